@@ -1,4 +1,4 @@
-"""Simulated scenes with labels that no training generator makes, for `edgegrasp benchmark-real`.
+"""Labelled simulated scenes for `edgegrasp benchmark-real`, independent of the training generators.
 
     python benchmarks/heldout_scenes.py --objects OBJECTS --output SCENES --seed 0
     edgegrasp benchmark-real --scenes SCENES --output RESULTS
@@ -44,7 +44,7 @@ class Made(NamedTuple):
 
 
 class Maker:
-    """A world, and what scenes are built of in it."""
+    """A world, with the objects and background of its scenes."""
 
     def __init__(self, objects: Path, rng: np.random.Generator) -> None:
         self.world, self.rng = PybulletWorld(), rng

@@ -34,7 +34,7 @@ OK = "OK"
 
 @dataclass(frozen=True)
 class Task:
-    """What one process sends."""
+    """The share of one process."""
 
     address: str  # of the server
     clients: int  # requests at a time
@@ -45,7 +45,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Sample:
-    """What became of one request."""
+    """The outcome of one request."""
 
     seconds: float  # until its answer or error
     detector_seconds: float | None  # of the detection, as the answer says; None without an answer
@@ -129,7 +129,7 @@ def request(client: GraspClient, points: Float32) -> Sample:
 
 
 def summary(samples: Sequence[Sample]) -> dict[str, Any]:
-    """How many requests came to what, and how long they took, in milliseconds."""
+    """Counts of outcomes, and times in milliseconds."""
     answered = [one for one in samples if one.code == OK]
     beyond = [one.seconds - one.detector_seconds for one in answered if one.detector_seconds]
     return {

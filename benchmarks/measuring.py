@@ -1,4 +1,4 @@
-"""What the benchmarks share: runs that take turns, the machine, a server to measure."""
+"""Shared by the benchmarks: alternating runs, the machine, a server to measure."""
 
 import json
 import os

@@ -156,7 +156,7 @@ def plans(seed: int, end: float) -> Iterator[Plan]:
 
 
 class Soak:
-    """Sends plans from several clients at a time, and notes what becomes of each."""
+    """Sends plans from several clients at a time, and records their outcomes."""
 
     def __init__(self, server: Served, seed: int) -> None:
         self._server, self._seed = server, seed
@@ -175,7 +175,7 @@ class Soak:
         sampling.cancel()
 
     def figures(self) -> dict[str, Any]:
-        """What came of it."""
+        """Its outcome."""
         return {
             "requests": self._given,
             "lost": self._given - self._came.total(),
@@ -242,7 +242,7 @@ class Soak:
 
 
 def outcome(plan: Plan, came: Detection | GraspClientError) -> str:
-    """What came of a request, by the digest in its answer or by its error."""
+    """The outcome of a request, by the digest in its answer or by its error."""
     if isinstance(came, Detection):
         mine = came.counts["crc32"] == zlib.crc32(plan.points().tobytes())
         return ANSWERED if mine else CROSSED
@@ -328,7 +328,7 @@ def http2_frame(kind: int, flags: int, stream: int, payload: bytes) -> bytes:
 
 
 def http2_opening() -> bytes:
-    """What a client says first."""
+    """The first bytes of a client."""
     return b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + http2_frame(4, 0, 0, b"")
 
 
@@ -343,7 +343,7 @@ def http2_headers(path: str, stream: int) -> bytes:
 
 
 def probe(url: str, address: str, stop: Any, pipe: Any) -> None:
-    """Ask for health over both transports, each time on a new connection; tells how it went."""
+    """Ask for health over both transports, each time on a new connection; returns the outcome."""
     questions = {"http": partial(ask_http, url), "grpc": partial(ask_grpc, address)}
     refused: Counter[str] = Counter()
     seconds: dict[str, list[float]] = {name: [] for name in questions}

@@ -1,7 +1,7 @@
 """Measure speed: `python -m benchmarks.speed` writes speed.json.
 
 Most times are processor seconds on one thread, medians of interleaved runs: they hold on a busy
-machine too. Networks carry random weights, which cost what trained ones cost.
+machine too. Networks have random weights, which take as long as trained ones cost.
 """
 
 import argparse
@@ -90,7 +90,7 @@ def shipped() -> dict[str, Any]:
 
 
 def camera() -> dict[str, float]:
-    """Seconds for what cameras send, given only the camera's position: the default weights.
+    """Seconds for images of cameras, given only the camera's position: the default weights.
 
     The demo's own scene; each image of SHARED, where it is; and the same enlarged to 1280 x 720.
     """
@@ -109,7 +109,7 @@ def camera() -> dict[str, float]:
 
 
 def demo_view() -> Observation:
-    """What the camera of examples/demo.py sees."""
+    """The view of the camera in examples/demo.py."""
     scene, camera, noise = (np.random.default_rng([0, 0, stream]) for stream in range(3))
     with ClutterSimulation() as simulation:
         simulation.reset(SceneKind.PILE, scene, num_objects=6)
@@ -195,7 +195,7 @@ def observe(kind: SceneKind = SceneKind.PILE, table: TableView = "known") -> Obs
 
 
 def detector(config: NetworkConfig) -> GraspDetector:
-    """A detector with random weights, which cost what trained ones cost."""
+    """A detector with random weights, which take as long as trained ones."""
     metadata = CheckpointMetadata("random", config, VOXEL_SIZE, "panda")
     return GraspDetector(build_network(config), metadata, load_gripper())
 
@@ -235,7 +235,7 @@ def write_table(page: Path, written: str) -> None:
 
 
 def camera_table(results: dict[str, Any]) -> str:
-    """What the images of cameras take."""
+    """The times of camera images."""
     rows = [
         "| `edgegrasp-plus`, what a camera sends to ranked grasps | one thread |",
         "| --- | --- |",
@@ -251,7 +251,7 @@ def camera_table(results: dict[str, Any]) -> str:
 
 
 def table(results: dict[str, Any]) -> str:
-    """All the others, and what they were measured on."""
+    """All other times, and the machine."""
     rows = ["| the table given | scene | one thread | two threads |", "| --- | --- | --- | --- |"]
     for name, scenes in results["shipped"].items():
         for scene, of in scenes.items():

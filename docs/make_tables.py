@@ -70,7 +70,7 @@ def _settings() -> Rows:
 
 def _default(value: Any) -> str:
     if isinstance(value, dict):
-        return f'`"{value["kind"]}"`' if value.keys() == {"kind"} else "those of the object"
+        return f'`"{value["kind"]}"`' if value.keys() == {"kind"} else "its defaults"
     return f"`{json.dumps(value)}`"
 
 

@@ -65,7 +65,7 @@ def main(seed: int, output: Path, engine: str | None = None) -> None:
 def detect_over_both(seen: Observation, seed: int) -> tuple[Detection, Detection]:
     """Grasps of one cloud over gRPC and over REST, from a server of our own.
 
-    The table is in the cloud: the server finds it, and what stands on it.
+    The table is in the cloud: the server finds it, and the objects on it.
     """
     options: DetectOptions = {
         "seed": seed,

@@ -1,4 +1,4 @@
-"""One request of three views finds at least what the best view does, which sees less of objects.
+"""One request of three views finds at least as many grasps as the best of the views.
 
 usage: python examples/several_views.py [ADDRESS] [SCENES]
 

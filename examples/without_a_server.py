@@ -12,7 +12,7 @@ from edgegrasp_model.options import DetectOptions, SupportPlane
 
 
 def box_cloud(rng: np.random.Generator) -> np.ndarray:
-    """Points on the surface of the box, but for its floor.  # (6000, 3) float32 metres."""
+    """Points on the surface of the box, except its bottom.  # (6000, 3) float32 metres."""
     size = np.array([0.05, 0.08, 0.06])
     points = rng.uniform(0.0, size, (6000, 3))
     face = rng.integers(5, size=len(points))

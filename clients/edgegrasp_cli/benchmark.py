@@ -98,9 +98,9 @@ class BenchmarkFlags(Cluster):
 def benchmark(
     *, flags: dict[str, Any], connection: dict[str, Any], options: dict[str, Any]
 ) -> None:
-    """Clear simulated clutter with a planner's grasps and count what succeeds.
+    """Clear simulated clutter with a planner's grasps and count the successes.
 
-    GSR: successes / attempts. DR: objects removed / present. The protocol says what a round is.
+    GSR: successes / attempts. DR: objects removed / present. The protocol defines a round.
     Options of the detection are the protocol's unless a flag is given.
     """
     from edgegrasp_sim.results import ResultFolder, below_gate, summarise

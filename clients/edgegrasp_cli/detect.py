@@ -37,15 +37,13 @@ PICTURES = (".png", ".jpg", ".jpeg")
 
 Weights = Annotated[
     list[Path] | None,
-    Option(help="Weights file or folder besides those that ship, where there is no server."),
+    Option(help="Weights file or folder besides those that ship, without a server."),
 ]
-Grippers = Annotated[
-    list[Path] | None, Option(help="Gripper file (.toml), where there is no server.")
-]
+Grippers = Annotated[list[Path] | None, Option(help="Gripper file (.toml), without a server.")]
 Cloud = Annotated[
     Path | None, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
 ]
-Device = Annotated[str, Option(help="auto, cpu, cuda or cuda:N, where there is no server.")]
+Device = Annotated[str, Option(help="auto, cpu, cuda or cuda:N, without a server.")]
 
 
 class DetectFlags(BaseModel):

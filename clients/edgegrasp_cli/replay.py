@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 Option = typer.Option
 
 replay = typer.Typer(
-    help="Make what was recorded again: an attempt of a benchmark, or a request.",
+    help="Repeat a recording: an attempt of a benchmark, or a request.",
     no_args_is_help=True,
     add_completion=False,
 )

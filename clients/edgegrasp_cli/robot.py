@@ -53,7 +53,7 @@ def check(
     file: Annotated[Path, typer.Argument(help="Robot file, .toml, or a name of one that ships.")],
     picture: Annotated[Path | None, typer.Option(help="Picture of it at its home, .png.")] = None,
 ) -> None:
-    """Load a robot file, say what it is, and draw the arm at its home.
+    """Load a robot file, print its facts, and draw the arm at its home.
 
     edgegrasp robot check fr3 --picture fr3.png
     """

@@ -32,9 +32,9 @@ def serve(
 ) -> None:
     """Answer requests until SIGTERM; SIGHUP reloads weights, tokens and certificates.
 
-    Prints one line with both addresses once weights are loaded. What no flag sets comes from
+    Prints one line with both addresses once weights are loaded. Settings without a flag come from
     EDGEGRASP_* environment variables, such as EDGEGRASP_HTTP_PORT, then from the file of --config,
-    or else from the defaults. Tokens come from files.
+    then from the defaults. Tokens come from files.
     """
     # gRPC's own log lines are not JSON, and a pipe that is not read would block it.
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")

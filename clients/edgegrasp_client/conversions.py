@@ -225,7 +225,7 @@ def isaac_grasps(
         T_object_cloud: (4, 4) pose of the cloud's frame in the object's; None: they are the same.
         T_hand_gripper: (4, 4) pose of the gripper's frame in our hand frame; None: the same.
         joints: The gripper's joints.
-        dialect: What the frames are called: `object_frame_link` and `gripper_frame_link` in Isaac
+        dialect: Names of the frames: `object_frame_link` and `gripper_frame_link` in Isaac
             Sim, `object_frame` and `gripper_frame` in Isaac ROS.
 
     Returns:

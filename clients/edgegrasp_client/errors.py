@@ -42,7 +42,7 @@ class UnknownModelError(InvalidRequestError):
 
 
 class StartCollisionError(InvalidRequestError):
-    """Where the request has the arm, it touches itself or what the camera sees."""
+    """In the request's joints the arm touches itself or the scene."""
 
 
 class PayloadTooLargeError(InvalidRequestError):

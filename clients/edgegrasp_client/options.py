@@ -14,7 +14,7 @@ Numbers = Sequence[float] | NDArray[Any]
 
 
 class Cone(TypedDict):
-    """Directions within an angle of one."""
+    """Directions within an angle of a given one."""
 
     direction: Numbers
     max_angle: float
@@ -28,7 +28,7 @@ class ApproachDirection(TypedDict, total=False):
 
 
 class AutoPlane(TypedDict):
-    """Find the support plane: that of the points recognised as a support near objects."""
+    """The plane of the points near objects that are classified as support."""
 
     kind: Literal["auto"]
 
@@ -51,7 +51,7 @@ class OrientedBox(TypedDict):
 
 
 class Collision(TypedDict, total=False):
-    """What the hand must not meet, and on which way: cloud, support plane and obstacles."""
+    """Collision checks of the hand and its motion: cloud, support plane and obstacles."""
 
     mode: Literal["avoid", "penalise", "ignore"]
     margin: float
@@ -112,7 +112,7 @@ class PreviousObject(TypedDict):
 
 
 class Previous(TypedDict, total=False):
-    """What an earlier answer found, which the next one keeps where it is still there."""
+    """Grasps and objects of an earlier answer, to be followed."""
 
     gripper: str
     next_id: int
@@ -122,7 +122,7 @@ class Previous(TypedDict, total=False):
 
 
 class RansacPlane(TypedDict):
-    """Look for the plane in the cloud: the largest of those near the level."""
+    """The largest plane in the cloud that is nearly level."""
 
     kind: Literal["ransac"]
     distance: NotRequired[float]
@@ -146,14 +146,14 @@ class Indices(TypedDict):
 
 
 class Mask(TypedDict):
-    """Points by one truth value for each row of the cloud as it was sent."""
+    """Points by a truth value for each row of the cloud as it was sent."""
 
     kind: Literal["mask"]
     mask: Sequence[bool] | NDArray[Any]
 
 
 class Segments(TypedDict):
-    """Points by the segment they belong to: `segment_ids`, sent beside the cloud."""
+    """Points by their segment in `segment_ids`, sent with the cloud."""
 
     kind: Literal["segments"]
     ids: Sequence[int] | NDArray[Any]
@@ -168,14 +168,14 @@ class Sphere(TypedDict):
 
 
 class Region(TypedDict, total=False):
-    """What lies in any of `include` and in none of `exclude`."""
+    """Points in any of `include` and in none of `exclude`."""
 
     include: Sequence[Box | OrientedBox | Sphere | HalfSpace | Indices | Mask | Segments]
     exclude: Sequence[Box | OrientedBox | Sphere | HalfSpace | Indices | Mask | Segments]
 
 
 class PlaceRegion(TypedDict):
-    """An axis-aligned box in the arm's base frame, on whose bottom an object is put."""
+    """An axis-aligned box in the arm's base frame; an object is put on its bottom."""
 
     min: Numbers
     max: Numbers
@@ -189,7 +189,7 @@ class Place(TypedDict, total=False):
 
 
 class RobotArm(TypedDict):
-    """The arm that is to execute a grasp: each grasp is answered with how the arm gets there."""
+    """The arm that executes the grasp; each grasp in the answer has its joints and motion."""
 
     name: str
     T_base_cloud: Numbers
@@ -209,7 +209,7 @@ class SupportPlane(TypedDict):
 
 
 class Suppression(TypedDict, total=False):
-    """Drop a grasp near a better one: nearer than both distances."""
+    """Drop a grasp that is nearer to a better one than both distances."""
 
     translation: float
     rotation: float

@@ -74,7 +74,7 @@ class RestTransport:
         return await self._call(Robots, {"method": "GET", "url": "/v1/robots"}, timeout)
 
     async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
-        """Tell the server what became of a grasp."""
+        """Report to the server whether a grasp held."""
         call = {"method": "POST", "url": "/v1/outcomes", "json": tried}
         await self._call(dict, call, timeout)
 

@@ -1,4 +1,4 @@
-"""What a caller asks: checked as far as it can be without the server, in the forms of the wire.
+"""The request of a caller, checked as far as possible without the server, in the forms of the wire.
 
 Also helpers that build a request from a segmentation mask, or from an object's cloud and its
 scene's.
@@ -36,7 +36,7 @@ class Intrinsics(TypedDict):
 
 
 class DepthImage(TypedDict):
-    """What a camera saw. Camera frame: x right, y down, z forward."""
+    """An image of a depth camera. Camera frame: x right, y down, z forward."""
 
     # (H, W), 0 or NaN where there is no reading: metres as float32 or float64, millimetres as
     # uint16. Or the path of a file that holds it: .npy, or .png of 16 bits.

@@ -1,6 +1,6 @@
-"""The answer to one request: as the model makes it, and as the client reads it.
+"""The answer to one request, as made by the model and as read by the client.
 
-What an annotation says beside an array is the shape in which the client has it.
+The shape in an array's annotation is the client's.
 """
 
 from dataclasses import dataclass, field
@@ -31,13 +31,13 @@ class ArmTrajectory:
 
 @dataclass(frozen=True, eq=False)
 class ArmPlan:
-    """How an arm gets to a grasp."""
+    """Joints and motion of an arm to a grasp."""
 
-    reachable: bool  # whether it gets there and straight on, and to the place, touching nothing
-    pregrasp_joints: Float64 | None = None  # (J,) where it is reachable
-    grasp_joints: Float64 | None = None  # (J,) where it is reachable
+    reachable: bool  # pregrasp, grasp and place without a collision
+    pregrasp_joints: Float64 | None = None  # (J,) if reachable
+    grasp_joints: Float64 | None = None  # (J,) if reachable
     trajectory: ArmTrajectory | None = None  # if it was asked for and found in time
-    place_joints: Float64 | None = None  # (J,) where it lets go; None without a place
+    place_joints: Float64 | None = None  # (J,) at the release; None without a place
     T_base_place: Annotated[Float64, (4, 4)] | None = None  # (4, 4) the hand there, base frame
 
 
@@ -101,7 +101,7 @@ class GripperOutline:
 class DetectedObject:
     """A recognised object; cloud frame, metres."""
 
-    number: int  # as in `Grasp.object`; the segment, where segment_ids were sent
+    number: int  # as in `Grasp.object`; the segment, if segment_ids were sent
     points: int  # its number of voxels in the processed cloud
     center: Float32  # (3,) of the smallest upright box around them
     half_extents: Float32  # (3,) of that box, along its own axes, the last of which is up
@@ -109,7 +109,7 @@ class DetectedObject:
     best_score: float | None  # of the grasps returned; None: it has none
     confidence: float | None  # probability that it is an object; None: given by the caller
     # Why it has no good grasp: "too-wide", "too-flat", "blocked" or "hidden"; None: it has one, or
-    # nobody can say.
+    # there is another reason.
     reason: str | None
     # (K, 3) points by which `previous` finds it again; the client's are flat, as sent back.
     surface: Annotated[Float32, (-1,)] | None = None
@@ -117,9 +117,9 @@ class DetectedObject:
 
 @dataclass(frozen=True)
 class Tracking:
-    """How an answer follows the one before, which was sent as `previous`."""
+    """How the answer continues the one in `previous`."""
 
-    first: str  # what became of the first grasp: "started", "kept", "replaced" or "lost"
+    first: str  # state of the first grasp: "started", "kept", "replaced" or "lost"
     next_id: int  # above all ids and numbers used so far
 
 
@@ -132,8 +132,8 @@ class DebugInfo:
     approach_index: Int64  # (E,) p_a, rows of `points`
     contact_index: Int64  # (E,) p_c, rows of `points`
     T_cloud_hand: Annotated[Float32, (-1, 4, 4)]  # (E, 4, 4)
-    score: Float32  # (E,) NaN where it was not scored
-    outcome: list[str]  # E of them: "returned", or what became of it
+    score: Float32  # (E,) NaN: not scored
+    outcome: list[str]  # E of them: "returned", or why it was not
     support_plane: Float32 | None  # (4,) unit normal and offset, given or found, metres
     # (R,) of each row of the cloud as sent, images row by row: the number of its object; -1: an
     # obstacle; -2: the support; -3: no reading, cut off or below the support.
@@ -150,12 +150,12 @@ class Detection:
     model: str  # name of the weights used
     gripper: GripperOutline
     warnings: list[str] = field(default_factory=list)
-    debug: DebugInfo | None = None  # where `debug` is asked for
+    debug: DebugInfo | None = None  # if `debug` is set
     support: FoundSupport | None = None  # given or found
     # (3,) unit, away from gravity, as it was used
     up: Float32 = field(default_factory=lambda: np.array([0, 0, 1], np.float32))
     objects: list[DetectedObject] = field(default_factory=list)  # the largest first
-    tracking: Tracking | None = None  # where `previous` was sent
+    tracking: Tracking | None = None  # if `previous` was sent
 
     @property
     def best_pick(self) -> Grasp | None:
@@ -165,7 +165,7 @@ class Detection:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What the network says of one edge or hand pose."""
+    """The network's score of one edge or hand pose."""
 
     grasp: Grasp | None  # None if it defines no edge grasp
     reason: str | None  # why it defines none, e.g. "too-long"

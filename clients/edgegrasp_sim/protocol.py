@@ -25,7 +25,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True, config=STRICT)
 class SceneRules:
-    """What stands on the table.
+    """The objects on the table.
 
     Attributes:
         num_objects: how many objects to try to place, in turn from round to round.
@@ -46,7 +46,7 @@ class SceneRules:
 
 @dataclass(frozen=True, config=STRICT)
 class RoundRules:
-    """What ends a round.
+    """Conditions that end a round.
 
     Attributes:
         max_consecutive_failures: failed grasps in a row that end a round.
@@ -101,7 +101,7 @@ class NoiseRules(DepthNoise):
 
 @dataclass(frozen=True, config=STRICT)
 class PlanningRules:
-    """What a planner is given, and how many candidates it may score.
+    """The input of a planner, and its number of candidates.
 
     Attributes:
         table: `known`: the cloud is cut off above the table, and its plane is given; `seen`: the

@@ -163,7 +163,7 @@ def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
 
 
 def _arm_figures(rounds: Sequence[Round]) -> dict[str, Any] | None:
-    """What an arm did, None where the hand floated; times are simulated and the planner's."""
+    """Figures of an arm, None for a floating hand; times are simulated and the planner's."""
     attempts = [attempt for item in rounds for attempt in item.attempts]
     if not any(attempt.motion_seconds for attempt in attempts):
         return None

@@ -109,7 +109,7 @@ def load_object(
 
 
 class Layout(NamedTuple):
-    """What a scene is made of.
+    """The parts of a scene.
 
     Attributes:
         world: gets the objects; the surroundings are there already.
@@ -201,7 +201,7 @@ def wait_for_rest(world: World, objects: Sequence[SceneObject], seconds: float) 
 def settle(
     world: World, objects: Sequence[SceneObject], surroundings: Surroundings
 ) -> list[SceneObject]:
-    """Wait for rest and remove what is no longer where objects are, until nothing more leaves.
+    """Wait for rest and remove objects outside the workspace, until none leaves it.
 
     Returns:
         The objects that remain.

@@ -1,4 +1,4 @@
-"""What depth cameras get wrong: structured light, stereo, time of flight, and plain noise.
+"""Faults of depth cameras: structured light, stereo, time of flight, and plain noise.
 
 A rendered depth image goes in, one as such a camera would give it comes out, NaN where it has no
 reading. The models follow measurements of such cameras: noise that grows with the square of the

@@ -1,4 +1,4 @@
-"""What a scene's objects stand in: a table, an open bin, a crowded table, or a shelf.
+"""The surroundings of a scene's objects: a table, an open bin, a crowded table, or a shelf.
 
 Nothing of it ever moves. The plane that the objects rest on lies at `TABLE_HEIGHT` in every scene.
 """
@@ -29,7 +29,7 @@ Span = tuple[float, float]  # least and greatest, metres
 
 @dataclass(frozen=True, slots=True)
 class Bins:
-    """What bins are drawn from; lengths in metres."""
+    """Ranges of random bins; lengths in metres."""
 
     # Length, width and height inside. The palm of the Panda's hand is 20 cm wide and 5 cm above
     # its fingertips: along a higher wall it holds little.
@@ -44,7 +44,7 @@ class Bins:
 
 @dataclass(frozen=True, slots=True)
 class Tables:
-    """What crowded tables are drawn from; lengths in metres."""
+    """Ranges of random crowded tables; lengths in metres."""
 
     reach: float = 0.16  # from the middle, along x and y, where objects are put
     length: Span = (0.5, 1.2)
@@ -59,7 +59,7 @@ class Tables:
 
 @dataclass(frozen=True, slots=True)
 class Shelves:
-    """What shelves are drawn from; lengths in metres."""
+    """Ranges of random shelves; lengths in metres."""
 
     # Width, depth and height inside a compartment, in which a hand has room.
     inside: tuple[Span, Span, Span] = ((0.45, 0.90), (0.26, 0.40), (0.34, 0.48))
@@ -96,7 +96,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What stays as it is in a scene, and where its objects are.
+    """The fixed parts of a scene, and the region of its objects.
 
     Attributes:
         boxes: all that never moves.

@@ -93,7 +93,7 @@ _SHORT = _Short()
 
 
 class StartCollision(InvalidRequest):
-    """Where the request has the arm, it touches itself or what the camera sees."""
+    """In the request's joints the arm touches itself or the scene."""
 
 
 class UnknownModel(EdgeGraspError):  # noqa: N818

@@ -128,9 +128,9 @@ class OrientedBox(Strict):
     """A box in any orientation."""
 
     kind: Literal["oriented_box"] = "oriented_box"
-    center: Vector = Field(description="its middle, metres")
+    center: Vector = Field(description="centre, metres")
     half_extents: tuple[Length, Length, Length] = Field(
-        description="half its lengths along its own axes, metres"
+        description="half lengths along the box's axes, metres"
     )
     quaternion: Quaternion = Field(
         default=(0.0, 0.0, 0.0, 1.0),
@@ -142,7 +142,7 @@ class Sphere(Strict):
     """A ball."""
 
     kind: Literal["sphere"] = "sphere"
-    center: Vector = Field(description="its middle, metres")
+    center: Vector = Field(description="centre, metres")
     radius: Length = Field(description="metres")
 
 
@@ -159,7 +159,7 @@ class Indices(Strict):
 
     kind: Literal["indices"] = "indices"
     indices: tuple[Row, ...] = Field(
-        max_length=MAX_ROWS, description="rows of the cloud as sent; row-major where organised"
+        max_length=MAX_ROWS, description="rows of the cloud as sent; row-major if organised"
     )
 
 
@@ -179,7 +179,7 @@ def _byte_for_each(value: object) -> bytes:
 
 
 class Mask(Strict):
-    """Points by one truth value for each row of the cloud as it was sent."""
+    """Points by a truth value for each row of the cloud as it was sent."""
 
     kind: Literal["mask"] = "mask"
     mask: Annotated[
@@ -194,12 +194,12 @@ class Mask(Strict):
             | Annotated[list[bool], Field(max_length=MAX_ROWS)],
         ),
     ] = Field(
-        description="as many values as the cloud has rows; in JSON also base64 of a byte for each"
+        description="one value for each row of the cloud; in JSON also base64 of one byte each"
     )
 
 
 class Segments(Strict):
-    """Points by the segment they belong to: `segment_ids`, sent beside the cloud."""
+    """Points by their segment in `segment_ids`, sent with the cloud."""
 
     kind: Literal["segments"] = "segments"
     ids: tuple[Annotated[int, Field(strict=True, ge=-(2**31), lt=2**31)], ...] = Field(
@@ -214,7 +214,7 @@ Shape = Annotated[Box | OrientedBox | Sphere | HalfSpace | Rows, Field(discrimin
 
 
 class Region(Strict):
-    """What lies in any of `include` and in none of `exclude`.
+    """Points in any of `include` and in none of `exclude`.
 
     Shapes see each voxel of the processed cloud as its mean point. Rows (indices, mask, segments)
     hold a voxel where they hold at least half of the points in it.
@@ -229,13 +229,13 @@ class Region(Strict):
 
 
 class Cone(Strict):
-    """Directions within an angle of one."""
+    """Directions within an angle of a given one."""
 
     direction: Direction = Field(
-        description="the way the hand moves toward the object, +z of the hand; any length but zero"
+        description="direction in which the hand moves, its +z axis; any length but zero"
     )
     max_angle: Annotated[float, Field(ge=0.0, le=math.pi), numeric] = Field(
-        description="radians between it and the hand's way"
+        description="greatest angle between it and the hand's direction, radians"
     )
 
 
@@ -247,9 +247,11 @@ class ApproachDirection(Strict):
     come from more than 6 degrees below the horizontal.
     """
 
-    cones: tuple[Cone, ...] = Field(default=(), max_length=64, description="any of these")
+    cones: tuple[Cone, ...] = Field(
+        default=(), max_length=64, description="directions are allowed in any of these"
+    )
     preset: Literal["top-down", "side"] | None = Field(
-        default=None, description="or this, relative to up"
+        default=None, description="or in this, relative to up"
     )
 
     @model_validator(mode="after")
@@ -267,8 +269,8 @@ class SupportPlane(Strict):
     offset: Finite = Field(description="normal . x of its points, metres")
     max_depth_error: Annotated[float, Field(ge=0.0, le=0.3), numeric] = Field(
         default=0.0,
-        description="share by which a camera's depths may be wrong: each view is scaled about its "
-        "viewpoint by up to this until the plane that it sees lies in place; 0: not at all",
+        description="greatest relative error of a camera's depths: each view is scaled about its "
+        "viewpoint by up to this, so that its table lies in the plane; 0: no correction",
     )
 
     def heights(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -278,7 +280,7 @@ class SupportPlane(Strict):
 
 
 class RansacPlane(Strict):
-    """Look for the plane in the cloud: the largest of those near the level.
+    """The largest plane in the cloud that is nearly level.
 
     Found from the request's seed, within the workspace. Its points are removed before anything
     else; the plane stays as an obstacle. None found: a warning, and no support plane.
@@ -286,18 +288,19 @@ class RansacPlane(Strict):
 
     kind: Literal["ransac"] = "ransac"
     distance: Annotated[float, Field(gt=0.0, le=0.1), numeric] = Field(
-        default=0.005, description="metres from the plane within which points belong to it at least"
+        default=0.005, description="least distance within which points belong to the plane, metres"
     )
     max_tilt: Annotated[float, Field(ge=0.0, le=1.6), numeric] = Field(
-        default=0.35, description="radians between its normal and up; a quarter turn: any plane"
+        default=0.35,
+        description="greatest angle between its normal and up, radians; a quarter turn: any plane",
     )
     min_share: Annotated[float, Field(gt=0.0, le=1.0), numeric] = Field(
-        default=0.1, description="share of the seen surface it must hold"
+        default=0.1, description="least share of the seen surface that lies in it"
     )
 
 
 class AutoPlane(Strict):
-    """Find the support plane: that of the points recognised as a support near objects.
+    """The plane of the points near objects that are classified as support.
 
     Where `up` is sent, it lies within 30 degrees of the level. None found: a warning, and objects
     without a support plane.
@@ -332,7 +335,7 @@ class GripperGeometry(Strict):
     max_opening: HandLength = Field(description="metres between the open fingers' inner faces")
     tip_z: HandLength = Field(description="fingertips of the open gripper, metres along z")
     contact_z: HandLength = Field(
-        description="where contacts are put, metres along z; between palm and fingertips"
+        description="contact, metres along z; between palm and fingertips"
     )
     tcp_z: NearHand = Field(description="origin of the TCP frame, metres along z")
     hand: HandPart = Field(description="the hand without its fingers")
@@ -402,7 +405,7 @@ class Workspace(Strict):
 
 
 class Suppression(Strict):
-    """Drop a grasp near a better one: nearer than both distances."""
+    """Drop a grasp that is nearer to a better one than both distances."""
 
     translation: Number = Field(default=0.01, ge=0.0, le=1.0, description="metres between TCPs")
     rotation: Number = Field(
@@ -414,34 +417,34 @@ class Suppression(Strict):
 
 
 class Collision(Strict):
-    """What the hand must not meet, and on which way: cloud, support plane and obstacles."""
+    """Collision checks of the hand and its motion: cloud, support plane and obstacles."""
 
     mode: CollisionMode = Field(
         default="avoid",
-        description="grasps whose hand collides: left out, their scores worth half in the "
-        "ranking, or not looked for",
+        description="grasps whose hand collides are left out, ranked by half their score, or not "
+        "checked for",
     )
     margin: Number = Field(
         default=0.0,
         ge=0.0,
         le=0.1,
-        description="metres kept free around the hand: its boxes are grown by this on every side",
+        description="metres by which the hand's boxes are grown on every side",
     )
     opening: Annotated[float, Field(gt=0.0, le=1.0), numeric] | None = Field(
         default=None,
-        description="metres between the fingers on the way in; null: the gripper's maximum",
+        description="metres between the fingers during the approach; null: the gripper's maximum",
     )
     approach_length: Number = Field(
-        default=0.05, ge=0.0, le=1.0, description="metres of straight way in along the approach"
+        default=0.05, ge=0.0, le=1.0, description="length of the straight approach, metres"
     )
     retreat_length: Number = Field(
-        default=0.0, ge=0.0, le=1.0, description="metres of straight way out"
+        default=0.0, ge=0.0, le=1.0, description="length of the straight retreat, metres"
     )
     retreat_direction: Literal["back", "up"] = Field(
-        default="back", description="way out: back along the approach, or along up"
+        default="back", description="direction of the retreat: back along the approach, or along up"
     )
     obstacles: tuple[Annotated[Box | OrientedBox, Field(discriminator="kind")], ...] = Field(
-        default=(), max_length=64, description="solid boxes beside the cloud"
+        default=(), max_length=64, description="solid boxes in addition to the cloud"
     )
 
 
@@ -487,7 +490,7 @@ RigidPose = Annotated[
 
 
 class PlaceRegion(Workspace):
-    """An axis-aligned box in the arm's base frame, on whose bottom an object is put."""
+    """An axis-aligned box in the arm's base frame; an object is put on its bottom."""
 
 
 class Place(Strict):
@@ -495,13 +498,13 @@ class Place(Strict):
 
     T_base_object: RigidPose | None = Field(
         default=None,
-        description="where the object's box, as `objects` in the answer have it, is to be in the "
-        "arm's base frame: a 4 x 4 matrix, row by row",
+        description="pose of the object's box, as in `objects` of the answer, in the arm's base "
+        "frame: a 4 x 4 matrix, row by row",
     )
     region: PlaceRegion | None = Field(
         default=None,
-        description="where the whole object is to stand, turned about the vertical at will; the "
-        "base frame's z is up",
+        description="box for the whole object, which may be turned about the vertical; the base "
+        "frame's z must be up",
     )
 
     @model_validator(mode="after")
@@ -512,14 +515,14 @@ class Place(Strict):
 
 
 class RobotArm(Strict):
-    """The arm that is to execute a grasp: each grasp is answered with how the arm gets there."""
+    """The arm that executes the grasp; each grasp in the answer has its joints and motion."""
 
     name: str = Field(max_length=100, description="one of the server's robots")
     T_base_cloud: RigidPose = Field(
-        description="where the cloud's frame is in the arm's base frame: a 4 x 4 matrix, row by row"
+        description="pose of the cloud's frame in the arm's base frame: a 4 x 4 matrix, row by row"
     )
     joints: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=16)] = Field(
-        description="the arm's joints now, radians or metres, in the order of the robot file"
+        description="present joints of the arm, radians or metres, in the order of the robot file"
     )
     plan: Literal["reach", "motion"] = Field(
         default="motion",
@@ -532,7 +535,7 @@ class RobotArm(Strict):
     )
     avoid_unseen: StrictBool = Field(
         default=False,
-        description="whether the arm keeps out of what no camera saw, behind what was seen",
+        description="whether unseen space behind a surface is an obstacle of the arm",
     )
 
 
@@ -559,23 +562,25 @@ class PreviousObject(Strict):
 
 
 class Previous(Strict):
-    """What an earlier answer found, which the next one keeps where it is still there.
+    """Grasps and objects of an earlier answer, to be followed.
 
     All of it is in the frame of the cloud that is sent now.
     """
 
-    gripper: str = Field(default="", max_length=100, description="its name in that answer")
+    gripper: str = Field(
+        default="", max_length=100, description="name of the gripper in that answer"
+    )
     next_id: Row = Field(default=0, description="as in that answer")
     grasps: tuple[PreviousGrasp, ...] = Field(
         default=(), max_length=MAX_PREVIOUS, description="best first; the first is the one to keep"
     )
     objects: tuple[PreviousObject, ...] = Field(
-        default=(), max_length=MAX_PREVIOUS, description="those that the grasps are on, and others"
+        default=(), max_length=MAX_PREVIOUS, description="objects of these grasps, and others"
     )
     search: StrictBool = Field(
         default=True,
-        description="whether to look for other grasps too; false: only these are moved along and "
-        "scored anew, which takes a fraction of the time, best with the `support` of that answer",
+        description="whether to detect other grasps too; false: only these are moved and scored "
+        "again, which takes a fraction of the time; send the `support` of that answer",
     )
 
     @model_validator(mode="after")
@@ -688,22 +693,21 @@ class DetectOptions(Strict):
         ),
     ] = Field(
         default=AutoPlane(),
-        description="plane the objects rest on; no part of the hand goes below it; a bare kind "
-        "will do; null: none",
+        description="plane that the objects rest on and the hand stays above; a kind alone is "
+        "allowed; null: none",
     )
     objects: Literal["auto", "off"] | ObjectChoice = Field(
         default="auto",
-        description="what grasps are for: the objects that are recognised, some of "
-        "them by number, or everything; all the rest is an obstacle. Where segment_ids are sent, "
-        "they are the objects, 0 and less none",
+        description="objects to grasp: those recognised, some of them by number, or everything; "
+        "all else is an obstacle. If segment_ids are sent, those above 0 are the objects",
     )
     at: Pixel | None = Field(
         default=None,
-        description="pixel of the image; grasps are for the object that is seen there",
+        description="pixel of the image; grasps are for the object at this pixel",
     )
     near: Vector | None = Field(
         default=None,
-        description="position, metres; grasps are for the object next to it, 0.1 m away at most",
+        description="position, metres; grasps are for the nearest object, at most 0.1 m away",
     )
     max_object_size: Number = Field(
         default=0.4,
@@ -722,19 +726,20 @@ class DetectOptions(Strict):
         default=None, description="where contact points may lie; null: everywhere"
     )
     approach_direction: ApproachDirection | None = Field(
-        default=None, description="ways the hand may move; null: not from below"
+        default=None, description="directions in which the hand may move; null: not from below"
     )
     collision: Annotated[
         Collision,
         BeforeValidator(_mode_as_object, json_schema_input_type=CollisionMode | Collision),
-    ] = Field(default=Collision(), description="what the hand must not meet; a bare mode will do")
+    ] = Field(
+        default=Collision(), description="collision checks of the hand; a mode alone is allowed"
+    )
     robot: RobotArm | None = Field(
         default=None,
-        description="the arm that is to execute a grasp; grasps within its reach come first; "
-        "null: a hand alone",
+        description="arm that executes the grasp; grasps within its reach come first; null: no arm",
     )
     min_score: Number = Field(
-        default=0.3, ge=0.0, le=1.0, description="lowest score returned; 0: all, however bad"
+        default=0.3, ge=0.0, le=1.0, description="lowest score returned; 0: all"
     )
     top_k: Integer = Field(
         default=50, ge=1, le=MAX_CANDIDATES, description="grasps returned at most"
@@ -744,14 +749,14 @@ class DetectOptions(Strict):
     )
     order: Literal["score", "highest", "clearance"] = Field(
         default="score",
-        description="what comes first: the score (before others, the best grasp of each object "
-        "that has one of 0.5 and more); the highest TCP along up among scores of 0.9 and more, "
-        "then the others by score; or the clearance",
+        description="score: by score, the best grasp of each object first if it has 0.5 or more; "
+        "highest: by height of the TCP along up among scores of 0.9 and more, then the "
+        "others by score; clearance: by clearance",
     )
     previous: Previous | None = Field(
         default=None,
-        description="what an earlier answer found: what is still there keeps its id, its number "
-        "and its place; an empty object begins; null: each answer stands alone",
+        description="grasps and objects of an earlier answer, which keep their ids, numbers and "
+        "order; empty for the first image; null: no tracking",
     )
     debug: StrictBool = Field(
         default=False, description="whether to return the processed cloud and every candidate"

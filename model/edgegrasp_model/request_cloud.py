@@ -58,7 +58,7 @@ class File(NamedTuple):
 def decode_cloud(
     fields: Mapping[str, Any], options: DetectOptions, max_points: int
 ) -> tuple[CloudInput, DetectOptions]:
-    """Decode the cloud of a request and the arrays beside it.
+    """Decode the cloud of a request and its per-point arrays.
 
     `fields` has one of SOURCES, and any of PER_POINT.
 
@@ -270,7 +270,7 @@ class Depth(Strict):
 
 
 class DepthImage(CameraView):
-    """What a camera saw. Camera frame: x right, y down, z forward."""
+    """An image of a depth camera. Camera frame: x right, y down, z forward."""
 
     depth: SkipValidation[list[list[float]] | Depth] = Field(
         description="rows of metres, or an object as Depth"

@@ -1,1 +1,1 @@
-"""EdgeGrasp in ROS 2: the node, and what it does as plain Python."""
+"""EdgeGrasp in ROS 2: the node, and its logic in plain Python."""

@@ -1,8 +1,8 @@
-"""What the node does, without ROS: messages to a request, grasps to the fields of messages.
+"""The logic of the node, without ROS: messages to a request, grasps to the fields of messages.
 
 Messages that come in are any objects with the attributes of theirs; those that go out are
 dictionaries of fields, for `rosidl_runtime_py.set_message_fields`. Poses are those of the hand's
-frame, but for `moveit_msgs/Grasp`, which has the end effector's parent link.
+frame, except for `moveit_msgs/Grasp`, which has the end effector's parent link.
 """
 
 from collections import deque
@@ -96,7 +96,7 @@ def read_parameters(given: Mapping[str, Any]) -> tuple[Settings, dict[str, Any]]
 
 
 class Scene(NamedTuple):
-    """What to detect in: a cloud, or a depth image with its camera, and perhaps a mask."""
+    """The input of a detection: a cloud, or a depth image with its camera, and perhaps a mask."""
 
     cloud: Any = None  # sensor_msgs/PointCloud2
     depth: Any = None  # sensor_msgs/Image, rectified
@@ -206,7 +206,7 @@ def detect(
     Raises:
         GraspClientError: As of the client.
         ValueError: There is no message to detect in, or one that cannot be read.
-        InvalidRequest: A cloud or an image is not what its fields say.
+        InvalidRequest: A cloud or an image does not match its fields.
     """
     header = scene.header
     if header is None and object_cloud is not None:
@@ -432,7 +432,7 @@ def _robot(
 
 
 def _from_frames(scene: Scene, settings: Settings, lookup: Lookup) -> dict[str, Any]:
-    """What frames say of a request: where the camera stands, and which way is up."""
+    """Options that follow from frames: where the camera stands, and which way is up."""
     frame_id, stamp = scene.header.frame_id, scene.header.stamp
     asked: dict[str, Any] = {}
     if scene.cloud is not None:

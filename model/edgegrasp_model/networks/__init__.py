@@ -1,1 +1,1 @@
-"""One file per architecture, and what they share."""
+"""One file per architecture, and shared parts."""

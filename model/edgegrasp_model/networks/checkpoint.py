@@ -82,7 +82,7 @@ def load_checkpoint(
     except RuntimeError as error:
         raise InvalidCheckpoint(
             f"checkpoint: got {path}, whose weights do not fit its own metadata ({error}). "
-            "Write it anew with `edgegrasp train` or `edgegrasp import-checkpoint`."
+            "Write it again with `edgegrasp train` or `edgegrasp import-checkpoint`."
         ) from error
     return network.to(device).eval(), metadata
 
@@ -128,7 +128,7 @@ def _check_tensors(path: Path, tensors: Mapping[str, Tensor], expected: str) -> 
         if not tensor.isfinite().all():
             raise InvalidCheckpoint(
                 f"checkpoint: got {path}, whose {name} holds NaN or infinity. Restore the file "
-                "from a copy, or train anew."
+                "from a copy, or train again."
             )
     if expected and _digest(tensors) != expected:
         raise InvalidCheckpoint(
@@ -152,7 +152,7 @@ def _read_metadata(path: Path, text: str | None) -> CheckpointMetadata:
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise InvalidCheckpoint(
             f"checkpoint: got {path}, whose edgegrasp metadata is unusable ({error!r}). "
-            "Write it anew with `edgegrasp train` or `edgegrasp import-checkpoint`."
+            "Write it again with `edgegrasp train` or `edgegrasp import-checkpoint`."
         ) from error
 
 

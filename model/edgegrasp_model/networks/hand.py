@@ -46,7 +46,7 @@ CHUNK = 32  # hands at a time, so that the work stays in cache
 
 @dataclass(frozen=True)
 class HandBatch:
-    """E edge grasps, each with what its hand sees. Metres."""
+    """E edge grasps, each with the points near its hand. Metres."""
 
     description: Tensor  # (E, F) float32, F at least what the network reads
     points: Tensor  # (E, P, 6) float32, positions and normals around the fingers, hand frame

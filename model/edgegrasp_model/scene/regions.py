@@ -37,7 +37,7 @@ def check_regions(cloud: CheckedCloud, options: DetectOptions) -> None:
 
 
 def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
-    """Check that the rows a region speaks of exist.
+    """Check that the rows of a region exist.
 
     Args:
         region: A region, whose shapes may name rows.
@@ -57,7 +57,7 @@ def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
                 value = f"{len(shape.mask)} values for a cloud of {rows} rows"
                 raise InvalidRequest(f"{here}.mask", value, "Send one value for each row.")
             if isinstance(shape, Segments) and cloud.segment_ids is None:
-                fix = f"Send one id for each point beside the cloud: {here} asks for segments."
+                fix = f"Send one id for each point with the cloud: {here} asks for segments."
                 raise InvalidRequest("segment_ids", "nothing", fix)
 
 

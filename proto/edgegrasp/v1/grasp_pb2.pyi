@@ -119,9 +119,9 @@ class DetectGraspsStreamRequest(_message.Message):
     REQUEST_FIELD_NUMBER: _builtins.int
     TIMEOUT_FIELD_NUMBER: _builtins.int
     request_id: _builtins.str
-    """The caller's own name for it; comes back with the answer."""
+    """The caller's name for it; the answer has it too."""
     timeout: _builtins.float
-    """Seconds from its arrival at the server after which the answer is not wanted any more."""
+    """Deadline, seconds after its arrival at the server."""
     @_builtins.property
     def request(self) -> Global___DetectGraspsRequest: ...
     def __init__(
@@ -175,7 +175,7 @@ Global___DetectGraspsStreamResponse: _TypeAlias = DetectGraspsStreamResponse  # 
 
 @_typing.final
 class StreamError(_message.Message):
-    """Why one request of a stream failed: what a call of its own would have ended with."""
+    """Why one request of a stream failed; as the error of a single call."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -452,7 +452,7 @@ Global___PointField: _TypeAlias = PointField  # noqa: Y015
 
 @_typing.final
 class DepthImage(_message.Message):
-    """What a camera saw. Camera frame: x right, y down, z forward."""
+    """An image of a depth camera. Camera frame: x right, y down, z forward."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -461,7 +461,7 @@ class DepthImage(_message.Message):
     T_CLOUD_CAMERA_FIELD_NUMBER: _builtins.int
     DEPTH_SCALE_FIELD_NUMBER: _builtins.int
     depth_scale: _builtins.float
-    """Metres that one unit of the depth is worth. Absent: 0.001 of whole numbers, 1 of floats."""
+    """Metres for one unit of depth. Absent: 0.001 of integers, 1 of floats."""
     @_builtins.property
     def depth(self) -> Global___Depth:
         """Distance along z at each pixel."""
@@ -602,20 +602,19 @@ class DetectOptions(_message.Message):
     seed: _builtins.int
     """Seed of every random choice."""
     objects: _builtins.str
-    """What grasps are for: the objects that are recognised, some of them by number, or everything;
-    all the rest is an obstacle. Where segment_ids are sent, they are the objects, 0 and less none.
-    One of "auto", "off".
+    """Objects to grasp: those recognised, some of them by number, or everything; all else is an
+    obstacle. If segment_ids are sent, those above 0 are the objects. One of "auto", "off".
     """
     max_object_size: _builtins.float
     """Longest side of an object, metres; longer ones are obstacles."""
     min_score: _builtins.float
-    """Lowest score returned; 0: all, however bad."""
+    """Lowest score returned; 0: all."""
     top_k: _builtins.int
     """Grasps returned at most."""
     order: _builtins.str
-    """What comes first: the score (before others, the best grasp of each object that has one of 0.5
-    and more); the highest TCP along up among scores of 0.9 and more, then the others by score; or
-    the clearance. One of "score", "highest", "clearance".
+    """Score: by score, the best grasp of each object first if it has 0.5 or more; highest: by height
+    of the TCP along up among scores of 0.9 and more, then the others by score; clearance: by
+    clearance. One of "score", "highest", "clearance".
     """
     debug: _builtins.bool
     """Whether to return the processed cloud and every candidate."""
@@ -635,17 +634,17 @@ class DetectOptions(_message.Message):
 
     @_builtins.property
     def support(self) -> Global___Support:
-        """Plane the objects rest on; no part of the hand goes below it; a bare kind will do; disabled:
+        """Plane that the objects rest on and the hand stays above; a kind alone is allowed; disabled:
         none.
         """
 
     @_builtins.property
     def at(self) -> Global___Pixel:
-        """Pixel of the image; grasps are for the object that is seen there."""
+        """Pixel of the image; grasps are for the object at this pixel."""
 
     @_builtins.property
     def near(self) -> Global___Vector:
-        """Position, metres; grasps are for the object next to it, 0.1 m away at most."""
+        """Position, metres; grasps are for the nearest object, at most 0.1 m away."""
 
     @_builtins.property
     def workspace(self) -> Global___Workspace:
@@ -661,15 +660,15 @@ class DetectOptions(_message.Message):
 
     @_builtins.property
     def approach_direction(self) -> Global___ApproachDirection:
-        """Ways the hand may move; absent: not from below."""
+        """Directions in which the hand may move; absent: not from below."""
 
     @_builtins.property
     def collision(self) -> Global___Collision:
-        """What the hand must not meet; a bare mode will do."""
+        """Collision checks of the hand; a mode alone is allowed."""
 
     @_builtins.property
     def robot(self) -> Global___RobotArm:
-        """The arm that is to execute a grasp; grasps within its reach come first; absent: a hand alone."""
+        """Arm that executes the grasp; grasps within its reach come first; absent: no arm."""
 
     @_builtins.property
     def suppression(self) -> Global___Suppression:
@@ -677,13 +676,13 @@ class DetectOptions(_message.Message):
 
     @_builtins.property
     def previous(self) -> Global___Previous:
-        """What an earlier answer found: what is still there keeps its id, its number and its place; an
-        empty object begins; absent: each answer stands alone.
+        """Grasps and objects of an earlier answer, which keep their ids, numbers and order; empty for the
+        first image; absent: no tracking.
         """
 
     @_builtins.property
     def object_choice(self) -> Global___ObjectChoice:
-        """`objects` where it is an object in JSON."""
+        """`objects` if it is an object in JSON."""
 
     def __init__(
         self,
@@ -787,7 +786,7 @@ class GripperGeometry(_message.Message):
     tip_z: _builtins.float
     """Fingertips of the open gripper, metres along z."""
     contact_z: _builtins.float
-    """Where contacts are put, metres along z; between palm and fingertips."""
+    """Contact, metres along z; between palm and fingertips."""
     tcp_z: _builtins.float
     """Origin of the TCP frame, metres along z."""
     @_builtins.property
@@ -856,8 +855,8 @@ class Support(_message.Message):
     offset: _builtins.float
     """Normal . x of its points, metres."""
     max_depth_error: _builtins.float
-    """Share by which a camera's depths may be wrong: each view is scaled about its viewpoint by up to
-    this until the plane that it sees lies in place; 0: not at all.
+    """Greatest relative error of a camera's depths: each view is scaled about its viewpoint by up to
+    this, so that its table lies in the plane; 0: no correction.
     """
     disabled: _builtins.bool
     """True: null in JSON."""
@@ -867,14 +866,14 @@ class Support(_message.Message):
 
     @_builtins.property
     def ransac(self) -> Global___RansacPlane:
-        """Look for the plane in the cloud: the largest of those near the level. `kind` is "ransac" in
-        JSON, its fields beside it.
+        """The largest plane in the cloud that is nearly level. `kind` is "ransac" in JSON, its fields
+        beside it.
         """
 
     @_builtins.property
     def auto(self) -> Global___AutoPlane:
-        """Find the support plane: that of the points recognised as a support near objects. `kind` is
-        "auto" in JSON, its fields beside it.
+        """The plane of the points near objects that are classified as support. `kind` is "auto" in JSON,
+        its fields beside it.
         """
 
     def __init__(
@@ -904,7 +903,7 @@ Global___Support: _TypeAlias = Support  # noqa: Y015
 
 @_typing.final
 class RansacPlane(_message.Message):
-    """Look for the plane in the cloud: the largest of those near the level."""
+    """The largest plane in the cloud that is nearly level."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -912,11 +911,11 @@ class RansacPlane(_message.Message):
     MAX_TILT_FIELD_NUMBER: _builtins.int
     MIN_SHARE_FIELD_NUMBER: _builtins.int
     distance: _builtins.float
-    """Metres from the plane within which points belong to it at least."""
+    """Least distance within which points belong to the plane, metres."""
     max_tilt: _builtins.float
-    """Radians between its normal and up; a quarter turn: any plane."""
+    """Greatest angle between its normal and up, radians; a quarter turn: any plane."""
     min_share: _builtins.float
-    """Share of the seen surface it must hold."""
+    """Least share of the seen surface that lies in it."""
     def __init__(
         self,
         *,
@@ -945,7 +944,7 @@ Global___RansacPlane: _TypeAlias = RansacPlane  # noqa: Y015
 
 @_typing.final
 class AutoPlane(_message.Message):
-    """Find the support plane: that of the points recognised as a support near objects."""
+    """The plane of the points near objects that are classified as support."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1022,7 +1021,7 @@ Global___Workspace: _TypeAlias = Workspace  # noqa: Y015
 
 @_typing.final
 class Region(_message.Message):
-    """What lies in any of `include` and in none of `exclude`."""
+    """Points in any of `include` and in none of `exclude`."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1059,10 +1058,10 @@ class ApproachDirection(_message.Message):
     CONES_FIELD_NUMBER: _builtins.int
     PRESET_FIELD_NUMBER: _builtins.int
     preset: _builtins.str
-    """Or this, relative to up. One of "top-down", "side"."""
+    """Or in this, relative to up. One of "top-down", "side"."""
     @_builtins.property
     def cones(self) -> _containers.RepeatedCompositeFieldContainer[Global___Cone]:
-        """Any of these."""
+        """Directions are allowed in any of these."""
 
     def __init__(
         self,
@@ -1082,7 +1081,7 @@ Global___ApproachDirection: _TypeAlias = ApproachDirection  # noqa: Y015
 
 @_typing.final
 class Collision(_message.Message):
-    """What the hand must not meet, and on which way: cloud, support plane and obstacles."""
+    """Collision checks of the hand and its motion: cloud, support plane and obstacles."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1094,22 +1093,22 @@ class Collision(_message.Message):
     RETREAT_DIRECTION_FIELD_NUMBER: _builtins.int
     OBSTACLES_FIELD_NUMBER: _builtins.int
     mode: _builtins.str
-    """Grasps whose hand collides: left out, their scores worth half in the ranking, or not looked
-    for. One of "avoid", "penalise", "ignore".
+    """Grasps whose hand collides are left out, ranked by half their score, or not checked for. One of
+    "avoid", "penalise", "ignore".
     """
     margin: _builtins.float
-    """Metres kept free around the hand: its boxes are grown by this on every side."""
+    """Metres by which the hand's boxes are grown on every side."""
     opening: _builtins.float
-    """Metres between the fingers on the way in; absent: the gripper's maximum."""
+    """Metres between the fingers during the approach; absent: the gripper's maximum."""
     approach_length: _builtins.float
-    """Metres of straight way in along the approach."""
+    """Length of the straight approach, metres."""
     retreat_length: _builtins.float
-    """Metres of straight way out."""
+    """Length of the straight retreat, metres."""
     retreat_direction: _builtins.str
-    """Way out: back along the approach, or along up. One of "back", "up"."""
+    """Direction of the retreat: back along the approach, or along up. One of "back", "up"."""
     @_builtins.property
     def obstacles(self) -> _containers.RepeatedCompositeFieldContainer[Global___Obstacle]:
-        """Solid boxes beside the cloud."""
+        """Solid boxes in addition to the cloud."""
 
     def __init__(
         self,
@@ -1155,7 +1154,7 @@ Global___Collision: _TypeAlias = Collision  # noqa: Y015
 
 @_typing.final
 class RobotArm(_message.Message):
-    """The arm that is to execute a grasp: each grasp is answered with how the arm gets there."""
+    """The arm that executes the grasp; each grasp in the answer has its joints and motion."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1172,14 +1171,14 @@ class RobotArm(_message.Message):
     "motion".
     """
     avoid_unseen: _builtins.bool
-    """Whether the arm keeps out of what no camera saw, behind what was seen."""
+    """Whether unseen space behind a surface is an obstacle of the arm."""
     @_builtins.property
     def T_base_cloud(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """Where the cloud's frame is in the arm's base frame: a 4 x 4 matrix, row by row."""
+        """Pose of the cloud's frame in the arm's base frame: a 4 x 4 matrix, row by row."""
 
     @_builtins.property
     def joints(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """The arm's joints now, radians or metres, in the order of the robot file."""
+        """Present joints of the arm, radians or metres, in the order of the robot file."""
 
     @_builtins.property
     def place(self) -> Global___Place:
@@ -1226,13 +1225,13 @@ class Place(_message.Message):
     REGION_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def T_base_object(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """Where the object's box, as `objects` in the answer have it, is to be in the arm's base frame:
-        a 4 x 4 matrix, row by row.
+        """Pose of the object's box, as in `objects` of the answer, in the arm's base frame: a 4 x 4
+        matrix, row by row.
         """
 
     @_builtins.property
     def region(self) -> Global___PlaceRegion:
-        """Where the whole object is to stand, turned about the vertical at will; the base frame's z is
+        """Box for the whole object, which may be turned about the vertical; the base frame's z must be
         up.
         """
 
@@ -1252,7 +1251,7 @@ Global___Place: _TypeAlias = Place  # noqa: Y015
 
 @_typing.final
 class PlaceRegion(_message.Message):
-    """An axis-aligned box in the arm's base frame, on whose bottom an object is put."""
+    """An axis-aligned box in the arm's base frame; an object is put on its bottom."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1282,7 +1281,7 @@ Global___PlaceRegion: _TypeAlias = PlaceRegion  # noqa: Y015
 
 @_typing.final
 class Suppression(_message.Message):
-    """Drop a grasp near a better one: nearer than both distances."""
+    """Drop a grasp that is nearer to a better one than both distances."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1319,7 +1318,7 @@ Global___Suppression: _TypeAlias = Suppression  # noqa: Y015
 
 @_typing.final
 class Previous(_message.Message):
-    """What an earlier answer found, which the next one keeps where it is still there."""
+    """Grasps and objects of an earlier answer, to be followed."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1329,12 +1328,12 @@ class Previous(_message.Message):
     OBJECTS_FIELD_NUMBER: _builtins.int
     SEARCH_FIELD_NUMBER: _builtins.int
     gripper: _builtins.str
-    """Its name in that answer."""
+    """Name of the gripper in that answer."""
     next_id: _builtins.int
     """As in that answer."""
     search: _builtins.bool
-    """Whether to look for other grasps too; false: only these are moved along and scored anew, which
-    takes a fraction of the time, best with the `support` of that answer.
+    """Whether to detect other grasps too; false: only these are moved and scored again, which takes a
+    fraction of the time; send the `support` of that answer.
     """
     @_builtins.property
     def grasps(self) -> _containers.RepeatedCompositeFieldContainer[Global___PreviousGrasp]:
@@ -1342,7 +1341,7 @@ class Previous(_message.Message):
 
     @_builtins.property
     def objects(self) -> _containers.RepeatedCompositeFieldContainer[Global___PreviousObject]:
-        """Those that the grasps are on, and others."""
+        """Objects of these grasps, and others."""
 
     def __init__(
         self,
@@ -1498,7 +1497,7 @@ class Indices(_message.Message):
     INDICES_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def indices(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
-        """Rows of the cloud as sent; row-major where organised."""
+        """Rows of the cloud as sent; row-major if organised."""
 
     def __init__(
         self,
@@ -1515,14 +1514,14 @@ Global___Indices: _TypeAlias = Indices  # noqa: Y015
 
 @_typing.final
 class Mask(_message.Message):
-    """Points by one truth value for each row of the cloud as it was sent."""
+    """Points by a truth value for each row of the cloud as it was sent."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
     MASK_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def mask(self) -> _containers.RepeatedScalarFieldContainer[_builtins.bool]:
-        """As many values as the cloud has rows; in JSON also base64 of a byte for each."""
+        """One value for each row of the cloud; in JSON also base64 of one byte each."""
 
     def __init__(
         self,
@@ -1548,11 +1547,11 @@ class OrientedBox(_message.Message):
     QUATERNION_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def center(self) -> Global___Vector:
-        """Its middle, metres."""
+        """Centre, metres."""
 
     @_builtins.property
     def half_extents(self) -> Global___Vector:
-        """Half its lengths along its own axes, metres."""
+        """Half lengths along the box's axes, metres."""
 
     @_builtins.property
     def quaternion(self) -> Global___Quaternion:
@@ -1575,7 +1574,7 @@ Global___OrientedBox: _TypeAlias = OrientedBox  # noqa: Y015
 
 @_typing.final
 class Segments(_message.Message):
-    """Points by the segment they belong to: `segment_ids`, sent beside the cloud."""
+    """Points by their segment in `segment_ids`, sent with the cloud."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1609,7 +1608,7 @@ class Sphere(_message.Message):
     """Metres."""
     @_builtins.property
     def center(self) -> Global___Vector:
-        """Its middle, metres."""
+        """Centre, metres."""
 
     def __init__(
         self,
@@ -1629,17 +1628,17 @@ Global___Sphere: _TypeAlias = Sphere  # noqa: Y015
 
 @_typing.final
 class Cone(_message.Message):
-    """Directions within an angle of one."""
+    """Directions within an angle of a given one."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
     DIRECTION_FIELD_NUMBER: _builtins.int
     MAX_ANGLE_FIELD_NUMBER: _builtins.int
     max_angle: _builtins.float
-    """Radians between it and the hand's way."""
+    """Greatest angle between it and the hand's direction, radians."""
     @_builtins.property
     def direction(self) -> Global___Vector:
-        """The way the hand moves toward the object, +z of the hand; any length but zero."""
+        """Direction in which the hand moves, its +z axis; any length but zero."""
 
     def __init__(
         self,
@@ -1894,7 +1893,7 @@ Global___Quaternion: _TypeAlias = Quaternion  # noqa: Y015
 
 @_typing.final
 class GripperChoice(_message.Message):
-    """A gripper by name, or its geometry; in JSON the one or the other without a field around it."""
+    """A gripper by name, or its geometry; in JSON the name or the geometry itself."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -2021,11 +2020,11 @@ class DetectGraspsResponse(_message.Message):
 
     @_builtins.property
     def warnings(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
-        """What the caller should know about the result, in words."""
+        """Warnings for the caller, in words."""
 
     @_builtins.property
     def debug(self) -> Global___DebugInfo:
-        """Set where options.debug is."""
+        """Set if options.debug is set."""
 
     @_builtins.property
     def support(self) -> Global___FoundSupport:
@@ -2037,15 +2036,15 @@ class DetectGraspsResponse(_message.Message):
 
     @_builtins.property
     def objects(self) -> _containers.RepeatedCompositeFieldContainer[Global___DetectedObject]:
-        """The objects that grasps are for, the largest first."""
+        """The recognised objects, the largest first."""
 
     @_builtins.property
     def gripper(self) -> Global___GripperOutline:
-        """The gripper that they are for."""
+        """The gripper of the grasps."""
 
     @_builtins.property
     def tracking(self) -> Global___Tracking:
-        """Set where options.previous is."""
+        """Set if options.previous is set."""
 
     def __init__(
         self,
@@ -2072,15 +2071,15 @@ Global___DetectGraspsResponse: _TypeAlias = DetectGraspsResponse  # noqa: Y015
 
 @_typing.final
 class Tracking(_message.Message):
-    """How an answer follows the one before, which options.previous tells."""
+    """How the answer continues the one in options.previous."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
     FIRST_FIELD_NUMBER: _builtins.int
     NEXT_ID_FIELD_NUMBER: _builtins.int
     first: _builtins.str
-    """What became of the first grasp: "started": there was none; "kept": it is the first again, moved
-    with its object; "replaced": another one is better by a margin; "lost": it is not there any more.
+    """State of the first grasp: "started": there was none; "kept": it is the first again, moved with
+    its object; "replaced": another one is better by a margin; "lost": it is not there any more.
     """
     next_id: _builtins.int
     """Above all ids of grasps and numbers of objects so far."""
@@ -2100,7 +2099,7 @@ Global___Tracking: _TypeAlias = Tracking  # noqa: Y015
 
 @_typing.final
 class GripperOutline(_message.Message):
-    """A gripper, as far as drawing it needs; metres along the z of the hand frame."""
+    """The dimensions of a gripper for drawing it; metres along the z of the hand frame."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -2167,7 +2166,7 @@ Global___FoundSupport: _TypeAlias = FoundSupport  # noqa: Y015
 
 @_typing.final
 class DetectedObject(_message.Message):
-    """An object that grasps are for; cloud frame, metres."""
+    """A recognised object; cloud frame, metres."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -2181,26 +2180,26 @@ class DetectedObject(_message.Message):
     REASON_FIELD_NUMBER: _builtins.int
     SURFACE_FIELD_NUMBER: _builtins.int
     number: _builtins.int
-    """As in Grasp.object; the segment, where segment_ids were sent."""
+    """As in Grasp.object; the segment, if segment_ids were sent."""
     points: _builtins.int
-    """Voxels of the processed cloud that are seen of it."""
+    """Number of its voxels in the processed cloud."""
     best_score: _builtins.float
-    """Best of the scores of the grasps returned; absent (null in JSON): there is none on it."""
+    """Best score of the returned grasps on it; absent (null in JSON): none."""
     confidence: _builtins.float
     """Probability that it is an object, a factor of its grasps' scores; absent (null in JSON): the
-    caller named it.
+    caller gave it.
     """
     reason: _builtins.str
-    """Why it has no grasp of a score of 0.5 and more: too-wide, too-flat, blocked or hidden; absent
-    (null in JSON): it has one, or none of these is why.
+    """Why it has no grasp of a score of 0.5 or more: too-wide, too-flat, blocked or hidden; absent
+    (null in JSON): it has one, or there is another reason.
     """
     @_builtins.property
     def center(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """3 floats: the middle of the smallest upright box around them."""
+        """3 floats: the centre of the smallest upright box around them."""
 
     @_builtins.property
     def half_extents(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """3 floats: half its lengths along its own axes, the last of which is up."""
+        """3 floats: half lengths of that box along its axes, the last of which is up."""
 
     @_builtins.property
     def quaternion(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
@@ -2208,7 +2207,7 @@ class DetectedObject(_message.Message):
 
     @_builtins.property
     def surface(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """K * 3 floats: points by which it is found again in the next cloud; empty (null in JSON) without
+        """K * 3 floats: points with which the next request finds it again; empty (null in JSON) without
         options.previous.
         """
 
@@ -2268,13 +2267,13 @@ class Grasp(_message.Message):
     width: _builtins.float
     """Opening to approach with, metres; the hand's maximum if far_side_hidden."""
     collision_free: _builtins.bool
-    """Whether the open hand meets nothing at the grasp and on its ways."""
+    """Whether the open hand touches nothing at the grasp and along its approach and retreat."""
     clearance: _builtins.float
     """Metres from the open hand at the grasp to the nearest surface; 0 or less: within it."""
     object: _builtins.int
-    """Number of the object that the contact point is on; absent (null in JSON): of none."""
+    """Number of the object that the contact point is on; absent (null in JSON): no object."""
     id: _builtins.int
-    """The same in every answer that follows this grasp; absent (null in JSON) without
+    """The same in every answer while this grasp is followed; absent (null in JSON) without
     options.previous.
     """
     far_side_hidden: _builtins.bool
@@ -2301,8 +2300,8 @@ class Grasp(_message.Message):
 
     @_builtins.property
     def arm(self) -> Global___ArmPlan:
-        """How the robot's arm gets there; absent (null in JSON): no robot was asked about, or there was
-        no time for it.
+        """Joints and motion of the robot's arm; absent (null in JSON): no robot was given, or time ran
+        out.
         """
 
     def __init__(
@@ -2339,7 +2338,7 @@ Global___Grasp: _TypeAlias = Grasp  # noqa: Y015
 
 @_typing.final
 class ArmPlan(_message.Message):
-    """How an arm gets to a grasp. J joints, in the order of the robot file."""
+    """Joints and motion of an arm to a grasp. J joints, in the order of the robot file."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -2350,28 +2349,26 @@ class ArmPlan(_message.Message):
     PLACE_JOINTS_FIELD_NUMBER: _builtins.int
     T_BASE_PLACE_FIELD_NUMBER: _builtins.int
     reachable: _builtins.bool
-    """Whether it gets to the pregrasp and straight on, and to where it puts the object, touching
-    nothing.
-    """
+    """Whether it reaches the pregrasp, the grasp and the place without a collision."""
     @_builtins.property
     def pregrasp_joints(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """J radians (metres of sliding joints) where it is reachable; else absent (null in JSON)."""
+        """J radians (metres of sliding joints) if reachable; else absent (null in JSON)."""
 
     @_builtins.property
     def grasp_joints(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """J radians (metres of sliding joints) where it is reachable; else absent (null in JSON)."""
+        """J radians (metres of sliding joints) if reachable; else absent (null in JSON)."""
 
     @_builtins.property
     def trajectory(self) -> Global___ArmTrajectory:
-        """Where it was asked for and found in time; else absent (null in JSON)."""
+        """If requested and found in time; else absent (null in JSON)."""
 
     @_builtins.property
     def place_joints(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """J radians (metres of sliding joints) where it lets go; absent (null in JSON) without a place."""
+        """J radians (metres of sliding joints) at the release; absent (null in JSON) without a place."""
 
     @_builtins.property
     def T_base_place(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """16 floats, 4 x 4 row-major: the hand where it lets go, in the arm's base frame; absent (null in
+        """16 floats, 4 x 4 row-major: the hand at the release, in the arm's base frame; absent (null in
         JSON) without a place.
         """
 
@@ -2453,7 +2450,7 @@ Global___ArmTrajectory: _TypeAlias = ArmTrajectory  # noqa: Y015
 
 @_typing.final
 class DebugInfo(_message.Message):
-    """The processed cloud and every candidate, whatever became of it. V points, E candidates."""
+    """The processed cloud and every candidate with its outcome. V points, E candidates."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -2492,7 +2489,7 @@ class DebugInfo(_message.Message):
 
     @_builtins.property
     def outcome(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
-        """E words: "returned", or what became of it."""
+        """E words: "returned", or why it was not."""
 
     @_builtins.property
     def support_plane(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
@@ -2590,7 +2587,7 @@ class ScoreGraspsResponse(_message.Message):
 
     @_builtins.property
     def warnings(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
-        """What the caller should know about the result, in words."""
+        """Warnings for the caller, in words."""
 
     def __init__(
         self,
@@ -2611,17 +2608,17 @@ Global___ScoreGraspsResponse: _TypeAlias = ScoreGraspsResponse  # noqa: Y015
 
 @_typing.final
 class Evaluation(_message.Message):
-    """What the network says of one edge or hand pose."""
+    """The network's score of one edge or hand pose."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
     GRASP_FIELD_NUMBER: _builtins.int
     REASON_FIELD_NUMBER: _builtins.int
     reason: _builtins.str
-    """Why it defines none, in a word; null in JSON where it defines one."""
+    """Why it defines none, in a word; null in JSON if it defines one."""
     @_builtins.property
     def grasp(self) -> Global___Grasp:
-        """Absent (null in JSON) where it defines no grasp."""
+        """Absent (null in JSON) if it defines no grasp."""
 
     def __init__(
         self,
@@ -2728,9 +2725,9 @@ class Robot(_message.Message):
     AXES_FIELD_NUMBER: _builtins.int
     SLIDING_FIELD_NUMBER: _builtins.int
     name: _builtins.str
-    """What options.robot.name takes."""
+    """Value of options.robot.name."""
     gripper: _builtins.str
-    """The gripper on it, which grasps are for."""
+    """Its gripper."""
     base_frame: _builtins.str
     """Link that T_base_cloud refers to."""
     @_builtins.property
@@ -2739,7 +2736,7 @@ class Robot(_message.Message):
 
     @_builtins.property
     def home(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """J, joints at which it touches nothing of itself."""
+        """J, joints without a collision of the arm with itself."""
 
     @_builtins.property
     def lower(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
@@ -2759,11 +2756,11 @@ class Robot(_message.Message):
 
     @_builtins.property
     def axes(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """J * 3: what each joint turns about, or slides along, in its own frame; unit."""
+        """J * 3: axis of each joint in its own frame; unit."""
 
     @_builtins.property
     def sliding(self) -> _containers.RepeatedScalarFieldContainer[_builtins.bool]:
-        """J: whether it slides."""
+        """J: whether the joint is prismatic."""
 
     def __init__(
         self,
@@ -2811,7 +2808,7 @@ class ReloadModelsResponse(_message.Message):
     MODELS_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def models(self) -> _containers.RepeatedCompositeFieldContainer[Global___Model]:
-        """What is loaded now."""
+        """The loaded weights."""
 
     def __init__(
         self,
@@ -2843,7 +2840,7 @@ class Model(_message.Message):
     HAND_DESCRIPTION_FIELD_NUMBER: _builtins.int
     DEVICE_FIELD_NUMBER: _builtins.int
     name: _builtins.str
-    """What options.model takes."""
+    """Value of options.model."""
     architecture: _builtins.str
     """Network architecture."""
     digest: _builtins.str
@@ -2886,7 +2883,7 @@ Global___Model: _TypeAlias = Model  # noqa: Y015
 
 @_typing.final
 class ErrorDetail(_message.Message):
-    """What is wrong with a request; in the trailing metadata under `edgegrasp-error-bin`."""
+    """The error of a request; in the trailing metadata under `edgegrasp-error-bin`."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -2904,7 +2901,7 @@ class ErrorDetail(_message.Message):
     fix: _builtins.str
     """What to send instead, in words."""
     retry_after: _builtins.float
-    """Seconds until another try is worth it; as Retry-After over HTTP."""
+    """Seconds after which to retry; Retry-After over HTTP."""
     def __init__(
         self,
         *,
