@@ -1,7 +1,8 @@
 import contextlib
-import importlib
+import importlib.util
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -32,6 +33,7 @@ settings.register_profile(
 )
 settings.load_profile("tests")
 
+WEIGHTS = Path(__file__).parents[1] / "model" / "edgegrasp_model" / "weights"
 READY_LINE = re.compile(r"EdgeGrasp serves HTTP (\S+) gRPC (\S+)\n")
 
 
@@ -48,6 +50,7 @@ class RunningServer:
     http_url: str
     grpc_address: str
     process: subprocess.Popen[str]
+    mine: Path | None = None  # weights that a test may replace
 
     def address(self, transport: str) -> str:
         return self.http_url if transport == "rest" else self.grpc_address
@@ -84,20 +87,20 @@ def running_server(
 
 
 @pytest.fixture(scope="session")
-def start_server() -> Callable[..., contextlib.AbstractContextManager[RunningServer]]:
-    return running_server
-
-
-@pytest.fixture(scope="session")
-def real_server() -> Iterator[RunningServer]:
-    """A server with the weights that ship."""
-    with running_server("--workers", "1", "--log-level", "warning") as server:
+def real_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
+    """A server with the weights that ship, a copy of others as `mine`, and an arm if installed."""
+    mine = tmp_path_factory.mktemp("weights") / "mine.safetensors"
+    shutil.copy(WEIGHTS / "edgegrasp.safetensors", mine)
+    flags = ("--weights", str(mine), "--workers", "2", "--max-voxels", "10000000")
+    robots = ("--robots", "fr3") if importlib.util.find_spec("roboplan") else ()
+    with running_server(*flags, *robots, "--log-level", "warning") as server:
+        server.mine = mine
         yield server
 
 
 @pytest.fixture(scope="session")
 def start_dummy() -> Callable[..., contextlib.AbstractContextManager[RunningServer]]:
-    """As `start_server`, with the dummy detector, which takes `seconds`."""
+    """Start a server with the dummy detector, which takes `seconds`."""
     return partial(running_server, program=("-P", serve_dummy.__file__))
 
 

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edgegrasp_model.candidates.collision import hits_cloud
-from edgegrasp_model.candidates.edge_grasps import TIP_MARGIN, edge_grasps, support_clearance
+from edgegrasp_model.candidates.edge_grasps import TIP_MARGIN, support_clearance
 from edgegrasp_model.candidates.outline import MAX_INSERTION
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidGripper, InvalidRequest
@@ -20,27 +19,18 @@ from edgegrasp_model.gripper import (
     gripper_names,
     load_gripper,
 )
-from edgegrasp_model.hand_description import Surroundings, describe_hands
-from edgegrasp_model.options import Collision, DetectOptions, GripperGeometry, SupportPlane
-from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_model.options import DetectOptions, GripperGeometry, SupportPlane
 
 from .scenes import PANDA, VIEW, box_on_table, detector
 
 GRIPPERS = [load_gripper(name) for name in gripper_names()]
 LINKAGES = [gripper for gripper in GRIPPERS if gripper.linkage is not None]
 by_name = pytest.mark.parametrize("gripper", GRIPPERS, ids=lambda gripper: gripper.name)
-HAND = np.eye(4, dtype=np.float32)[None]
 with_linkage = pytest.mark.parametrize("gripper", LINKAGES, ids=lambda gripper: gripper.name)
 
 
 def panda_fields() -> dict[str, Any]:
     return tomllib.loads((GRIPPER_FOLDER / "panda.toml").read_text())
-
-
-def edge_cloud(along: float, depth: float) -> Cloud:
-    """p_a over p_c: the hand comes down, its fingers close along y."""
-    points = np.array([[0.1, 0.2, 0.3], [0.1, 0.2 + along, 0.3 - depth]], np.float32)
-    return Cloud(points, np.array([[0, 0, 1], [0, 1, 0]], np.float32))
 
 
 @by_name
@@ -78,26 +68,6 @@ def test_a_swinging_gripper_stays_clear_of_the_support_as_it_closes(gripper: Gri
     clearance = support_clearance(down, floor, gripper)[0]
     lowest = min(0.5 - gripper.boxes(w)[:, 1, 2].max() for w in np.linspace(0, 0.08, 40))
     assert clearance == pytest.approx(lowest, abs=1e-5)
-
-
-@by_name
-def test_points_inside_any_box_collide_and_are_described(gripper: Gripper) -> None:
-    boxes = gripper.boxes(gripper.max_opening)
-    centres = boxes.mean(axis=1).astype(np.float32)
-    between = np.array([[0.0, 0.0, gripper.contact_z]], np.float32)
-    for point, hits in [(c[None], True) for c in centres] + [(between, False)]:
-        cloud = Cloud(point, np.zeros_like(point))
-        assert hits_cloud(cloud, HAND, gripper, Collision()).tolist() == [hits]
-    cloud = edge_cloud(0.02, 0.01)
-    pose = edge_grasps(cloud, np.array([0]), np.array([1]), gripper)
-    points = centres @ pose.T_cloud_hand[0, :3, :3].T + pose.T_cloud_hand[0, :3, 3]
-    seen = Cloud(np.vstack([cloud.points, points]), np.ones((2 + len(points), 3), np.float32))
-    up = np.array([0.0, 0.0, 1.0], np.float32)
-    described = describe_hands(Surroundings(seen, up), pose, gripper)[0]
-    fingers, hands = len(gripper.finger_boxes), len(gripper.hand_boxes)
-    # Centres of overlapping boxes lie in one region or the other, never in none.
-    assert np.expm1(described[:2]).round().tolist() == [fingers, fingers]
-    assert np.expm1(described[2]).round() >= hands
 
 
 @pytest.mark.parametrize(

@@ -92,27 +92,6 @@ def test_neither_single_precision_nor_recorded_gradients_change_a_score(architec
 
 
 @architectures
-def test_gradients_reach_every_parameter(architecture):
-    network = build_network(TINY[architecture]).double()
-    network(RandomScene.of_seed(1).batch()).square().sum().backward()
-    for name, parameter in network.named_parameters():
-        if ".reach." in name:  # chooses a vector: see Furthest
-            continue
-        assert parameter.grad is not None, name
-        assert parameter.grad.isfinite().all(), name
-        assert parameter.grad.abs().max() > 0, name
-
-
-def test_one_seed_makes_one_network_and_leaves_the_global_stream_alone():
-    config, state = TINY["edgegrasp"], torch.random.get_rng_state()
-    first, again = build_network(config), build_network(config)
-    other = build_network(config, torch.Generator().manual_seed(1))
-    assert torch.equal(torch.random.get_rng_state(), state)
-    assert torch.equal(first.join.weight, again.join.weight)
-    assert not torch.equal(first.join.weight, other.join.weight)
-
-
-@architectures
 def test_a_batch_without_grasps_has_no_scores(architecture):
     empty = replace(RandomScene.of_seed(1), edges=np.empty((0, 2), dtype=np.int64))
     assert scores(build_network(TINY[architecture]), empty.batch(torch.float32)).shape == (0,)

@@ -92,11 +92,10 @@ def test_several_views(real_server) -> None:
     assert len(printed) == 2
 
 
-def test_pick_and_place(start_server) -> None:
+def test_pick_and_place(real_server) -> None:
     pytest.importorskip("pybullet", reason="pybullet is not installed")
     pytest.importorskip("roboplan", reason="the extra robot is not installed")
-    with start_server("--workers", "1", "--robots", "fr3") as server:
-        shown = example("pick_and_place.py", server.grpc_address)
+    shown = example("pick_and_place.py", real_server.grpc_address)
     inside = re.search(r"(\d) of 4 objects in the tray", shown)
     assert inside is not None
     assert int(inside[1]) >= 2

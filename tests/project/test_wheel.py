@@ -128,9 +128,9 @@ def test_the_base_install_alone_asks_a_server(built, dummy_server, tmp_path: Pat
     """The client and the ROS 2 bridge without any extra, with the lowest numpy on 3.10."""
     program = oldest_python()
     lowest = program != sys.executable
-    subprocess.run([program, "-m", "venv", str(tmp_path / "venv")], check=True)
+    subprocess.run([program, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
     python = str(tmp_path / "venv/bin/python")
-    pip = [python, "-m", "pip", "install", "--quiet", "--no-cache-dir"]
+    pip = [sys.executable, "-m", "pip", f"--python={python}", "install", "--quiet"]
     pinned = ["numpy==1.24.*"] if lowest else ["-c", str(ROOT / "constraints.txt")]
     reached = subprocess.run([*pip, "numpy", *pinned], capture_output=True, text=True, check=False)
     if reached.returncode:

@@ -3,7 +3,6 @@
 import asyncio
 import dataclasses
 import os
-import shutil
 import subprocess
 import sys
 from collections import Counter
@@ -18,7 +17,6 @@ import pytest
 from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_service.errors import STATUS, kind_of
 from edgegrasp_service.observability import Call
 from edgegrasp_service.server import Server
@@ -26,17 +24,6 @@ from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.pool import ONE_THREAD
 
 PATIENCE = 20  # seconds; longer than anything takes
-
-
-@pytest.fixture(scope="session")
-def real_server(start_server: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """The weights that ship, and `mine`: a copy of others that a test may replace."""
-    mine = tmp_path_factory.mktemp("weights") / "mine.safetensors"
-    shutil.copy(WEIGHTS_FOLDER / "edgegrasp.safetensors", mine)
-    flags = ("--weights", str(mine), "--workers", "2", "--max-voxels", "10000000")
-    with start_server(*flags) as server:
-        server.mine = mine
-        yield server
 
 
 @dataclass

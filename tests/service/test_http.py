@@ -133,12 +133,3 @@ async def test_every_answer_says_what_a_browser_may_do_with_it(serve) -> None:
             headers = (await http.get(path)).headers
             assert "frame-ancestors 'none'" in headers["content-security-policy"]
             assert headers["x-content-type-options"] == "nosniff"
-
-
-async def test_timeouts_are_plain_numbers(serve, cloud) -> None:
-    running = await serve()
-    async with httpx.AsyncClient(base_url=running.server.http_url, timeout=20) as http:
-        for text, status in (("1_0", 400), ("nan", 400), ("1e999", 400), ("20", 200), ("2e1", 200)):
-            headers = {"X-Request-Timeout": text}
-            answer = await http.post("/v1/grasps", json={"points": cloud.tolist()}, headers=headers)
-            assert answer.status_code == status

@@ -173,28 +173,27 @@ def test_objects_and_points_are_asked_for_and_answers_saved(real_server, open_pa
     assert len({*seen}) == len(seen)
 
 
-def test_an_arm_is_drawn_and_moves(start_server, open_page) -> None:
+def test_an_arm_is_drawn_and_moves(real_server, open_page) -> None:
     pytest.importorskip("roboplan", reason="the extra robot is not installed")
-    with start_server("--workers", "1", "--robots", "fr3", "--log-level", "warning") as server:
-        page = open_page(server.http_url)
-        page.get_by_text("detecting, by").wait_for()
-        without = page.locator("#stage").screenshot()
-        with page.expect_response(f"{server.http_url}/v1/grasps") as answered:
-            page.locator("#robot").select_option("fr3")
-        best = answered.value.json()["grasps"][0]
-        page.locator("#play").wait_for()
-        assert len(page.locator("#base").input_value().split(",")) == 16
-        assert "within reach" in page.inner_text("#numbers")
-        assert f"{best['arm']['trajectory']['times'][-1]:.1f} s" in page.inner_text("#numbers")
-        page.locator("[data-look=side]").click()
-        save_screenshot(page)
-        at_grasp = page.locator("#stage").screenshot()
-        assert at_grasp != without
-        page.locator("#play").click()
-        assert page.locator("#stage").screenshot() != at_grasp
-        page.locator("#robot").select_option("")
-        page.get_by_text("detecting, by").wait_for()
-        assert not page.locator("#play").is_visible()
+    page = open_page(real_server.http_url)
+    page.get_by_text("detecting, by").wait_for()
+    without = page.locator("#stage").screenshot()
+    with page.expect_response(f"{real_server.http_url}/v1/grasps") as answered:
+        page.locator("#robot").select_option("fr3")
+    best = answered.value.json()["grasps"][0]
+    page.locator("#play").wait_for()
+    assert len(page.locator("#base").input_value().split(",")) == 16
+    assert "within reach" in page.inner_text("#numbers")
+    assert f"{best['arm']['trajectory']['times'][-1]:.1f} s" in page.inner_text("#numbers")
+    page.locator("[data-look=side]").click()
+    save_screenshot(page)
+    at_grasp = page.locator("#stage").screenshot()
+    assert at_grasp != without
+    page.locator("#play").click()
+    assert page.locator("#stage").screenshot() != at_grasp
+    page.locator("#robot").select_option("")
+    page.get_by_text("detecting, by").wait_for()
+    assert not page.locator("#play").is_visible()
 
 
 def save_screenshot(page: Any) -> None:

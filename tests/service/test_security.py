@@ -27,7 +27,7 @@ from edgegrasp_service.errors import (
     Unauthenticated,
 )
 from edgegrasp_service.probe import is_ready, read_settings
-from edgegrasp_service.security import ServerTls, Tokens, load_tokens
+from edgegrasp_service.security import ServerTls, load_tokens
 from edgegrasp_service.server import warn
 from edgegrasp_service.settings import Settings
 
@@ -277,12 +277,6 @@ def test_check(header, admin, error, tmp_path) -> None:
     else:
         with pytest.raises(error):
             known.check(header, admin=admin)
-
-
-def test_without_tokens_all_but_administration_is_open() -> None:
-    Tokens().check(None)
-    with pytest.raises(PermissionDenied, match="SIGHUP"):
-        Tokens().check(f"Bearer {ADMIN}", admin=True)
 
 
 def test_tokens_have_names(tmp_path: Path) -> None:
