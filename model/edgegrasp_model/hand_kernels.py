@@ -41,6 +41,17 @@ def any_point_in_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -
     return hit
 
 
+def any_point_on_way(
+    points: Float32, T_cloud_hand: Float32, boxes: Float64, way: Float32
+) -> Bools:
+    """As `any_point_in_boxes`, of hands that move straight along `way` (3,), cloud frame."""
+    turn, shift = _to_hand(T_cloud_hand)
+    hit = np.zeros(len(turn), dtype=np.bool_)
+    lift = np.ascontiguousarray(turn @ way.astype(np.float32))
+    _meet_on_way(columns_of(points), turn, shift, boxes.astype(np.float32), lift, hit)
+    return hit
+
+
 def signed_distance_to_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Float32:
     """Signed distance (E,) of points (N, 3) to the boxes (B, 2, 3) of each hand, the least."""
     turn, shift = _to_hand(T_cloud_hand)
@@ -304,6 +315,52 @@ def _meet(columns: Float32, turn: Float32, shift: Float32, boxes: Float32, hit: 
                     inside += _count_between(columns, k, turn[e], shift[e], low, high)
             if inside:
                 hit[e] = True
+                break
+
+
+@compiled("contract")
+def _count_on_way(
+    columns: Float32,
+    k: int,
+    turn: Float32,
+    shift: Float32,
+    low: Float32,
+    high: Float32,
+    per_way: Float32,
+) -> int:
+    """How many points of block k a box passes over; `per_way` (3,): 1 / its way, hand frame."""
+    start, stop = k * BLOCK, (k + 1) * BLOCK
+    xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
+    found = 0
+    for i in range(len(xs)):
+        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        # Shares of the way at which the point enters and leaves the box along each axis.
+        x0, x1 = (x - high[0]) * per_way[0], (x - low[0]) * per_way[0]
+        y0, y1 = (y - high[1]) * per_way[1], (y - low[1]) * per_way[1]
+        z0, z1 = (z - high[2]) * per_way[2], (z - low[2]) * per_way[2]
+        enter = max(min(x0, x1), min(y0, y1), min(z0, z1), np.float32(0.0))
+        leave = min(max(x0, x1), max(y0, y1), max(z0, z1), np.float32(1.0))
+        found += enter < leave
+    return found
+
+
+@compiled("contract")
+def _meet_on_way(
+    columns: Float32, turn: Float32, shift: Float32, boxes: Float32, lift: Float32, hit: Bools
+) -> None:
+    sphere = _blocks(columns)
+    none = np.float32(0.0)
+    for e in range(len(turn)):
+        below, above = np.minimum(lift[e], none), np.maximum(lift[e], none)
+        per_way = np.float32(1.0) / np.where(np.abs(lift[e]) < SLACK, np.float32(SLACK), lift[e])
+        for b in range(len(boxes)):
+            low, high = boxes[b]
+            for k in range(len(sphere)):
+                if _may_reach(sphere[k], turn[e], shift[e], low + below, high + above):
+                    if _count_on_way(columns, k, turn[e], shift[e], low, high, per_way):
+                        hit[e] = True
+                        break
+            if hit[e]:
                 break
 
 

@@ -14,24 +14,18 @@ NEAR = 0.006  # metres around a finger that count as near it
 APPROACH_LENGTH = 0.05  # metres of straight approach that the hand description looks at
 
 
-def reach_of(
-    gripper: Gripper, around: float = NEAR, back: float = APPROACH_LENGTH, lift: float = 0.0
-) -> Float32:
-    """Bounds of what a gripper's boxes and their straight motions can reach.
+def reach_of(gripper: Gripper) -> Float32:
+    """Bounds of what a gripper's boxes meet on a straight approach, and of what is near them.
 
     Args:
         gripper: Open to its maximum.
-        around: Metres on every side of a box; never less than NEAR.
-        back: Metres of motion along -z; never less than APPROACH_LENGTH.
-        lift: Metres of motion in an unknown direction.
 
     Returns:
         (2, 3) lowest and highest corner, hand frame.
     """
     boxes = gripper.open_boxes
-    around, back = max(around, NEAR) + lift, max(back, APPROACH_LENGTH)
-    low = boxes[:, 0].min(axis=0) - np.array([around, around, back + around - NEAR])
-    high = boxes[:, 1].max(axis=0) + np.array([around, around, around + NEAR])
+    low = boxes[:, 0].min(axis=0) - np.array([NEAR, NEAR, APPROACH_LENGTH])
+    high = boxes[:, 1].max(axis=0) + np.array([NEAR, NEAR, 2 * NEAR])
     high[2] += gripper.max_tip_z - gripper.tip_z
     return np.stack([low, high]).astype(np.float32)
 

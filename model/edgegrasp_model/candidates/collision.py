@@ -9,10 +9,11 @@ from edgegrasp_model.candidates.edge_grasps import support_clearance
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import (
     any_point_in_boxes,
+    any_point_on_way,
     points_in_hand_boxes,
     signed_distance_to_boxes,
 )
-from edgegrasp_model.hand_view import HandView, hand_views, reach_of
+from edgegrasp_model.hand_view import HandView
 from edgegrasp_model.options import Collision, SupportPlane
 from edgegrasp_model.scene.cloud import UP, Cloud
 from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
@@ -80,12 +81,8 @@ def hits_cloud(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper, request: C
     hit = any_point_in_boxes(cloud.points, T_cloud_hand, swept)
     if request.retreat_direction == "up" and request.retreat_length > 0:
         free = np.flatnonzero(~hit)
-        back, up = approach_sweep_length(request), request.retreat_length
-        reach = reach_of(gripper, around=request.margin, back=back, lift=up)
-        view = hand_views(cloud, T_cloud_hand[free], reach)
-        lift = up * (UP @ T_cloud_hand[free, :3, :3])[view.candidate]
-        for low, high in boxes:
-            hit[free[view.candidate[_swept_over(view.position, lift, low, high)]]] = True
+        way = request.retreat_length * UP
+        hit[free] = any_point_on_way(cloud.points, T_cloud_hand[free], boxes, way)
     return hit
 
 
@@ -153,14 +150,6 @@ def swept_boxes(boxes: Float64, request: Collision) -> Float64:
     swept = boxes.copy()
     swept[:, 0, 2] -= approach_sweep_length(request)
     return swept
-
-
-def _swept_over(position: Float32, lift: Float32, low: Float64, high: Float64) -> Bools:
-    """Which points (P, 3) a box (3,), (3,) passes over while it moves by `lift` (P, 3)."""
-    step = np.where(np.abs(lift) < 1e-12, 1e-12, lift)
-    one, other = (position - high) / step, (position - low) / step  # shares of the way
-    enter, leave = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
-    return np.asarray((enter < leave) & (enter < 1.0) & (leave > 0.0))
 
 
 def _nearest_obstacle(
