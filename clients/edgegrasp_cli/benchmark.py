@@ -48,7 +48,10 @@ class Cluster(BaseModel):
 class BenchmarkFlags(Cluster):
     """The flags of `edgegrasp benchmark`."""
 
-    scene: str = Field("pile", description="packed, pile, bin, bin-full, table or shelf")
+    scene: str | None = Field(
+        None,
+        description="packed, pile, bin, bin-full, table or shelf; else the protocol's, or pile",
+    )
     protocol: str = Field(
         "edgegrasp",
         description="edgegrasp, giga, vgn, bin, table, shelf, ur5-pile, or a .toml file like them",
@@ -112,7 +115,7 @@ def benchmark(
         folder = ResultFolder(asked.output) if asked.output is not None else None
         done, title = run_rounds(config, choice, folder, workers=asked.workers, ray=asked.ray)
     summary = {
-        "scene": asked.scene,
+        "scene": config.scene.value,
         "engine": config.engine,
         "protocol": config.protocol.name,
         "protocol_version": config.protocol.version,
@@ -162,7 +165,7 @@ def _plan(
         asked.robot,
     )
     config = BenchmarkConfig(
-        SceneKind(asked.scene),
+        SceneKind(asked.scene or rules.kind or SceneKind.PILE),
         rules.rounds if asked.rounds is None else asked.rounds,
         asked.seed or rules.seeds,
         rules,

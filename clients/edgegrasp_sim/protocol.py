@@ -135,6 +135,7 @@ class Protocol:
         noise: of what it sees.
         planning: what a planner is given.
         engine: the physics engine that its figures are of; empty: any.
+        kind: of the scenes that it is meant for; None: packed ones and piles.
     """
 
     name: str
@@ -148,15 +149,16 @@ class Protocol:
     noise: NoiseRules
     planning: PlanningRules
     engine: str = ""
+    kind: SceneKind | None = None
 
     def num_objects(self, index: int) -> int:
         """How many objects to try to place in a round."""
         return self.scene.num_objects[index % len(self.scene.num_objects)]
 
     def to_json(self) -> dict[str, Any]:
-        """All constants but the engine, which a result names by itself; ready for JSON."""
+        """All constants but engine and kind, which a result names by itself; ready for JSON."""
         table = asdict(self)
-        del table["engine"]
+        del table["engine"], table["kind"]
         if not self.noise.sensor:  # so that earlier results can be resumed
             del table["noise"]["sensor"]
         return table

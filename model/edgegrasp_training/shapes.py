@@ -138,8 +138,11 @@ def drawn_shape(index: int) -> str:
     if not 0 <= index < NUM_DRAWN:
         raise IndexError(f"drawn shape {index} of {NUM_DRAWN}")
     rng = np.random.default_rng([NUM_FREE, index])
-    if index >= NUM_FREE:
-        return as_obj([_surface(_plain(rng))])
+    return as_obj([_surface(_plain(rng))]) if index >= NUM_FREE else free_shape(rng, index)
+
+
+def free_shape(rng: np.random.Generator, index: int) -> str:
+    """A shape as an OBJ file in metres, of one of eight kinds in turn."""
     parts = _KINDS[index % len(_KINDS)](rng)
     extents = np.ptp(np.concatenate([part.reshape(-1, 3) for part in parts]), axis=0)
     scale = rng.uniform(*LONGEST) / extents.max()

@@ -71,6 +71,12 @@ def test_the_report_shows_tables_and_pictures(top_down: Path) -> None:
     assert all(name in page for name in figures(top_down)["objects_by_name"])
 
 
+def test_a_protocol_brings_its_scene(run, tmp_path) -> None:
+    where = ("--planner", TOP_DOWN, "--rounds", 1, "--no-report", "--output", tmp_path)
+    run("benchmark", "--protocol", "shelf", *where)
+    assert figures(tmp_path)["scene"] == "shelf"
+
+
 def test_a_recorded_attempt_comes_out_the_same(in_process: Path, run, tmp_path: Path) -> None:
     last = attempts(in_process)[-1]
     where = ("--round", last["round"], "--attempt", last["attempt"])

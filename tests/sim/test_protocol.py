@@ -12,7 +12,7 @@ def test_a_protocol_comes_back_from_a_manifest() -> None:
     for name in protocol_names():
         protocol = load_protocol(name)
         assert protocol_from(json.loads(json.dumps(protocol.to_json()))) == replace(
-            protocol, engine=""
+            protocol, engine="", kind=None
         )
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks import ur5_objects
 
 from edgegrasp_sim.engine import make_world
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
@@ -119,3 +120,15 @@ def test_household_objects_are_hollow_in_the_engine_and_read_again_from_their_fo
             over_wall = start * (0, 0, 1) + wall, end * (0, 0, 1) + wall
             assert world.first_hits(start, end) == [-1]
             assert world.first_hits(*over_wall) == [body.uid]
+
+
+def test_objects_of_the_ur5_protocols_stay_the_same_and_are_new(tmp_path: Path) -> None:
+    first, again = tmp_path / "first", tmp_path / "again"
+    for folder in (first, again):
+        ur5_objects.write(folder)
+    files = [file.relative_to(first) for file in sorted(first.glob("*/*"))]
+    assert all((first / file).read_bytes() == (again / file).read_bytes() for file in files)
+    assert len(ObjectSet.from_folder(first / "hard", SceneKind.PILE).models) == 20
+    shapes = {file.read_text() for file in first.glob("adversarial/*.obj")}
+    assert len(shapes) == 8
+    assert not shapes & {drawn_shape(index) for index in range(NUM_DRAWN)}
