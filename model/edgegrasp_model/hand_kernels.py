@@ -41,9 +41,7 @@ def any_point_in_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -
     return hit
 
 
-def any_point_on_way(
-    points: Float32, T_cloud_hand: Float32, boxes: Float64, way: Float32
-) -> Bools:
+def any_point_on_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, way: Float32) -> Bools:
     """As `any_point_in_boxes`, of hands that move straight along `way` (3,), cloud frame."""
     turn, shift = _to_hand(T_cloud_hand)
     hit = np.zeros(len(turn), dtype=np.bool_)
@@ -356,10 +354,10 @@ def _meet_on_way(
         for b in range(len(boxes)):
             low, high = boxes[b]
             for k in range(len(sphere)):
-                if _may_reach(sphere[k], turn[e], shift[e], low + below, high + above):
-                    if _count_on_way(columns, k, turn[e], shift[e], low, high, per_way):
-                        hit[e] = True
-                        break
+                near = _may_reach(sphere[k], turn[e], shift[e], low + below, high + above)
+                if near and _count_on_way(columns, k, turn[e], shift[e], low, high, per_way):
+                    hit[e] = True
+                    break
             if hit[e]:
                 break
 
