@@ -13,21 +13,13 @@ SETTLE_SECONDS = 0.25  # at the grasp and at the end, in which the joints arrive
 
 
 class ArmMotion(Protocol):
-    """A timed motion of J joints: to the pregrasp, on to the grasp, and away with what is held.
+    """A timed motion of J joints: to the pregrasp, on to the grasp, and away with what is held."""
 
-    Attributes:
-        times: (T,) seconds.
-        positions: (T, J) radians or metres.
-        velocities: (T, J).
-        pregrasp_row: where the straight way in begins.
-        grasp_row: where the fingers close.
-    """
-
-    times: Any
-    positions: Any
-    velocities: Any
-    pregrasp_row: int
-    grasp_row: int
+    times: Any  # (T,) seconds
+    positions: Any  # (T, J) radians or metres
+    velocities: Any  # (T, J)
+    pregrasp_row: int  # where the straight way in begins
+    grasp_row: int  # where the fingers close
 
 
 def seconds_of(motion: ArmMotion) -> float:

@@ -36,29 +36,20 @@ PACKAGES = ("edgegrasp", "numpy", "scipy", "pybullet", "mujoco", "torch", "open3
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkConfig:
-    """What to run.
+    """What to run."""
 
-    Attributes:
-        scene: kind of the scenes.
-        protocol: the constants.
-        rounds: how many for each seed.
-        seeds: with a round's number, a seed gives the round's scene, views and noise.
-        objects: folder in the layout `<scene>/<split>/*.urdf`; the built-in set if None.
-        split: of that folder.
-        engine: to simulate with; by default see `choose_engine`, with the protocol's.
-        gripper: the fields of a gripper file; by default the Panda's hand.
-        arm: what carries the hand; None: it floats.
-    """
-
-    scene: SceneKind
-    rounds: int
+    scene: SceneKind  # kind of the scenes
+    rounds: int  # how many for each seed
+    # With a round's number, a seed gives the round's scene, views and noise.
     seeds: tuple[int, ...] = (0,)
-    protocol: Protocol = field(default_factory=lambda: load_protocol("edgegrasp"))
+    protocol: Protocol = field(default_factory=lambda: load_protocol("edgegrasp"))  # the constants
+    # Folder in the layout `<scene>/<split>/*.urdf`; the built-in set if None.
     objects: Path | None = None
-    split: str = "test"
-    engine: str = ""
+    split: str = "test"  # of that folder
+    engine: str = ""  # to simulate with; by default see `choose_engine`, with the protocol's
+    # The fields of a gripper file; by default the Panda's hand.
     gripper: dict[str, Any] | None = None
-    arm: ArmModel | None = None
+    arm: ArmModel | None = None  # what carries the hand; None: it floats
 
     def __post_init__(self) -> None:
         if self.rounds < 1:

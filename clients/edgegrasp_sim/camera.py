@@ -19,28 +19,22 @@ Float = TypeVar("Float", bound=np.floating)
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """The point cloud of one or several depth images, and other input of a planner.
+    """The point cloud that one or several depth images show, and what a planner may know besides."""
 
-    Attributes:
-        cloud: (N, 3) float32, world frame, metres; order of the pixels, one image after another.
-        workspace: (2, 3) float32, lowest and highest corner of where grasps are looked for; not
-            to be used where `table` is `auto`.
-        table_height: metres; not to be used where `table` is `auto`.
-        camera_positions: (V, 3) float32, every camera, world frame, metres.
-        view_ids: (N,) int32, which camera saw each point.
-        table: what the cloud contains. `known`: it is cut off above the table. `seen`: it includes
-            the table, to correct the depth scale by, and is not cut off at the sides of the
-            workspace. `around`: everything that the camera sees. `auto`: the same, and a planner
-            may use nothing but the cloud and the cameras.
-        pixels: (N,) the pixel of each point, row-major; None: several images, or cut off.
-    """
-
+    # (N, 3) float32, world frame, metres; order of the pixels, one image after another.
     cloud: NDArray[np.float32]
+    # (2, 3) float32, lowest and highest corner of where grasps are looked for; not to be used where
+    # `table` is `auto`.
     workspace: NDArray[np.float32]
-    table_height: float
-    camera_positions: NDArray[np.float32]
-    view_ids: NDArray[np.int32]
+    table_height: float  # metres; not to be used where `table` is `auto`
+    camera_positions: NDArray[np.float32]  # (V, 3) float32, every camera, world frame, metres
+    view_ids: NDArray[np.int32]  # (N,) int32, which camera saw each point
+    # What the cloud contains. `known`: it is cut off above the table. `seen`: it includes the
+    # table, to correct the depth scale by, and is not cut off at the sides of the workspace.
+    # `around`: everything that the camera sees. `auto`: the same, and a planner may use nothing but
+    # the cloud and the cameras.
     table: TableView = "known"
+    # (N,) the pixel of each point, row-major; None: several images, or cut off.
     pixels: NDArray[np.int64] | None = None
 
     @property
@@ -61,18 +55,12 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class ViewRange:
-    """Where a camera may stand: ranges of spherical coordinates around `target`.
+    """Where a camera may stand: ranges of spherical coordinates around `target`."""
 
-    Attributes:
-        radius: metres.
-        polar_angle: radians from world z.
-        azimuth: radians from world x.
-        target: the point looked at, world frame, metres.
-    """
-
-    radius: tuple[float, float]
-    polar_angle: tuple[float, float]
-    azimuth: tuple[float, float]
+    radius: tuple[float, float]  # metres
+    polar_angle: tuple[float, float]  # radians from world z
+    azimuth: tuple[float, float]  # radians from world x
+    # The point looked at, world frame, metres.
     target: tuple[float, float, float] = (0.15, 0.15, 0.25)
 
     def sample(self, rng: np.random.Generator, views: int = 1) -> list[Matrix]:

@@ -55,25 +55,17 @@ class FailureCause(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class GraspResult:
-    """The outcome of a grasp, and its details.
+    """The outcome of a grasp, and its details."""
 
-    Attributes:
-        opening: metres between the fingers at the end.
-        start_contact: whether the open hand overlapped something at its start pose.
-        held: the object held, None if nothing is.
-        target: the object between the fingers before the hand came, None if there was none.
-        cause: why it failed, None if it did not.
-        held_after_shaking: whether it was still held then; None if the hand was not shaken.
-        touched_on_the_way: whether an arm overlapped anything before its pregrasp.
-    """
-
-    opening: float
-    start_contact: bool
-    held: SceneObject | None
+    opening: float  # metres between the fingers at the end
+    start_contact: bool  # whether the open hand overlapped something at its start pose
+    held: SceneObject | None  # the object held, None if nothing is
+    # The object between the fingers before the hand came, None if there was none.
     target: SceneObject | None = None
-    cause: FailureCause | None = None
+    cause: FailureCause | None = None  # why it failed, None if it did not
+    # Whether it was still held then; None if the hand was not shaken.
     held_after_shaking: bool | None = None
-    touched_on_the_way: bool = False
+    touched_on_the_way: bool = False  # whether an arm overlapped anything before its pregrasp
 
     @property
     def success(self) -> bool:

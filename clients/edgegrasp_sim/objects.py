@@ -73,19 +73,12 @@ CLUTTER = (SceneKind.PACKED, SceneKind.PILE)  # those of the published clutter r
 
 @dataclass(frozen=True, slots=True)
 class ObjectModel:
-    """An object that can be put into a scene.
+    """An object that can be put into a scene."""
 
-    Attributes:
-        name: unique within its set.
-        urdf: its description.
-        scale: factor that brings it to the size of the hand, before a scene's own scale.
-        origin: the object that it is a stretched copy of, if it is one.
-    """
-
-    name: str
-    urdf: Path
-    scale: float = 1.0
-    origin: "ObjectModel | None" = None
+    name: str  # unique within its set
+    urdf: Path  # its description
+    scale: float = 1.0  # factor that brings it to the size of the hand, before a scene's own scale
+    origin: "ObjectModel | None" = None  # the object that it is a stretched copy of, if it is one
 
     @property
     def files(self) -> list[Path]:
@@ -103,15 +96,10 @@ class ObjectModel:
 
 @dataclass(frozen=True, slots=True)
 class ObjectSet:
-    """Objects to draw scenes from.
+    """Objects to draw scenes from."""
 
-    Attributes:
-        name: what to call the set in a report.
-        models: at least one, in an order that is the same on every machine.
-    """
-
-    name: str
-    models: tuple[ObjectModel, ...]
+    name: str  # what to call the set in a report
+    models: tuple[ObjectModel, ...]  # at least one, in an order that is the same on every machine
 
     def __post_init__(self) -> None:
         if not self.models:
@@ -309,17 +297,11 @@ def as_obj(
 
 @dataclass(frozen=True, slots=True)
 class Prism:
-    """A prism with a regular base, which unlike a cylinder does not roll.
+    """A prism with a regular base, which unlike a cylinder does not roll."""
 
-    Attributes:
-        sides: of the base, 4 or more.
-        size: full extents along x, y and z, metres.
-        axis: 0, 1 or 2, along which the prism extends.
-    """
-
-    sides: int
-    size: Size
-    axis: int = 2
+    sides: int  # of the base, 4 or more
+    size: Size  # full extents along x, y and z, metres
+    axis: int = 2  # 0, 1 or 2, along which the prism extends
 
     def obj(self) -> str:
         """Its surface as an OBJ file, metres."""

@@ -25,19 +25,12 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True, config=STRICT)
 class SceneRules:
-    """The objects on the table.
+    """What stands on the table."""
 
-    Attributes:
-        num_objects: how many objects to try to place, in turn from round to round.
-        packed_scale: range of the factor on the objects' size in packed scenes and on tables.
-        pile_scale: the same for piles and bins.
-        table_thickness: of packed and pile scenes, metres.
-    """
-
-    num_objects: tuple[int, ...]
-    packed_scale: Range
-    pile_scale: Range
-    table_thickness: float = OPEN_THICKNESS
+    num_objects: tuple[int, ...]  # how many objects to try to place, in turn from round to round
+    packed_scale: Range  # range of the factor on the objects' size in packed scenes and on tables
+    pile_scale: Range  # the same for piles and bins
+    table_thickness: float = OPEN_THICKNESS  # of packed and pile scenes, metres
 
     def scale(self, kind: SceneKind) -> Range:
         """The range of scales of a kind of scene."""
@@ -46,34 +39,21 @@ class SceneRules:
 
 @dataclass(frozen=True, config=STRICT)
 class RoundRules:
-    """Conditions that end a round.
+    """What ends a round."""
 
-    Attributes:
-        max_consecutive_failures: failed grasps in a row that end a round.
-        max_no_grasp: views without any grasp that end a round.
-    """
-
-    max_consecutive_failures: int
-    max_no_grasp: int
+    max_consecutive_failures: int  # failed grasps in a row that end a round
+    max_no_grasp: int  # views without any grasp that end a round
 
 
 @dataclass(frozen=True, config=STRICT)
 class CameraRules:
-    """Where the camera stands; ranges are drawn from uniformly before every grasp.
+    """Where the camera stands; ranges are drawn from uniformly before every grasp."""
 
-    Attributes:
-        views: images before every grasp, spread evenly over a full turn from the first.
-        radius: metres from `target`.
-        polar_degrees: from world z.
-        azimuth_degrees: from world x.
-        target: the point looked at, world frame, metres.
-    """
-
-    views: int
-    radius: Range
-    polar_degrees: Range
-    azimuth_degrees: Range
-    target: tuple[float, float, float]
+    views: int  # images before every grasp, spread evenly over a full turn from the first
+    radius: Range  # metres from `target`
+    polar_degrees: Range  # from world z
+    azimuth_degrees: Range  # from world x
+    target: tuple[float, float, float]  # the point looked at, world frame, metres
 
     def view_range(self) -> ViewRange:
         """The same in radians, to sample from."""
@@ -83,15 +63,10 @@ class CameraRules:
 
 @dataclass(frozen=True, config=STRICT)
 class NoiseRules(DepthNoise):
-    """Noise of the depth image, see `DepthNoise`, and of the points made from it.
+    """Noise of the depth image, see `DepthNoise`, and of the points made from it."""
 
-    Attributes:
-        point_std: standard deviation of each coordinate of each point, metres.
-        sensor: kind of camera whose faults the images have besides, one of `SENSORS`; `random`:
-            another before every grasp; empty: none.
-    """
-
-    point_std: float
+    point_std: float  # standard deviation of each coordinate of each point, metres
+    # Kind of camera whose faults the images have besides; `random`: another before every grasp.
     sensor: Literal["", "random", "structured-light", "stereo", "time-of-flight"] = ""
 
     def depth_sensor(self, rng: np.random.Generator) -> DepthSensor | None:
@@ -101,55 +76,34 @@ class NoiseRules(DepthNoise):
 
 @dataclass(frozen=True, config=STRICT)
 class PlanningRules:
-    """The input of a planner, and its number of candidates.
+    """What a planner is given, and how many candidates it may score."""
 
-    Attributes:
-        table: `known`: the cloud is cut off above the table, and its plane is given; `seen`: the
-            cloud includes the table, and its plane is given, so that the depth scale can be
-            corrected; `around`: the cloud holds everything that the camera sees, and plane and
-            workspace are given; `auto`: the same, and only the camera's position is given.
-        num_approach_points: approach points sampled.
-        num_candidates: candidates scored at most.
-        min_score: no grasp is made that scores less.
-    """
-
+    # `known`: the cloud is cut off above the table, and its plane is given; `seen`: the cloud
+    # includes the table, and its plane is given, so that the depth scale can be corrected;
+    # `around`: the cloud holds everything that the camera sees, and plane and workspace are given;
+    # `auto`: the same, and only the camera's position is given.
     table: TableView
-    num_approach_points: int
-    num_candidates: int
-    min_score: float
+    num_approach_points: int  # approach points sampled
+    num_candidates: int  # candidates scored at most
+    min_score: float  # no grasp is made that scores less
 
 
 @dataclass(frozen=True, config=STRICT)
 class Protocol:
-    """A named and versioned way to run the benchmark.
+    """A named and versioned way to run the benchmark."""
 
-    Attributes:
-        name: of the protocol.
-        version: raised whenever a constant changes.
-        source: where its constants come from.
-        rounds: how many rounds for each seed make a full run.
-        seeds: of a full run.
-        scene: what stands on the table.
-        round: what ends a round.
-        camera: where the camera stands.
-        noise: of what it sees.
-        planning: what a planner is given.
-        engine: the physics engine that its figures are of; empty: any.
-        kind: of the scenes that it is meant for; None: packed ones and piles.
-    """
-
-    name: str
-    version: int
-    source: str
-    rounds: int
-    seeds: tuple[int, ...]
-    scene: SceneRules
-    round: RoundRules
-    camera: CameraRules
-    noise: NoiseRules
-    planning: PlanningRules
-    engine: str = ""
-    kind: SceneKind | None = None
+    name: str  # of the protocol
+    version: int  # raised whenever a constant changes
+    source: str  # where its constants come from
+    rounds: int  # how many rounds for each seed make a full run
+    seeds: tuple[int, ...]  # of a full run
+    scene: SceneRules  # what stands on the table
+    round: RoundRules  # what ends a round
+    camera: CameraRules  # where the camera stands
+    noise: NoiseRules  # of what it sees
+    planning: PlanningRules  # what a planner is given
+    engine: str = ""  # the physics engine that its figures are of; empty: any
+    kind: SceneKind | None = None  # of scenes that it is meant for; None: packed ones and piles
 
     def num_objects(self, index: int) -> int:
         """How many objects to try to place in a round."""

@@ -109,23 +109,14 @@ def load_object(
 
 
 class Layout(NamedTuple):
-    """The parts of a scene.
+    """What a scene is made of."""
 
-    Attributes:
-        world: gets the objects; the surroundings are there already.
-        surroundings: what stays as it is.
-        objects: to draw from.
-        rng: source of the draws.
-        num_objects: how many to try to place.
-        scales: range of the factor on their size.
-    """
-
-    world: World
-    surroundings: Surroundings
-    objects: ObjectSet
-    rng: np.random.Generator
-    num_objects: int
-    scales: tuple[float, float]
+    world: World  # gets the objects; the surroundings are there already
+    surroundings: Surroundings  # what stays as it is
+    objects: ObjectSet  # to draw from
+    rng: np.random.Generator  # source of the draws
+    num_objects: int  # how many to try to place
+    scales: tuple[float, float]  # range of the factor on their size
 
 
 def make_packed(layout: Layout) -> list[SceneObject]:

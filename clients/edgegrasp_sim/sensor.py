@@ -23,21 +23,13 @@ PATCH_PIXELS = 12  # between those of what is missing
 
 @dataclass(frozen=True, slots=True)
 class DepthNoise:
-    """Noise of depth images: a random factor on each, and smooth Gaussian noise on some.
+    """Noise of depth images: a random factor on each, and smooth Gaussian noise on some."""
 
-    Attributes:
-        gamma_shape: shape of the gamma distribution of the factor; 0: no factor.
-        gamma_scale: its scale.
-        correlated_std: standard deviation of the smooth noise, metres.
-        correlated_pixels: pixels between its independent values, interpolated in between.
-        correlated_share: share of the images that have it.
-    """
-
-    gamma_shape: float
-    gamma_scale: float
-    correlated_std: float
-    correlated_pixels: int
-    correlated_share: float
+    gamma_shape: float  # shape of the gamma distribution of the factor; 0: no factor
+    gamma_scale: float  # its scale
+    correlated_std: float  # standard deviation of the smooth noise, metres
+    correlated_pixels: int  # pixels between its independent values, interpolated in between
+    correlated_share: float  # share of the images that have it
 
     def apply(self, depth: Float64, rng: np.random.Generator) -> Float64:
         """A noisy copy of a depth image: (height, width) metres."""
@@ -55,37 +47,29 @@ class DepthNoise:
 
 @dataclass(frozen=True, slots=True)
 class DepthSensor:
-    """A depth camera: what `apply` does to an image, in this order.
+    """A depth camera: what `apply` does to an image, in this order."""
 
-    Attributes:
-        baseline: metres from the camera to the projector or second camera along the image's x;
-            what it does not see is missing. 0: none.
-        window: pixels across the window in which depths are found; steps smaller than `EDGE` are
-            smoothed over. 1: each pixel by itself.
-        fattening: share of the pixels beside an edge, behind it, that get the depth of its front.
-        flying: share of the pixels at an edge that lie somewhere between its front and its back.
-        noise_floor: standard deviation of the noise at depth 0, metres.
-        noise_growth: what is added to that for each square metre of depth, 1 / metre.
-        noise_pixels: pixels between independent values of the noise.
-        warp: standard deviation of a smooth error over the whole image, metres: a camera
-            calibrated badly, or an uneven table.
-        disparity_step: pixels to which disparities are rounded; 0: not rounded.
-        grazing: degrees between a line of sight and the surface's normal at which half of the
-            readings are missing.
-        missing: share of the image that is missing in patches.
-    """
-
+    # Metres from the camera to the projector or second camera along the image's x; what it does not
+    # see is missing. 0: none.
     baseline: float
+    # Pixels across the window in which depths are found; steps smaller than `EDGE` are smoothed
+    # over. 1: each pixel by itself.
     window: int
+    # Share of the pixels beside an edge, behind it, that get the depth of its front.
     fattening: float
+    # Share of the pixels at an edge that lie somewhere between its front and its back.
     flying: float
-    noise_floor: float
-    noise_growth: float
-    noise_pixels: int
+    noise_floor: float  # standard deviation of the noise at depth 0, metres
+    noise_growth: float  # what is added to that for each square metre of depth, 1 / metre
+    noise_pixels: int  # pixels between independent values of the noise
+    # Standard deviation of a smooth error over the whole image, metres: a camera calibrated badly,
+    # or an uneven table.
     warp: float
-    disparity_step: float
+    disparity_step: float  # pixels to which disparities are rounded; 0: not rounded
+    # Degrees between a line of sight and the surface's normal at which half of the readings are
+    # missing.
     grazing: float
-    missing: float
+    missing: float  # share of the image that is missing in patches
 
     def apply(self, depth: Float64, camera: Intrinsics, rng: np.random.Generator) -> Float64:
         """The image that this camera gives: (height, width) metres, NaN without a reading."""

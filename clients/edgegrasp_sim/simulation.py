@@ -85,19 +85,12 @@ _CROP_MARGIN = 0.01  # metres; points further out cannot come back in by noise
 
 @dataclass(frozen=True, slots=True)
 class ObjectPlacement:
-    """Where an object is.
+    """Where an object is."""
 
-    Attributes:
-        urdf: its description.
-        scale: factor on the description's size.
-        position: centre of mass, world frame, metres.
-        quaternion_xyzw: orientation in the world.
-    """
-
-    urdf: Path
-    scale: float
-    position: tuple[float, float, float]
-    quaternion_xyzw: tuple[float, float, float, float]
+    urdf: Path  # its description
+    scale: float  # factor on the description's size
+    position: tuple[float, float, float]  # centre of mass, world frame, metres
+    quaternion_xyzw: tuple[float, float, float, float]  # orientation in the world
 
 
 class ClutterSimulation:

@@ -73,20 +73,13 @@ BINS, TABLES, SHELVES = Bins(), Tables(), Shelves()
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A box that never moves; metres, world frame.
+    """A box that never moves; metres, world frame."""
 
-    Attributes:
-        size: full extent along its own axes.
-        centre: of the box.
-        yaw: radians about world z.
-        friction: lateral.
-        obstacle: whether a hand that hits it has failed. The table is none, as in the reference.
-    """
-
-    size: tuple[float, float, float]
-    centre: tuple[float, float, float]
-    yaw: float = 0.0
-    friction: float = WALL_FRICTION
+    size: tuple[float, float, float]  # full extent along its own axes
+    centre: tuple[float, float, float]  # of the box
+    yaw: float = 0.0  # radians about world z
+    friction: float = WALL_FRICTION  # lateral
+    # Whether a hand that hits it has failed. The table is none, as in the reference.
     obstacle: bool = True
 
     def add_to(self, world: World) -> Body:
@@ -96,18 +89,14 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """The fixed parts of a scene, and the region of its objects.
+    """What stays as it is in a scene, and where its objects are."""
 
-    Attributes:
-        boxes: all that never moves.
-        workspace: lowest and highest corner of where grasps are looked for, metres.
-        bounds: the same of where an object's centre may be; one that leaves it is taken away.
-        reach: metres from the middle, along x and y, where objects are put down.
-    """
-
-    boxes: tuple[Box, ...]
+    boxes: tuple[Box, ...]  # all that never moves
+    # Lowest and highest corner of where grasps are looked for, metres.
     workspace: tuple[tuple[float, float, float], tuple[float, float, float]]
+    # The same of where an object's centre may be; one that leaves it is taken away.
     bounds: tuple[tuple[float, float, float], tuple[float, float, float]]
+    # Metres from the middle, along x and y, where objects are put down.
     reach: tuple[float, float] = (TABLES.reach, TABLES.reach)
 
     def add_to(self, world: World) -> frozenset[int]:

@@ -24,19 +24,12 @@ MIN_SEEN = 100  # points above the table; a round ends where a view shows fewer
 
 @dataclass(frozen=True, slots=True)
 class PlannedGrasp:
-    """A planner's answer.
+    """A planner's answer."""
 
-    Attributes:
-        T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
-        score: how good the planner believes the grasp is; higher is better.
-        width: opening that the grasp needs, metres.
-        motion: of the arm that carries the hand, if one does.
-    """
-
-    T_world_hand: ArrayLike
-    score: float
-    width: float
-    motion: ArmMotion | None = None
+    T_world_hand: ArrayLike  # (4, 4) pose of the `panda_hand` link in the world, metres
+    score: float  # how good the planner believes the grasp is; higher is better
+    width: float  # opening that the grasp needs, metres
+    motion: ArmMotion | None = None  # of the arm that carries the hand, if one does
 
 
 # From an observation, and a seed for randomness in planning, to the grasp to execute; None if
@@ -59,39 +52,22 @@ class RoundEnd(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """One executed grasp.
+    """One executed grasp."""
 
-    Attributes:
-        cause: why it failed, None if it did not.
-        object: name of the object removed, None after a failure.
-        target: name of the object that was between the fingers, None if there was none.
-        wrong_object: whether what was removed was not the target.
-        score: the planner's score.
-        width: the opening the planner asked for, metres.
-        opening: metres between the fingers at the end.
-        start_contact: whether the open hand overlapped something at its start pose.
-        view: number of the view in its round that the grasp was planned in.
-        points: size of the cloud that was seen.
-        planning_seconds: wall-clock time of the planner.
-        T_world_hand: (4, 4) row-major pose of the hand.
-        motion_seconds: that an arm took from home to the grasp, away and home again.
-        touched_on_the_way: whether an arm overlapped anything before its pregrasp.
-    """
-
-    cause: FailureCause | None
-    object: str | None
-    target: str | None
-    wrong_object: bool
-    score: float
-    width: float
-    opening: float
-    start_contact: bool
-    view: int
-    points: int
-    planning_seconds: float
-    T_world_hand: list[list[float]]
-    motion_seconds: float = 0.0
-    touched_on_the_way: bool = False
+    cause: FailureCause | None  # why it failed, None if it did not
+    object: str | None  # name of the object removed, None after a failure
+    target: str | None  # name of the object that was between the fingers, None if there was none
+    wrong_object: bool  # whether what was removed was not the target
+    score: float  # the planner's score
+    width: float  # the opening the planner asked for, metres
+    opening: float  # metres between the fingers at the end
+    start_contact: bool  # whether the open hand overlapped something at its start pose
+    view: int  # number of the view in its round that the grasp was planned in
+    points: int  # size of the cloud that was seen
+    planning_seconds: float  # wall-clock time of the planner
+    T_world_hand: list[list[float]]  # (4, 4) row-major pose of the hand
+    motion_seconds: float = 0.0  # that an arm took from home to the grasp, away and home again
+    touched_on_the_way: bool = False  # whether an arm overlapped anything before its pregrasp
 
     @property
     def success(self) -> bool:
@@ -106,28 +82,18 @@ class Attempt:
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """One round of clutter removal.
+    """One round of clutter removal."""
 
-    Attributes:
-        seed: with `index` it gives the scene, the views and the noise.
-        index: number of the round.
-        objects: names of the objects that were there after the reset.
-        attempts: the grasps executed, in order.
-        no_grasp: how often the planner found no grasp; not counted as attempts, as in the
-            reference.
-        end: why the round ended.
-        start_collisions: in how many of those the arm touched something where it started.
-        too_wide: names of the objects that no grasp can hold: the hand does not open that far.
-    """
-
-    seed: int
-    index: int
-    objects: tuple[str, ...]
-    attempts: tuple[Attempt, ...]
+    seed: int  # with `index` it gives the scene, the views and the noise
+    index: int  # number of the round
+    objects: tuple[str, ...]  # names of the objects that were there after the reset
+    attempts: tuple[Attempt, ...]  # the grasps executed, in order
+    # How often the planner found no grasp; not counted as attempts, as in the reference.
     no_grasp: int
-    end: RoundEnd
+    end: RoundEnd  # why the round ended
+    # Names of the objects that no grasp can hold: the hand does not open that far.
     too_wide: tuple[str, ...] = ()
-    start_collisions: int = 0
+    start_collisions: int = 0  # in how many of those the arm touched something where it started
 
     @property
     def successes(self) -> int:

@@ -22,15 +22,10 @@ RAISE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # turns 
 
 
 class HouseholdMesh(NamedTuple):
-    """An object in metres, standing on z = 0 about the z axis.
+    """An object in metres, standing on z = 0 about the z axis."""
 
-    Attributes:
-        family: one of `FAMILIES`.
-        parts: closed and convex; they may overlap.
-    """
-
-    family: str
-    parts: list[Part]
+    family: str  # one of `FAMILIES`
+    parts: list[Part]  # closed and convex; they may overlap
 
 
 def household_mesh(rng: Random, family: str | None = None) -> HouseholdMesh:

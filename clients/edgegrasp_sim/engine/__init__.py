@@ -79,15 +79,10 @@ class Intrinsics:
 
 
 class Contact(NamedTuple):
-    """One contact point of a body.
+    """One contact point of a body."""
 
-    Attributes:
-        other_uid: the body that is touched.
-        distance: metres; negative where the two overlap.
-    """
-
-    other_uid: int
-    distance: float
+    other_uid: int  # the body that is touched
+    distance: float  # metres; negative where the two overlap
 
 
 class Shake(NamedTuple):
@@ -105,62 +100,39 @@ class HandModel:
     """A floating hand with two coupled fingers that slide apart along y.
 
     Fields that no gripper file gives have a default, the same for every hand.
-
-    Attributes:
-        palm: in the hand's frame.
-        fingers: that at y > 0 and the other, shut, each in its own frame.
-        finger_base: metres along the hand's z to the fingers' frames.
-        finger_centre: centre of mass of the finger at y > 0, in its frame, metres.
-        tip: fingertips as they hold something, metres along z.
-        centre: the palm's centre of mass, hand frame, metres.
-        max_opening: metres between the fingers.
-        mass: of the palm, kg.
-        friction: of the palm.
-        finger_mass: kg.
-        finger_friction: lateral.
-        finger_force: with which each finger closes and opens, N.
-        tool_force: with which the hand is moved at most, N.
-        advance: how far the fingers are ahead of where they are in the open hand, metres: the
-            coefficients of 1, q, ..., q^4, where q is half the opening; None: they never are.
-        meshes: PyBullet's own files with palm and finger; None: its parts are boxes.
     """
 
-    palm: Parts
-    fingers: tuple[Parts, Parts]
-    finger_base: float
+    palm: Parts  # in the hand's frame
+    fingers: tuple[Parts, Parts]  # that at y > 0 and the other, shut, each in its own frame
+    finger_base: float  # metres along the hand's z to the fingers' frames
+    # Centre of mass of the finger at y > 0, in its frame, metres.
     finger_centre: tuple[float, float, float]
-    tip: float
-    centre: tuple[float, float, float]
-    max_opening: float
-    mass: float = 0.5
-    friction: float = 1.0
-    finger_mass: float = 0.1
-    finger_friction: float = 0.75
-    finger_force: float = 20.0
-    tool_force: float = 300.0
+    tip: float  # fingertips as they hold something, metres along z
+    centre: tuple[float, float, float]  # the palm's centre of mass, hand frame, metres
+    max_opening: float  # metres between the fingers
+    mass: float = 0.5  # of the palm, kg
+    friction: float = 1.0  # of the palm
+    finger_mass: float = 0.1  # kg
+    finger_friction: float = 0.75  # lateral
+    finger_force: float = 20.0  # with which each finger closes and opens, N
+    tool_force: float = 300.0  # with which the hand is moved at most, N
+    # How far the fingers are ahead of where they are in the open hand, metres: the coefficients of
+    # 1, q, ..., q^4, where q is half the opening; None: they never are.
     advance: tuple[float, ...] | None = None
+    # PyBullet's own files with palm and finger; None: its parts are boxes.
     meshes: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class ArmModel:
-    """An arm that carries a hand; J joints.
+    """An arm that carries a hand; J joints."""
 
-    Attributes:
-        urdf: XML with absolute paths of meshes, without what is beyond the flange.
-        T_world_root: where its first link stands, (4, 4).
-        flange: link that the hand is on.
-        T_flange_hand: where the hand's frame is in the flange's, (4, 4).
-        joint_names: of the moving joints, J.
-        home: where they rest, (J,) radians or metres.
-    """
-
-    urdf: str
-    T_world_root: Matrix
-    flange: str
-    T_flange_hand: Matrix
-    joint_names: Sequence[str]
-    home: Matrix
+    urdf: str  # XML with absolute paths of meshes, without what is beyond the flange
+    T_world_root: Matrix  # where its first link stands, (4, 4)
+    flange: str  # link that the hand is on
+    T_flange_hand: Matrix  # where the hand's frame is in the flange's, (4, 4)
+    joint_names: Sequence[str]  # of the moving joints, J
+    home: Matrix  # where they rest, (J,) radians or metres
 
 
 class World(ABC):

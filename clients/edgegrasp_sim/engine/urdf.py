@@ -26,17 +26,11 @@ class Surface(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """An object, in the frame of its centre of mass, with the axes of its link.
+    """An object, in the frame of its centre of mass, with the axes of its link."""
 
-    Attributes:
-        centre: the centre of mass in the link's frame, (3,) metres.
-        visible: what a camera sees.
-        hulls: the convex parts that contacts use.
-    """
-
-    centre: Matrix
-    visible: list[Surface]
-    hulls: list[Surface]
+    centre: Matrix  # the centre of mass in the link's frame, (3,) metres
+    visible: list[Surface]  # what a camera sees
+    hulls: list[Surface]  # the convex parts that contacts use
 
 
 def read_urdf(path: Path, scale: float) -> Shape:
