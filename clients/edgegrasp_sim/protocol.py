@@ -25,7 +25,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True, config=STRICT)
 class SceneRules:
-    """What stands on the table."""
+    """The objects on the table."""
 
     num_objects: tuple[int, ...]  # how many objects to try to place, in turn from round to round
     packed_scale: Range  # range of the factor on the objects' size in packed scenes and on tables
@@ -39,7 +39,7 @@ class SceneRules:
 
 @dataclass(frozen=True, config=STRICT)
 class RoundRules:
-    """What ends a round."""
+    """Conditions that end a round."""
 
     max_consecutive_failures: int  # failed grasps in a row that end a round
     max_no_grasp: int  # views without any grasp that end a round
@@ -76,7 +76,7 @@ class NoiseRules(DepthNoise):
 
 @dataclass(frozen=True, config=STRICT)
 class PlanningRules:
-    """What a planner is given, and how many candidates it may score."""
+    """The input of a planner, and its number of candidates."""
 
     # `known`: the cloud is cut off above the table, and its plane is given; `seen`: the cloud
     # includes the table, and its plane is given, so that the depth scale can be corrected;

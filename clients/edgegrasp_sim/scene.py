@@ -109,7 +109,7 @@ def load_object(
 
 
 class Layout(NamedTuple):
-    """What a scene is made of."""
+    """The parts of a scene."""
 
     world: World  # gets the objects; the surroundings are there already
     surroundings: Surroundings  # what stays as it is

@@ -89,7 +89,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What stays as it is in a scene, and where its objects are."""
+    """The fixed parts of a scene, and the region of its objects."""
 
     boxes: tuple[Box, ...]  # all that never moves
     # Lowest and highest corner of where grasps are looked for, metres.

@@ -1,4 +1,4 @@
-"""The core of both transports: check, admit, run, record and report a request."""
+"""The core of both transports: check, admit, run and report a request."""
 
 import asyncio
 import contextlib
@@ -38,7 +38,6 @@ HARMFUL_SECONDS = 600.0  # seconds for which it is refused
 MOST_HARMFUL = 1000  # requests remembered
 
 Observer = Callable[[Call], None]
-Recorder = Callable[[Job, Answer], None]
 
 
 class GraspService:
@@ -48,7 +47,6 @@ class GraspService:
         tokens: Replaced on reload.
         stopping: When set, new requests are refused.
         in_flight: Number of calls in progress.
-        record: Called with each job and its answer.
     """
 
     def __init__(
@@ -65,7 +63,6 @@ class GraspService:
         self.in_flight = 0
         self.admission = Admission(pool.size, settings.max_queue_length, settings.max_held_bytes)
         self._observers = observers
-        self.record: Recorder | None = None
         self._harmful = HarmfulRequests()
 
     @property
@@ -161,8 +158,6 @@ class GraspService:
         call.stages |= answer.facts.seconds
         call.bytes_out = len(answer.body)
         self.admission.resize(ticket, call.bytes_out)
-        if self.record is not None:
-            self.record(job, answer)
         return answer
 
     async def drain(self, grace: float) -> None:
