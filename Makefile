@@ -7,6 +7,8 @@ PYTHON ?= python3
 TORCH ?= --no-deps --extra-index-url https://download.pytorch.org/whl/cpu torch
 VENV := .venv
 BIN := $(VENV)/bin
+# Compiled on import, what is used.
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-compile
 INSTALLED := $(VENV)/.installed
 # What `make view` needs, which is installed sooner; what only `make lint` and its like need.
 TO_LOOK := $(VENV)/.to_look
@@ -27,14 +29,15 @@ $(TO_LOOK): EXTRA := service,view
 $(INSTALLED) $(TO_LOOK): pyproject.toml constraints.txt scripts/system_packages.sh
 	scripts/system_packages.sh $(PYTHON)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python scripts/install.py constraints.txt $(TORCH)
-	$(BIN)/python scripts/install.py constraints.txt --editable '.[$(EXTRA)]'
+	$(PIP) --quiet --upgrade 'pip>=25.1' # shows a bar while it unpacks too
+	$(PIP) --constraint constraints.txt $(TORCH)
+	$(PIP) --constraint constraints.txt --editable '.[$(EXTRA)]'
 	-[ $(EXTRA) != dev ] || \
-		$(BIN)/python scripts/install.py constraints.txt --editable '.[open3d]' # not for glibc < 2.35
+		$(PIP) --constraint constraints.txt --editable '.[open3d]' # not for glibc < 2.35
 	@touch $@
 
 $(TOOLS): $(INSTALLED)
-	$(BIN)/python scripts/install.py constraints.txt --editable '.[tools]'
+	$(PIP) --constraint constraints.txt --editable '.[tools]'
 	@touch $@
 
 lint: $(TOOLS) ## style, types, import boundaries, generated code

@@ -6,6 +6,7 @@ FileDescriptorSet in JSON. Additions are written into it; what would break a cal
 usage: scripts/contract.py [FOLDER]    writes edgegrasp/v1/contract.json there, or into proto/
 """
 
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,6 @@ ROOT = Path(__file__).parents[1]
 CONTRACT = Path("edgegrasp/v1/contract.json")
 
 File = descriptor_pb2.FileDescriptorProto
-Message = descriptor_pb2.DescriptorProto
 
 
 def current() -> File:
@@ -33,61 +33,38 @@ def read(path: Path) -> File:
     return json_format.Parse(path.read_text(), descriptor_pb2.FileDescriptorSet()).file[0]
 
 
-def text(file: File) -> str:
-    """A contract, in an order that shows additions as added lines."""
-    return json_format.MessageToJson(descriptor_pb2.FileDescriptorSet(file=[file])) + "\n"
-
-
 def breaks(old: File, new: File) -> list[str]:
     """What of `old` a caller of `new` would miss; empty: compatible, on the wire and in source."""
-    now = promises(new)
+    before, now = (promises(json_format.MessageToDict(file)) for file in (old, new))
     return [
-        f"{name} ({said}) is {f'now {now[name]}' if name in now else 'gone'}"
-        for name, said in promises(old).items()
-        if now.get(name) != said
+        f"{name} ({value}) is {f'now {now[name]}' if name in now else 'gone'}"
+        for name, value in before.items()
+        if now.get(name) != value
     ]
 
 
-def promises(file: File) -> dict[str, str]:
-    """Everything that a caller may rely on, by its name or number; each in words."""
-    found = {"package": file.package, "syntax": file.syntax}
-    for service in file.service:
-        for method in service.method:
-            found[f"rpc {service.name}.{method.name}"] = _said(method)
-    for enum in file.enum_type:
-        found |= _of_enum(enum.name, enum)
-    for message in file.message_type:
-        found |= _of_message(message.name, message)
-    return found
+def promises(part: Any, path: str = "") -> dict[str, Any]:
+    """Everything that a caller may rely on: each value by its place, where numbers name fields."""
+    if isinstance(part, dict) and {"number", "inputType"} & part.keys():  # a field or a method
+        return {path: ", ".join(f"{name} {one}" for name, one in part.items() if name != "options")}
+    if isinstance(part, dict):
+        oneofs = [one["name"] for one in part.get("oneofDecl", ())]
+        for field in part.get("field", ()):
+            if "oneofIndex" in field:  # of all in the message, which may become more
+                field["oneof"] = oneofs[field.pop("oneofIndex")]
+        places = part.items()
+    elif isinstance(part, list):
+        places = {_key(one): one for one in part}.items()
+    else:
+        return {path: part}
+    parts = (promises(one, f"{path}.{name}".lstrip(".")) for name, one in places)
+    return {name: value for found in parts for name, value in found.items()}
 
 
-def _of_message(name: str, message: Message) -> dict[str, str]:
-    found = {f"message {name}": ""}
-    for field in message.field:
-        # The oneof of an `optional` field is made up.
-        is_choice = field.HasField("oneof_index") and not field.proto3_optional
-        oneof = f", in oneof {message.oneof_decl[field.oneof_index].name}" if is_choice else ""
-        found[f"{name} = {field.number}"] = _said(field) + oneof
-    for numbers in message.reserved_range:
-        found |= {f"{name} reserves {n}": "" for n in range(numbers.start, numbers.end)}
-    found |= {f"{name} reserves {word}": "" for word in message.reserved_name}
-    for inner in message.nested_type:
-        found |= _of_message(f"{name}.{inner.name}", inner)
-    for enum in message.enum_type:
-        found |= _of_enum(f"{name}.{enum.name}", enum)
-    return found
-
-
-def _of_enum(name: str, enum: Any) -> dict[str, str]:
-    values = {f"{name}.{value.name}": f"= {value.number}" for value in enum.value}
-    return {f"enum {name}": ""} | values
-
-
-def _said(part: Any) -> str:
-    """The properties of a field or method, except its number and options."""
-    properties = ((field.name, value) for field, value in part.ListFields())
-    skipped = ("number", "oneof_index", "options")
-    return ", ".join(f"{name} {value}" for name, value in properties if name not in skipped)
+def _key(part: Any) -> str:
+    """What tells a part of a list from the others."""
+    named = part if isinstance(part, dict) else {"name": part}
+    return str(named.get("number", named.get("name", json.dumps(part))))
 
 
 def main() -> None:
@@ -97,7 +74,8 @@ def main() -> None:
     if committed.exists() and (broken := breaks(read(committed), new)):
         sys.exit("\n".join(["edgegrasp.v1 would break its callers; a change goes to v2:", *broken]))
     (folder / CONTRACT).parent.mkdir(parents=True, exist_ok=True)
-    (folder / CONTRACT).write_text(text(new))
+    text = json_format.MessageToJson(descriptor_pb2.FileDescriptorSet(file=[new]))
+    (folder / CONTRACT).write_text(text + "\n")
 
 
 if __name__ == "__main__":

@@ -73,13 +73,13 @@ def without_a_call(file: File) -> None:
 
 
 BREAKS = {
-    without_a_field: "Grasp = 4 (name width",
+    without_a_field: "Grasp.field.4 (name width",
     number_used_again: "is now name opening",
-    another_type: "type ",
-    not_repeated: "label",
-    out_of_its_oneof: "in oneof cloud) is now",
-    number_not_reserved: "DetectOptions reserves 10 () is gone",
-    without_a_call: "rpc GraspService.ScoreGrasps (name",
+    another_type: "type TYPE_",
+    not_repeated: "label LABEL_",
+    out_of_its_oneof: "oneof cloud) is now",
+    number_not_reserved: "messageType.DetectOptions.reservedRange.",
+    without_a_call: "service.GraspService.method.ScoreGrasps (name",
 }
 
 
@@ -108,6 +108,6 @@ def test_a_break_is_not_written_into_the_contract(tmp_path, monkeypatch) -> None
     without_a_field(broken)
     monkeypatch.setattr(contract, "current", lambda: broken)
     monkeypatch.setattr("sys.argv", ["contract.py", str(tmp_path)])
-    with pytest.raises(SystemExit, match=r"Grasp = 4 \(name width.* is gone"):
+    with pytest.raises(SystemExit, match=r"Grasp.field.4 \(name width.* is gone"):
         contract.main()
     assert list(tmp_path.iterdir()) == []
