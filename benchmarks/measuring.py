@@ -24,17 +24,12 @@ SERVE = ("-c", "from edgegrasp_cli.main import main; main()")
 
 
 def interleaved(
-    variants: Mapping[str, Callable[[], object]],
-    runs: int = RUNS,
+    variants: Mapping[str, Callable[[], object]],  # what to run, by name
+    runs: int = RUNS,  # rounds that count
+    # Of the processor, which other work on the machine changes little; or of the wall.
     clock: Callable[[], float] = time.process_time,
 ) -> dict[str, list[float]]:
-    """Seconds of each variant in each of `runs` rounds, after one that does not count.
-
-    Args:
-        variants: What to run, by name.
-        runs: Rounds that count.
-        clock: Of the processor, which other work on the machine changes little; or of the wall.
-    """
+    """Seconds of each variant in each of `runs` rounds, after one that does not count."""
     seconds: dict[str, list[float]] = {name: [] for name in variants}
     for number in range(runs + 1):
         for name, variant in variants.items():

@@ -258,49 +258,33 @@ class Picture:
 
 
 def draw_grasps(
+    # `.png` or `.jpg` file to write, whose folder must exist; or where to write a PNG.
     path: Path | BinaryIO,
-    cloud: ArrayLike,
-    grasps: Sequence[Drawable],
+    cloud: ArrayLike,  # (N, 3) metres
+    grasps: Sequence[Drawable],  # best first
     *,
-    camera_position: ArrayLike,
-    title: str,
-    palm_and_tip: tuple[float, float] = PANDA,
+    camera_position: ArrayLike,  # (3,) metres, cloud frame; the picture looks from there
+    title: str,  # a line below it
+    palm_and_tip: tuple[float, float] = PANDA,  # metres along the hand's z
 ) -> None:
-    """Write a picture of a cloud and of grasps in it, as `Picture.save` does.
-
-    Args:
-        path: `.png` or `.jpg` file to write, whose folder must exist; or where to write a PNG.
-        cloud: (N, 3) metres.
-        grasps: best first.
-        camera_position: (3,) metres, cloud frame; the picture looks from there.
-        title: a line below it.
-        palm_and_tip: metres along the hand's z.
-    """
+    """Write a picture of a cloud and of grasps in it, as `Picture.save` does."""
     picture = Picture(View.of(cloud, camera_position), cloud, title=title)
     picture.grasps(grasps, palm_and_tip)
     picture.save(path)
 
 
 def draw_detection(
-    path: Path | BinaryIO,
-    detection: Any,
-    sent: CloudInput,
-    options: Mapping[str, Any],
-    colors: Array | None = None,
-    from_above: bool = False,
+    path: Path | BinaryIO,  # `.png` or `.jpg` file to write, or where to write a PNG
+    detection: Any,  # the answer, of a client or of a detector
+    sent: CloudInput,  # the cloud of the request
+    options: Mapping[str, Any],  # of the request: its regions are drawn
+    colors: Array | None = None,  # as `CloudInput.colors`; None: those of the cloud, if any
+    from_above: bool = False,  # whether to look from above, whatever the cloud
 ) -> None:
     """Write a picture of a request and the best of its grasps.
 
     An organised cloud is drawn as its camera saw it, in its colours if given; any other cloud from
     its viewpoint, or obliquely from above.
-
-    Args:
-        path: `.png` or `.jpg` file to write, or where to write a PNG.
-        detection: The answer, of a client or of a detector.
-        sent: The cloud of the request.
-        options: Of the request: its regions are drawn.
-        colors: As `CloudInput.colors`; None: those of the cloud, if any.
-        from_above: Whether to look from above, whatever the cloud.
     """
     points = np.asarray(sent.points)
     flat, shown, image = points.reshape(-1, 3), detection.grasps[:DRAWN], None

@@ -54,19 +54,13 @@ def takes_flags(**groups: Flags) -> Callable[[Callable[..., None]], Callable[...
 
 
 def model_flags(
+    # The fields; those other than numbers, text, booleans and paths are given as JSON.
     model: "type[BaseModel]",
-    leave_out: Sequence[str] = (),
-    panel: str = "Options",
-    defaults: bool = True,
+    leave_out: Sequence[str] = (),  # fields without a flag
+    panel: str = "Options",  # heading of the flags in the help
+    defaults: bool = True,  # whether the help shows the fields' defaults
 ) -> Flags:
-    """A flag for each field of a pydantic model, with the field's description and default.
-
-    Args:
-        model: The fields; those other than numbers, text, booleans and paths are given as JSON.
-        leave_out: Fields without a flag.
-        panel: Heading of the flags in the help.
-        defaults: Whether the help shows the fields' defaults.
-    """
+    """A flag for each field of a pydantic model, with the field's description and default."""
     flags = []
     for name, field in model.model_fields.items():
         if name in leave_out:

@@ -149,23 +149,15 @@ def load_scene(file: Path) -> RealScene:
 
 
 def judge(
-    scene: RealScene,
-    grasps: Sequence[Any],
+    scene: RealScene,  # with its labels
+    grasps: Sequence[Any],  # best first, camera frame
+    # Normal (3,) and offset of the support plane that was found, camera frame.
     plane: tuple[Array, float] | None,
-    answer: Int64,
-    gripper: "Gripper",
-    milliseconds: float,
+    answer: Int64,  # (R,) number of the object that each point is of, from 1; 0: of none
+    gripper: "Gripper",  # that the grasps are for
+    milliseconds: float,  # from the request to the answer
 ) -> SceneFigures:
-    """Evaluate an answer.
-
-    Args:
-        scene: With its labels.
-        grasps: Best first, camera frame.
-        plane: Normal (3,) and offset of the support plane that was found, camera frame.
-        answer: (R,) number of the object that each point is of, from 1; 0: of none.
-        gripper: That the grasps are for.
-        milliseconds: From the request to the answer.
-    """
+    """Evaluate an answer."""
     best = grasps[:BEST]
     on_object = _objects_held(scene, grasps)
     scores = np.array([grasp.score for grasp in grasps])

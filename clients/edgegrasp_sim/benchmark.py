@@ -77,23 +77,16 @@ class BenchmarkConfig:
 
 
 def run_benchmark(
-    config: BenchmarkConfig,
-    make_planner: PlannerFactory,
+    config: BenchmarkConfig,  # what to run
+    make_planner: PlannerFactory,  # called once in every process
     *,
-    workers: int | None = 1,
-    ray: str | None = None,
-    folder: ResultFolder | None = None,
+    workers: int | None = 1,  # how many rounds at a time, and
+    ray: str | None = None,  # address of a Ray cluster to run them on: see `run_tasks`
+    folder: ResultFolder | None = None,  # keeps each round as it finishes; opened by the caller
+    # Called with every round as it finishes, in any order.
     on_round: Callable[[Round], None] | None = None,
 ) -> list[Round]:
     """Run all rounds that `folder` does not hold yet; outcomes do not depend on where.
-
-    Args:
-        config: what to run.
-        make_planner: called once in every process.
-        workers: how many rounds at a time, and
-        ray: address of a Ray cluster to run them on: see `run_tasks`.
-        folder: keeps each round as it finishes; opened by the caller.
-        on_round: called with every round as it finishes, in any order.
 
     Returns:
         All rounds of `config`, by seed and index.

@@ -74,25 +74,19 @@ class GraspResult:
 
 
 def run_grasp(
-    gripper: "Gripper",
-    T_world_hand: Matrix,
-    objects: Mapping[int, SceneObject],
+    gripper: "Gripper",  # the hand to use
+    T_world_hand: Matrix,  # pose of the `panda_hand` link at the grasp, (4, 4)
+    objects: Mapping[int, SceneObject],  # what may be held, by the id of its body
+    # Ids of the bodies that a hand must not cut into: that fails the grasp at once.
     obstacles: Set[int] = frozenset(),
     *,
+    # Simulate every step, so that whatever the hand pushes aside ends up right; otherwise stop once
+    # the outcome is clear.
     to_the_end: bool,
+    # Shake a held object at the end of the retreat; this does not change `success`.
     shake: bool = False,
 ) -> GraspResult:
-    """Run a grasp from its start pose to the end of the retreat; the hand stays there.
-
-    Args:
-        gripper: the hand to use.
-        T_world_hand: pose of the `panda_hand` link at the grasp, (4, 4).
-        objects: what may be held, by the id of its body.
-        obstacles: ids of the bodies that a hand must not cut into: that fails the grasp at once.
-        to_the_end: simulate every step, so that whatever the hand pushes aside ends up right;
-            otherwise stop once the outcome is clear.
-        shake: shake a held object at the end of the retreat; this does not change `success`.
-    """
+    """Run a grasp from its start pose to the end of the retreat; the hand stays there."""
     gripper.start(T_world_hand)
     gripper.world.detect_collisions()
     start_contact = any(contact.distance < 0.0 for contact in gripper.body.contacts())

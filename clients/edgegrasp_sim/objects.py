@@ -237,22 +237,14 @@ def write_object(name: str, surface: str, folder: Path) -> Path:
 
 
 def write_parts(
-    name: str,
-    visible: Iterable[Mesh],
-    parts: Iterable[Mesh],
-    centre: NDArray[np.float64],
-    inertia: NDArray[np.float64],
-    folder: Path,
+    name: str,  # of the object
+    visible: Iterable[Mesh],  # meshes that a camera sees, metres
+    parts: Iterable[Mesh],  # convex meshes; the engine takes the hull of each
+    centre: NDArray[np.float64],  # (3,) its centre of mass, metres
+    inertia: NDArray[np.float64],  # (3, 3) about it, kg m²
+    folder: Path,  # gets the meshes and `<name>.urdf`; created if missing
 ) -> Path:
     """Write an object whose contacts use convex parts, so that hollow objects stay hollow.
-
-    Args:
-        name: of the object.
-        visible: meshes that a camera sees, metres.
-        parts: convex meshes; the engine takes the hull of each.
-        centre: (3,) its centre of mass, metres.
-        inertia: (3, 3) about it, kg m².
-        folder: gets the meshes and `<name>.urdf`; created if missing.
 
     Returns:
         The URDF file.
@@ -273,18 +265,13 @@ def write_parts(
 
 
 def as_obj(
-    meshes: Iterable[Mesh],
+    meshes: Iterable[Mesh],  # points (P, 3) and triangles (F, 3) of each
     *,
-    decimals: int = 6,
+    decimals: int = 6,  # of coordinates
+    # Make each mesh an object of its own; the engine takes the convex hull of each.
     named: bool = False,
 ) -> str:
-    """Meshes as one OBJ file.
-
-    Args:
-        meshes: points (P, 3) and triangles (F, 3) of each.
-        decimals: of coordinates.
-        named: make each mesh an object of its own; the engine takes the convex hull of each.
-    """
+    """Meshes as one OBJ file."""
     lines, before = [], 1
     for number, (points, faces) in enumerate(meshes):
         if named:

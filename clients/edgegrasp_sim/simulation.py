@@ -178,20 +178,14 @@ class ClutterSimulation:
 
     def reset(
         self,
-        scene: SceneKind | str,
-        rng: np.random.Generator,
-        num_objects: int = 5,
+        scene: SceneKind | str,  # `packed`, `pile`, `bin`, `table`, `bin-full` or `shelf`
+        rng: np.random.Generator,  # the scene's own stream
+        num_objects: int = 5,  # how many to try to place
+        # Range of the factor on the objects' size; by default the scene's own.
         scales: tuple[float, float] | None = None,
-        table_thickness: float = OPEN_THICKNESS,
+        table_thickness: float = OPEN_THICKNESS,  # of packed and pile scenes, metres
     ) -> int:
         """Make a new scene at rest.
-
-        Args:
-            scene: `packed`, `pile`, `bin`, `table`, `bin-full` or `shelf`.
-            rng: the scene's own stream.
-            num_objects: how many to try to place.
-            scales: range of the factor on the objects' size; by default the scene's own.
-            table_thickness: of packed and pile scenes, metres.
 
         Returns:
             How many objects are there.
@@ -247,24 +241,16 @@ class ClutterSimulation:
 
     def observe_from(
         self,
-        T_world_cameras: Sequence[Matrix],
-        rng_noise: np.random.Generator,
+        T_world_cameras: Sequence[Matrix],  # one for each image
+        rng_noise: np.random.Generator,  # stream of the noise
         *,
+        # Standard deviation of the noise in each coordinate of each point, metres.
         noise_std: float = NOISE_STD,
-        depth_noise: DepthNoise | None = None,
-        sensor: DepthSensor | None = None,
-        table: TableView = "known",
+        depth_noise: DepthNoise | None = None,  # noise of the images
+        sensor: DepthSensor | None = None,  # what else the camera gets wrong
+        table: TableView = "known",  # what the cloud holds of the table, see `Observation`
     ) -> Observation:
-        """Look at the scene from each of the given poses, (4, 4) each.
-
-        Args:
-            T_world_cameras: one for each image.
-            rng_noise: stream of the noise.
-            noise_std: standard deviation of the noise in each coordinate of each point, metres.
-            depth_noise: noise of the images.
-            sensor: what else the camera gets wrong.
-            table: what the cloud holds of the table, see `Observation`.
-        """
+        """Look at the scene from each of the given poses, (4, 4) each."""
         workspace = np.asarray(self.surroundings.workspace)
         box = seen_box(workspace, table)
         clouds = []

@@ -123,23 +123,14 @@ class GraspDetector:
 
     def __init__(
         self,
-        network: nn.Module,
-        metadata: CheckpointMetadata,
-        gripper: Gripper,
-        device: torch.device | str = "cpu",
+        network: nn.Module,  # scores the candidates
+        metadata: CheckpointMetadata,  # of the weights
+        gripper: Gripper,  # that it was trained for, used if a request names none
+        device: torch.device | str = "cpu",  # where the network runs
+        # The user's own, which requests may name beside the shipped ones.
         grippers: Mapping[str, Gripper] | None = None,
-        max_voxels: int = MAX_VOXELS,
+        max_voxels: int = MAX_VOXELS,  # most that a request's cloud may have
     ) -> None:
-        """Wrap a network.
-
-        Args:
-            network: Scores the candidates.
-            metadata: Describes the weights.
-            gripper: The one it was trained for, used if a request names none.
-            device: Where it runs.
-            grippers: The user's own, which requests may name beside the shipped ones.
-            max_voxels: Most voxels that a request's cloud may have.
-        """
         self.max_voxels = max_voxels
         self.network = network.to(device).eval()
         self.metadata = metadata
@@ -155,13 +146,7 @@ class GraspDetector:
         grippers: Mapping[str, Gripper] | None = None,
         max_voxels: int = MAX_VOXELS,
     ) -> "GraspDetector":
-        """Load a checkpoint and the gripper it was trained for.
-
-        Args:
-            path: The file.
-            device: Where the network runs; everything else runs on the processor.
-            grippers: The user's own, which requests may name beside the shipped ones.
-            max_voxels: As for the constructor.
+        """Load a checkpoint and the gripper it was trained for; arguments as of the constructor.
 
         Raises:
             InvalidCheckpoint: The file cannot be used.
@@ -489,11 +474,7 @@ class ModelCatalogue:
     pace = Pace()
 
     def __init__(self, detectors: Mapping[str, GraspDetector], default: str = "") -> None:
-        """Collect detectors.
-
-        Args:
-            detectors: By name; at least one.
-            default: Name to use if a request names none; empty: the best one loaded.
+        """Collect detectors by name, at least one; `default` as for `load`.
 
         Raises:
             UnknownModel: No detector has the default's name.
@@ -509,20 +490,15 @@ class ModelCatalogue:
     @classmethod
     def load(
         cls,
-        weights: Sequence[Path] = (),
-        default: str = "",
-        device: torch.device | str = "cpu",
-        grippers: Sequence[Path] = (),
-        max_voxels: int = MAX_VOXELS,
+        weights: Sequence[Path] = (),  # .safetensors files, or folders of them
+        default: str = "",  # name to use if a request names none; empty: the best one loaded
+        device: torch.device | str = "cpu",  # where the networks run
+        grippers: Sequence[Path] = (),  # files that requests may name by their stem
+        max_voxels: int = MAX_VOXELS,  # most that a request's cloud may have
     ) -> Self:
         """Load the shipped weights, then the user's own, which replace those of the same name.
 
-        Args:
-            weights: `.safetensors` files, or folders of them; a model is named as its file.
-            default: As for the constructor.
-            device: Where the networks run.
-            grippers: Gripper files that requests may name by their stem.
-            max_voxels: Most voxels that a request's cloud may have.
+        A model is named as its file.
 
         Raises:
             InvalidCheckpoint: A file cannot be used, or there is none.

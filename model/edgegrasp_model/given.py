@@ -54,23 +54,14 @@ class Given:
 
 
 def evaluate(
-    scene: Scene,
-    given: Given,
-    gripper: Gripper,
-    request: Collision,
-    scorer: Scorer,
-    collide: CollisionCheck = collides,
+    scene: Scene,  # the scene
+    given: Given,  # edges or hand poses as candidates
+    gripper: Gripper,  # the hand
+    request: Collision,  # what collides
+    scorer: Scorer,  # the network
+    collide: CollisionCheck = collides,  # the collision check
 ) -> list[Evaluation]:
-    """Evaluate the given edges or poses, in order.
-
-    Args:
-        scene: The scene.
-        given: Edges or hand poses as candidates.
-        gripper: The hand.
-        request: What collides.
-        scorer: The network.
-        collide: The collision check.
-    """
+    """Evaluate the given edges or poses, in order."""
     candidates = given.candidates
     view = hand_views(scene.cloud, candidates.T_cloud_hand, reach_of(gripper))
     if scorer.network.architecture == "hand":

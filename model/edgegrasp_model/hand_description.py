@@ -68,24 +68,19 @@ class Surroundings:
 
 
 def describe_hands(
-    around: Surroundings,
-    candidates: Candidates,
-    gripper: Gripper,
+    around: Surroundings,  # what they look at
+    candidates: Candidates,  # E candidates
+    gripper: Gripper,  # fingers open to its maximum
+    # `hand_views` of the same candidates, within `reach_of` the gripper, if the caller has it
+    # already.
     view: HandView | None = None,
+    # How many numbers the network reads; the extents, which come last, are skipped if it reads
+    # none.
     size: int = HAND_DESCRIPTION_SIZE,
 ) -> Float32:
     """The hand-frame description of each candidate.
 
     With several cameras, only the space that none of them saw is described.
-
-    Args:
-        around: What they look at.
-        candidates: E candidates.
-        gripper: Fingers open to its maximum.
-        view: `hand_views` of the same candidates, within `reach_of` the gripper, if the caller has
-            it already.
-        size: How many numbers the network reads; the extents, which come last, are skipped if it
-            reads none.
 
     Returns:
         (E, HAND_DESCRIPTION_SIZE), or without the extents: counts (logarithm of 1 + n), metres

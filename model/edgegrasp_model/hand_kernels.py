@@ -101,21 +101,15 @@ def extents_between(
 
 
 def distance_behind(
+    # (2 H + 1, 2 H + 1) metres from the camera in each cell, the middle cell straight ahead; inf
+    # where nothing was seen.
     surface: Float32,
-    turn: Floats,
-    shift: Floats,
-    places: Float32,
-    cell: float,
+    turn: Floats,  # (E, 3, 3) from each hand's frame to the camera's: across, down, ahead
+    shift: Floats,  # (E, 3) of each hand in the camera's frame
+    places: Float32,  # (S, 3) hand frame
+    cell: float,  # tangent of the angle of a cell
 ) -> Float32:
     """How far some places of hands lie behind the first surface that a camera saw.
-
-    Args:
-        surface: (2 H + 1, 2 H + 1) metres from the camera in each cell, the middle cell straight
-            ahead; inf where nothing was seen.
-        turn: (E, 3, 3) from each hand's frame to the camera's: across, down, ahead.
-        shift: (E, 3) of each hand in the camera's frame.
-        places: (S, 3) hand frame.
-        cell: Tangent of the angle of a cell.
 
     Returns:
         (E, S) metres; 0 in front of the surface, and where nothing was seen.

@@ -161,24 +161,15 @@ def _grid(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Float32:
 
 
 def visible_extents(
-    points: Float32,
-    number: Int64 | None,
-    contact_index: Int64,
-    T_cloud_hand: Float32,
-    side: Float32,
-    gripper: Gripper,
-    up: Float32,
+    points: Float32,  # (N, 3)
+    number: Int64 | None,  # (N,) the object of each point; None: one object
+    contact_index: Int64,  # (E,) rows of `points`: the object of that point is measured
+    T_cloud_hand: Float32,  # (E, 4, 4) hands
+    side: Float32,  # (E,) 1 or -1, the factor on x
+    gripper: Gripper,  # fingers open to its maximum
+    up: Float32,  # (3,) away from gravity
 ) -> Float32:
     """The visible size of the object between the fingers, and how far it extends beyond them.
-
-    Args:
-        points: (N, 3).
-        number: (N,) the object of each point; None: one object.
-        contact_index: (E,) rows of `points`: the object of that point is measured.
-        T_cloud_hand: (E, 4, 4) hands.
-        side: (E,) 1 or -1, the factor on x.
-        gripper: Fingers open to its maximum.
-        up: (3,) away from gravity.
 
     Returns:
         (E, NUM_EXTENTS) metres: beyond the inner face of each finger along the closing line,

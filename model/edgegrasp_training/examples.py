@@ -96,19 +96,12 @@ def tried_grasps(
 
 
 def hand_batch(
-    view: LabelledView,
-    candidates: Candidates,
-    viewpoints: Float32 | None,
-    max_points: int,
+    view: LabelledView,  # what is seen of the scene
+    candidates: Candidates,  # E hands to try
+    viewpoints: Float32 | None,  # (W, 3) camera positions, metres; None: not known
+    max_points: int,  # points of each hand at most
 ) -> HandBatch:
-    """The hand network's inputs for candidates in a simulated scene.
-
-    Args:
-        view: What is seen of the scene.
-        candidates: E hands to try.
-        viewpoints: (W, 3) camera positions, metres; None: not known.
-        max_points: Points of each hand at most.
-    """
+    """The hand network's inputs for candidates in a simulated scene."""
     cloud = Cloud(view.points, view.normals)
     known = view.support_plane, viewpoints, view.cut_off(), view.numbered_objects()
     return HandBatch.of_hands(

@@ -112,20 +112,15 @@ class Query(NamedTuple):
 
 
 def generate(
-    folder: Path,
+    folder: Path,  # where the views go, one file each
+    # Object sets in the layout `packed/train`, `pile/train`; None: the built-in ones.
     objects: Path | None,
-    options: GenerationOptions,
-    workers: int | None = 1,
+    options: GenerationOptions,  # what to generate
+    workers: int | None = 1,  # how many scenes at a time, and
+    # Address of a Ray cluster to make them on: see `run_tasks`. Views come back to `folder`.
     ray: str | None = None,
 ) -> Iterator[tuple[int, int, int]]:
     """Generate the scenes that are missing, in any order; workers do not change the result.
-
-    Args:
-        folder: Where the views go, one file each.
-        objects: Object sets in the layout `packed/train`, `pile/train`; None: the built-in ones.
-        options: What to generate.
-        workers: How many scenes at a time, and
-        ray: Address of a Ray cluster to make them on: see `run_tasks`. Views come back to `folder`.
 
     Yields:
         For each finished scene its index, the grasps tried in it and those that held.
@@ -364,22 +359,14 @@ def _objects_of(simulation: ClutterSimulation) -> Region:
 
 
 def label(
-    simulation: ClutterSimulation,
-    query: Query,
-    options: GenerationOptions,
-    rng: np.random.Generator,
+    simulation: ClutterSimulation,  # holds the scene
+    query: Query,  # A view of it and the request
+    options: GenerationOptions,  # how many to try, and the weights that guide the choice
+    rng: np.random.Generator,  # chooses among the candidates
     *,
-    hard: bool,
+    hard: bool,  # whether the scene is known to be hard, even where the best grasp is sure
 ) -> LabelledView:
-    """Sample candidates as the detector does and try some of them.
-
-    Args:
-        simulation: Holds the scene.
-        query: A view of it and the request.
-        options: How many to try, and the weights that guide the choice.
-        rng: Chooses among the candidates.
-        hard: Whether the scene is known to be hard, even where the best grasp is sure.
-    """
+    """Sample candidates as the detector does and try some of them."""
     observation = query.observation
     found = choose_grasps(query, options, rng, hard=hard)
     if found is None:

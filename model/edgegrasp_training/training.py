@@ -53,26 +53,16 @@ class Trainer:
 
     def __init__(
         self,
-        metadata: CheckpointMetadata,
-        train_paths: list[Path],
-        validation_paths: list[Path],
-        folder: Path,
-        options: TrainingOptions,
-        device: torch.device | str = "cpu",
-        teacher: Teacher | None = None,
-        start: Path | None = None,
+        metadata: CheckpointMetadata,  # name, widths and gripper of the network to train
+        train_paths: list[Path],  # view files
+        validation_paths: list[Path],  # view files of other scenes
+        folder: Path,  # gets `state.pt`, `log.csv` and `NAME.safetensors`, the best so far
+        options: TrainingOptions,  # the recipe
+        device: torch.device | str = "cpu",  # where the network runs
+        teacher: Teacher | None = None,  # scores further candidates to learn from
+        start: Path | None = None,  # weights to start from; None: random ones
     ) -> None:
         """Set up, and resume from the folder's last state if there is one.
-
-        Args:
-            metadata: Name, widths and gripper of the network to train.
-            train_paths: View files.
-            validation_paths: View files of other scenes.
-            folder: Gets `state.pt`, `log.csv` and `NAME.safetensors`, the best so far.
-            options: The recipe.
-            device: Where the network runs.
-            teacher: Scores further candidates to learn from.
-            start: Weights to start from; None: random ones.
 
         Raises:
             InvalidCheckpoint: The weights to start from cannot be read.
