@@ -46,6 +46,7 @@ from edgegrasp_client.options import Suppression as Suppression
 from edgegrasp_client.options import Workspace as Workspace
 from edgegrasp_client.requests import DepthImage as DepthImage
 from edgegrasp_client.requests import Intrinsics as Intrinsics
+from edgegrasp_client.requests import RequestFields as RequestFields
 from edgegrasp_client.requests import StreamRequest as StreamRequest
 from edgegrasp_client.requests import object_in_scene as object_in_scene
 from edgegrasp_client.requests import on_mask as on_mask

@@ -13,7 +13,6 @@ from collections.abc import (
     Coroutine,
     Iterable,
     Iterator,
-    Sequence,
 )
 from concurrent.futures import Future
 from functools import partial, wraps
@@ -30,10 +29,9 @@ from edgegrasp_client.errors import (
     WorkerLostError,
     invalid,
 )
-from edgegrasp_client.options import DetectOptions
 from edgegrasp_client.over_grpc import GrpcTransport
 from edgegrasp_client.over_rest import RestTransport
-from edgegrasp_client.requests import Cloud, DepthImage, Request, StreamRequest
+from edgegrasp_client.requests import Cloud, Request, RequestFields, StreamRequest
 from edgegrasp_client.results import Model, Robot, StreamAnswer
 from edgegrasp_results import Detection, Grasp, Scoring
 
@@ -86,13 +84,8 @@ class AsyncGraspClient:
         self,
         cloud: Cloud | None = None,
         *,
-        depth_images: Sequence[DepthImage] | None = None,
-        normals: Array | None = None,
-        colors: Array | None = None,
-        segment_ids: Array | None = None,
-        view_ids: Array | None = None,
         timeout: float | None = None,
-        **options: Unpack[DetectOptions],
+        **fields: Unpack[RequestFields],
     ) -> Detection:
         """Find grasps in a cloud.
 
@@ -100,20 +93,14 @@ class AsyncGraspClient:
             cloud: (N, 3) float32 or float64, metres; (H, W, 3) with NaN for holes; the path of a
                 .npy, .npz, .ply, .pcd or .xyz file; or an object with the attributes of
                 sensor_msgs/PointCloud2.
-            depth_images: Views to fuse in place of a cloud; their cameras are the viewpoints, and
-                the rows of the cloud their pixels, one image after the other.
-            normals: (N, 3), one for each row of the cloud, outward, of any length.
-            colors: (N, 3), one for each row.
-            segment_ids: (N,) integers, which `segments` of a region name.
-            view_ids: (N,) integers: which of several positions of `viewpoint` saw each row.
             timeout: Seconds to wait; None: the client's own.
-            options: As in DetectOptions; options left out take the server's defaults.
+            fields: As in RequestFields: depth images in place of a cloud, arrays beside it, and
+                options; those left out take the server's defaults.
 
         Raises:
             GraspClientError: As in edgegrasp_client.errors.
         """
-        beside = (normals, colors, segment_ids, view_ids)
-        request = Request(cloud, depth_images, options, beside)
+        request = Request(cloud, fields)
         return await self._retried(partial(self._transport.ask, Detection, request), timeout)
 
     async def score(
@@ -122,13 +109,8 @@ class AsyncGraspClient:
         *,
         edges: Array | None = None,
         hand_poses: Array | None = None,
-        depth_images: Sequence[DepthImage] | None = None,
-        normals: Array | None = None,
-        colors: Array | None = None,
-        segment_ids: Array | None = None,
-        view_ids: Array | None = None,
         timeout: float | None = None,
-        **options: Unpack[DetectOptions],
+        **fields: Unpack[RequestFields],
     ) -> Scoring:
         """Score your own edges or hand poses (the paper's grasp evaluation function).
 
@@ -141,8 +123,7 @@ class AsyncGraspClient:
         Raises:
             GraspClientError: As in edgegrasp_client.errors.
         """
-        beside, given = (normals, colors, segment_ids, view_ids), (edges, hand_poses)
-        request = Request(cloud, depth_images, options, beside, given)
+        request = Request(cloud, fields, {"edges": edges, "hand_poses": hand_poses})
         return await self._retried(partial(self._transport.ask, Scoring, request), timeout)
 
     def detect_stream(

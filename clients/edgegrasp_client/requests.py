@@ -51,7 +51,6 @@ class DepthImage(TypedDict):
 
 Cloud = Array | str | PathLike[str] | PointCloud2
 BESIDE = ("normals", "colors", "segment_ids", "view_ids")
-TO_SCORE = ("edges", "hand_poses")
 Fits = Callable[[tuple[int, ...]], bool]
 VECTORS: tuple[str, Fits, str] = (
     "iuf",
@@ -73,15 +72,20 @@ ARRAYS: dict[str, tuple[str, Fits, str]] = {  # kinds of dtype, shapes that fit,
 }
 
 
+class RequestFields(DetectOptions, total=False):
+    """What may come with a cloud: options, arrays, and images in its place; N rows of the cloud."""
+
+    # Views to fuse in place of a cloud; their cameras are the viewpoints, and the rows of the cloud
+    # their pixels, one image after the other.
+    depth_images: Sequence[DepthImage] | None
+    normals: Array | None  # (N, 3) outward, of any length
+    colors: Array | None  # (N, 3)
+    segment_ids: Array | None  # (N,) integers, which `segments` of a region name
+    view_ids: Array | None  # (N,) integers: which of several positions of `viewpoint` saw each row
+
+
 class Request:
     """A cloud or depth images, options, and the arrays that come with them.
-
-    Args:
-        cloud: As of `GraspClient.detect`, as the next two.
-        depth_images: Views in place of a cloud.
-        options: Of the detection.
-        beside: Arrays in the order of BESIDE.
-        to_score: Edges and hand poses, of which one is None; empty: grasps are asked for.
 
     Attributes:
         options: As of `plain_options`.
@@ -96,26 +100,27 @@ class Request:
     def __init__(
         self,
         cloud: Cloud | None,
-        depth_images: Sequence[DepthImage] | None,
-        options: Mapping[str, Any],
-        beside: Sequence[Array | None] = (),
-        to_score: Sequence[Array | None] = (),
+        fields: Mapping[str, Any],  # as RequestFields
+        to_score: Mapping[str, Array | None]
+        | None = None,  # edges and hand_poses, one of them None
     ) -> None:
-        self.cloud, self.depth_images = cloud, depth_images
-        self.options = plain_options(options)
-        if (cloud is None) == (depth_images is None):
+        given, self.cloud, self.scores = dict(fields), cloud, to_score is not None
+        self.depth_images: Sequence[DepthImage] | None = given.pop("depth_images", None)
+        beside = {name: given.pop(name, None) for name in BESIDE} | dict(to_score or {})
+        self.options = plain_options(given)
+        if (cloud is None) == (self.depth_images is None):
             value = "nothing" if cloud is None else "a cloud beside depth_images"
             raise invalid("cloud", value, "Give a cloud or depth_images.")
-        self.scores = bool(to_score)
-        if to_score and (to_score[0] is None) == (to_score[1] is None):
-            value = "nothing" if to_score[0] is None else "edges beside hand_poses"
+        if to_score and (to_score["edges"] is None) == (to_score["hand_poses"] is None):
+            value = "nothing" if to_score["edges"] is None else "edges beside hand_poses"
             raise invalid("edges", value, "Give edges or hand_poses.")
-        given = (*zip(BESIDE, beside, strict=False), *zip(TO_SCORE, to_score, strict=False))
-        self.arrays = {name: _sent(name, array) for name, array in given if array is not None}
+        self.arrays = {
+            name: _sent(name, array) for name, array in beside.items() if array is not None
+        }
 
 
 class StreamRequest:
-    """One request of a stream; arguments as of `GraspClient.detect`.
+    """One request of a stream; `cloud` and `fields` as of `GraspClient.detect`.
 
     Attributes:
         request: The cloud and what comes with it.
@@ -132,15 +137,9 @@ class StreamRequest:
         *,
         request_id: str = "",
         timeout: float | None = None,
-        depth_images: Sequence[DepthImage] | None = None,
-        normals: Array | None = None,
-        colors: Array | None = None,
-        segment_ids: Array | None = None,
-        view_ids: Array | None = None,
-        **options: Unpack[DetectOptions],
+        **fields: Unpack[RequestFields],
     ) -> None:
-        beside = (normals, colors, segment_ids, view_ids)
-        self.request = Request(cloud, depth_images, options, beside)
+        self.request = Request(cloud, fields)
         self.request_id = request_id
         self.timeout = timeout
 
@@ -381,7 +380,7 @@ def _sent(name: str, array: object) -> Array:
         raise invalid(name, f"dtype {array.dtype}", f"Give {wanted}.")
     if not fits(array.shape):
         raise invalid(name, f"shape {array.shape}", f"Give {wanted}.")
-    if name in TO_SCORE:
+    if name in ("edges", "hand_poses"):
         return array
     if kinds == "iuf":
         return np.ascontiguousarray(array.reshape(-1, 3), dtype=np.float32)

@@ -59,7 +59,7 @@ def ask(robot, transport, settings=SETTINGS, remaining=60.0, **changes):
     """The answer to a request about the robot, and the catalogue that it went to."""
     catalogue = Catalogue(robot)
     asked = {"name": "fr3", "T_base_cloud": TURNED, "joints": robot.home} | changes
-    request = Request(catalogue.cloud, None, {"robot": asked})
+    request = Request(catalogue.cloud, {"robot": asked})
     if transport == "grpc":
         body = message_of(request).SerializeToString()
         return answer(Job("DetectGrasps", "grpc", body, remaining), catalogue, settings), catalogue

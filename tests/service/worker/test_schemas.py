@@ -38,8 +38,9 @@ def test_requests() -> None:
     in_grpc = [*SCHEMAS["DetectOptions"]["properties"], "object_choice"]  # `objects` as an object
     assert in_grpc == fields("DetectOptions")
     for method, names in ((client.GraspClient.detect, detect), (client.GraspClient.score, score)):
-        ours = set(inspect.signature(method).parameters) - {"self", "timeout"}
-        assert ours == set(names) - {"points", "encoded", "point_cloud2"} | {"cloud"}
+        beside = client.RequestFields.__annotations__.keys() - client.DetectOptions.__annotations__
+        ours = set(inspect.signature(method).parameters) - {"self", "timeout", "fields"} | beside
+        assert ours == set(names) - {"points", "encoded", "point_cloud2", "options"} | {"cloud"}
 
 
 def test_errors() -> None:
