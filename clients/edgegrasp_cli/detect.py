@@ -194,20 +194,29 @@ def open_client(
 class OwnDetector:
     """A detector in this process, with the interface of `GraspClient`."""
 
+    robot: str | None = None  # a name or file, in place of the name in a request
+
     def __init__(self, weights: Sequence[Path], grippers: Sequence[Path], device: str) -> None:
         self._load = weights, grippers, device
 
     def detect(
-        self, cloud: Any = None, *, depth_images: Any = None, colors: Any = None, **options: Any
+        self,
+        cloud: Any = None,
+        *,
+        depth_images: Any = None,
+        colors: Any = None,
+        view_ids: Any = None,
+        **options: Any,
     ) -> Any:
         """Find grasps in a cloud: an array, a file, or depth images; raises as the detector."""
         from edgegrasp_client.requests import depth_image_fields, npy_bytes
         from edgegrasp_model.options import parse_options
         from edgegrasp_model.request_cloud import File, decode_cloud
 
-        fields: dict[str, Any] = {}
-        if colors is not None:
-            fields["colors"] = File("npy", npy_bytes(colors))
+        beside = {"colors": colors, "view_ids": view_ids}
+        fields: dict[str, Any] = {
+            name: File("npy", npy_bytes(of)) for name, of in beside.items() if of is not None
+        }
         if depth_images is not None:
             images = enumerate(depth_images)
             fields["depth_images"] = [depth_image_fields(image, row) for row, image in images]
@@ -221,7 +230,10 @@ class OwnDetector:
             return detector.detect(sent, parsed)
         from edgegrasp_robot import detect_picks, load_robot
 
-        return detect_picks(detector, sent, parsed, load_robot(parsed.robot.name))
+        return detect_picks(detector, sent, parsed, load_robot(self.robot or parsed.robot.name))
+
+    def close(self) -> None:
+        """Nothing to close, unlike a client."""
 
     def models(self) -> "list[Model]":
         """The weights that can be used."""

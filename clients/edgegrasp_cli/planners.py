@@ -2,7 +2,7 @@
 
 import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import entry_points
@@ -12,14 +12,9 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from edgegrasp_cli.detect import OwnDetector
 from edgegrasp_cli.flags import connect
-from edgegrasp_client import (
-    GraspClient,
-    GraspClientError,
-    Model,
-    ServerUnavailableError,
-    StartCollisionError,
-)
+from edgegrasp_client import GraspClientError, Model, ServerUnavailableError, StartCollisionError
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.protocol import PlanningRules
 from edgegrasp_sim.trial import PlannedGrasp, Planner, StartCollides
@@ -82,27 +77,33 @@ def open_planner(choice: PlannerChoice, rules: PlanningRules) -> Iterator[Chosen
     if choice.server and choice.model.endswith(SUFFIX):
         raise ValueError(f"model is {choice.model}; name one of the server's own weights")
     weights, model = choice.weights_and_model()
-    facts: dict[str, Any] = {"name": choice.name, "options": choice.options}
-    if choice.name == "in-process":
-        from edgegrasp_model.detector import ModelCatalogue
+    asked = {"model": model, **choice.options}
+    with _server(choice, weights) as address:
+        open_client: Callable[[float], Any] = (
+            partial(_OneThread, weights, choice.robot)
+            if address is None
+            else partial(connect, address, **choice.connection)
+        )
+        with closing(open_client(CONNECT_SECONDS)) as client:
+            used = model_used(client, model)
+        facts: dict[str, Any] = {"name": choice.name, "options": choice.options}
+        facts |= {"model": used.name, "digest": used.digest, "voxel_size": used.voxel_size}
+        yield ChosenPlanner(partial(ClientPlanner, open_client, rules, asked), facts)
 
-        used = ModelCatalogue.load(weights).get(model).metadata
-        planner = partial(InProcessPlanner, weights, model, rules, choice.options, choice.robot)
-        yield ChosenPlanner(planner, facts | {"model": used.name, "digest": used.digest})
+
+@contextmanager
+def _server(choice: PlannerChoice, weights: Sequence[Path]) -> Iterator[str | None]:
+    """The address of the server to use, started if none is given; None: this process."""
+    if choice.name == "in-process" or choice.server:
+        yield choice.server if choice.name == "server" else None
         return
-    from edgegrasp_client.connection import Addresses, local_server
+    from edgegrasp_client.connection import local_server
 
     flags = [text for path in weights for text in ("--weights", str(path))]
     if choice.robot is not None:
         flags += ["--robots", choice.robot]
-    own = nullcontext(Addresses("", choice.server)) if choice.server else local_server(*flags)
-    with own as addresses:
-        address = addresses.grpc_address
-        with connect(address, CONNECT_SECONDS, **choice.connection) as client:
-            served = model_used(client, model)
-        asked = {"model": model, **choice.options}
-        facts |= {"model": served.name, "digest": served.digest, "voxel_size": served.voxel_size}
-        yield ChosenPlanner(partial(ServerPlanner, address, rules, asked, choice.connection), facts)
+    with local_server(*flags) as addresses:
+        yield addresses.grpc_address
 
 
 def named_planner(name: str) -> Planner:
@@ -131,24 +132,44 @@ def named_planner(name: str) -> Planner:
     return cast("Planner", planner)
 
 
-@dataclass
-class ServerPlanner:
-    """Requests the best grasp of each observation from a server; waits while it restarts."""
+class _OneThread(OwnDetector):
+    """A detector whose sums do not depend on how many threads the process has."""
 
-    address: str  # host:port (gRPC) or http://host:port
+    def __init__(self, weights: Sequence[Path], robot: str | None, timeout: float) -> None:
+        super().__init__(weights, (), "cpu")
+        self.robot = robot
+
+    def detect(self, cloud: Any = None, **options: Any) -> Any:
+        import torch
+
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            return super().detect(cloud, **options)
+        finally:
+            torch.set_num_threads(threads)
+
+
+@dataclass
+class ClientPlanner:
+    """Requests the best grasp of each observation; waits while a server restarts."""
+
+    open_client: Callable[[float], Any]  # of a timeout in seconds; a GraspClient or the like
     rules: PlanningRules  # of the protocol
     options: Mapping[str, Any]  # of each request, besides the protocol's
-    connection: Mapping[str, Any]  # keyword arguments of `connect`
-    _client: GraspClient | None = field(default=None, init=False)
+    _client: Any = field(default=None, init=False)
 
     def __call__(self, observation: Observation, seed: int) -> PlannedGrasp | None:
-        """The server's best grasp; None if it finds none.
+        """The best grasp; None if there is none.
 
         Raises:
             GraspClientError: the server refuses the request, or is away for REQUEST_SECONDS.
+            EdgeGraspError: the detector in this process refuses it.
         """
+        from edgegrasp_model.errors import StartCollision
+
         if self._client is None:
-            self._client = connect(self.address, REQUEST_SECONDS, **self.connection)
+            self._client = self.open_client(REQUEST_SECONDS)
         options = request_options(observation, seed, self.rules, self.options)
         ask = partial(
             self._client.detect, observation.image, view_ids=view_ids(observation), **options
@@ -159,7 +180,7 @@ class ServerPlanner:
             except ServerUnavailableError:
                 self._client.wait_until_ready(REQUEST_SECONDS)
                 return _best(ask().grasps, options)
-        except StartCollisionError as error:
+        except (StartCollision, StartCollisionError) as error:
             raise StartCollides(str(error)) from None
 
     def close(self) -> None:
@@ -168,64 +189,18 @@ class ServerPlanner:
             self._client.close()
 
 
-class InProcessPlanner:
-    """Returns the best grasp of a detector in this process.
-
-    Raises:
-        EdgeGraspError: the weights cannot be loaded.
-    """
-
-    def __init__(
-        self,
-        weights: tuple[Path, ...],
-        model: str,
-        rules: PlanningRules,
-        options: Mapping[str, Any],
-        robot: str | None = None,
-    ) -> None:
-        from edgegrasp_model.detector import ModelCatalogue
-
-        self._detector = ModelCatalogue.load(weights).get(model)
-        self._rules, self._options, self._robot = rules, options, robot
-
-    def __call__(self, observation: Observation, seed: int) -> PlannedGrasp | None:
-        """The best grasp; None if there is none."""
-        import torch
-
-        from edgegrasp_model.errors import StartCollision
-        from edgegrasp_model.options import parse_options
-        from edgegrasp_model.scene.cloud import CloudInput
-
-        asked = request_options(observation, seed, self._rules, self._options)
-        options = parse_options(asked)
-        cloud = CloudInput(observation.image, view_ids=view_ids(observation))
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # so that sums do not depend on the number of threads elsewhere
-        try:
-            if self._robot is None:
-                return _best(self._detector.detect(cloud, options).grasps, asked)
-            from edgegrasp_robot import detect_picks, load_robots
-
-            (robot,) = load_robots((Path(self._robot),)).values()
-            return _best(detect_picks(self._detector, cloud, options, robot).grasps, asked)
-        except StartCollision as error:
-            raise StartCollides(str(error)) from None
-        finally:
-            torch.set_num_threads(threads)
-
-
-def model_used(client: GraspClient, name: str) -> Model:
+def model_used(client: Any, name: str) -> Model:
     """The model that a request naming `name` gets; the default for an empty one.
 
     Raises:
         GraspClientError: the server does not answer, or has no such model.
     """
-    models = client.models()
+    models: list[Model] = client.models()
     for model in models:
         if model.name == name or (model.default and not name):
             return model
     known = ", ".join(model.name for model in models)
-    raise GraspClientError(f"model is {name!r}; the server has {known}")
+    raise GraspClientError(f"model is {name!r}; choose one of {known}")
 
 
 def request_options(
