@@ -222,11 +222,7 @@ def _sampled_poses(observation: Observation) -> np.ndarray:
 
 
 def write_table(page: Path, written: str) -> None:
-    """Put a table between a page's markers.
-
-    Raises:
-        ValueError: The file does not hold both markers.
-    """
+    """Put a table between a page's markers; raises ValueError where it does not hold both."""
     place = re.compile(f"{BEGIN}.*{END}", re.DOTALL)
     text, count = place.subn(lambda _: f"{BEGIN}\n{written}\n{END}", page.read_text())
     if not count:

@@ -281,11 +281,7 @@ def run_rounds(
     workers: int | None,
     ray: str | None,
 ) -> "tuple[list[Round], str]":
-    """Run the remaining rounds of a benchmark with a progress bar.
-
-    Returns:
-        All rounds, and the name of the weights or of the planner.
-    """
+    """Run the remaining rounds, with a progress bar; returns all, and the title of the planner."""
     from rich.console import Console
 
     from edgegrasp_cli.planners import open_planner

@@ -79,11 +79,7 @@ def model_flags(
 
 
 def given_flags(model: "type[Model]", given: Mapping[str, Any]) -> "Model":
-    """The model from the flags of `model_flags`.
-
-    Raises:
-        ValueError: A value is out of range; names flag, value and limit.
-    """
+    """The model from the flags of `model_flags`; a ValueError names flag, value and limit."""
     from pydantic import ValidationError
 
     try:
@@ -102,11 +98,7 @@ def option_flags(*leave_out: str, defaults: bool = True) -> Flags:
 
 
 def parse_option_flags(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The options from the flags of `option_flags`; text is read like query parameters.
-
-    Raises:
-        InvalidRequest: A value is of the wrong type or out of range.
-    """
+    """The options from the flags of `option_flags`; InvalidRequest: a value is wrong."""
     from edgegrasp_model.options import parse_options
     from edgegrasp_service.worker.http_bodies import options_from_query
 
@@ -137,11 +129,7 @@ def connect(
         Path | None, typer.Option(help="Key of the client certificate, PEM.")
     ] = None,
 ) -> "GraspClient":
-    """A client of a server; the keyword arguments are the flags in `CONNECTION`.
-
-    Raises:
-        GraspClientError: The token or a file cannot be used.
-    """
+    """A client of a server, by the flags in `CONNECTION`; raises GraspClientError."""
     from edgegrasp_client import GraspClient, Tls
 
     files = (tls_ca, tls_certificate, tls_key)

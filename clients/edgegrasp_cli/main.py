@@ -44,11 +44,7 @@ class LazyGroup(TyperGroup):
 
 
 def load_command(name: str) -> Any:
-    """Import a command.
-
-    Raises:
-        SystemExit: Needed packages are not installed.
-    """
+    """Import a command; raises SystemExit where packages that it needs are not installed."""
     module, _, _ = COMMANDS[name]
     try:
         found = importlib.import_module(f"edgegrasp_cli.{module}")

@@ -40,11 +40,7 @@ class PlannerChoice:
     robot: str | None = None  # that the options name: one that ships, or its file
 
     def weights_and_model(self) -> tuple[tuple[Path, ...], str]:
-        """The weights to load, and the name to ask for.
-
-        Raises:
-            ValueError: the model is a file, and there is none.
-        """
+        """The weights to load, and the name to ask for; raises ValueError if a file is missing."""
         if not self.model.endswith(SUFFIX):
             return self.weights, self.model
         file = Path(self.model)

@@ -110,11 +110,7 @@ def load_scenes(folders: Sequence[Path]) -> list[RealScene]:
 
 
 def load_scene(file: Path) -> RealScene:
-    """Read one scene.
-
-    Raises:
-        ValueError: It is not a scene; names file, field and fix.
-    """
+    """Read one scene; raises ValueError, with file, field and fix, for what is none."""
     try:
         with np.load(file) as archive:
             arrays = dict(archive)

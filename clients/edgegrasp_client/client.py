@@ -48,6 +48,8 @@ _ASKED_OVER_GRPC: set[int] = set()  # this process and its ancestors
 class AsyncGraspClient:
     """Client of one server; use it as an async context manager, or close it.
 
+    Its methods raise GraspClientErrors: see edgegrasp_client.errors.
+
     Args:
         address: "host:port" for gRPC, "http://host:port" or "https://..." for REST; or the socket
             of a server on this machine: "unix:/run/edgegrasp/grpc.sock" for gRPC,
@@ -96,9 +98,6 @@ class AsyncGraspClient:
             timeout: Seconds to wait; None: the client's own.
             fields: As in RequestFields: depth images in place of a cloud, arrays beside it, and
                 options; those left out take the server's defaults.
-
-        Raises:
-            GraspClientError: As in edgegrasp_client.errors.
         """
         request = Request(cloud, fields)
         return await self._retried(partial(self._transport.ask, Detection, request), timeout)
@@ -119,9 +118,6 @@ class AsyncGraspClient:
 
         Returns:
             An evaluation for each edge or pose, in their order.
-
-        Raises:
-            GraspClientError: As in edgegrasp_client.errors.
         """
         request = Request(cloud, fields, {"edges": edges, "hand_poses": hand_poses})
         return await self._retried(partial(self._transport.ask, Scoring, request), timeout)
@@ -151,29 +147,17 @@ class AsyncGraspClient:
         return self._transport.detect_stream(_named(requests), self._seconds(timeout))
 
     async def models(self, *, timeout: float | None = None) -> list[Model]:
-        """The weights that `model` can name.
-
-        Raises:
-            GraspClientError: As in edgegrasp_client.errors.
-        """
+        """The weights that `model` can name."""
         return (await self._retried(self._transport.models, timeout)).models
 
     async def robots(self, *, timeout: float | None = None) -> list[Robot]:
-        """The robots that `robot` can name.
-
-        Raises:
-            GraspClientError: As in edgegrasp_client.errors.
-        """
+        """The robots that `robot` can name."""
         return (await self._retried(self._transport.robots, timeout)).robots
 
     async def record_outcome(
         self, detection: Detection, grasp: Grasp, held: bool, *, timeout: float | None = None
     ) -> None:
-        """Report the outcome of an executed grasp to a server with an `outcomes_file`; REST only.
-
-        Raises:
-            GraspClientError: As in edgegrasp_client.errors; over gRPC there is no such call.
-        """
+        """Tell a server with an `outcomes_file` what became of a grasp; REST only."""
         tried = {"model": detection.model, "score": float(grasp.score), "held": bool(held)}
         call = partial(self._transport.record_outcome, tried)
         await self._retried(call, timeout)
@@ -183,11 +167,7 @@ class AsyncGraspClient:
         return await self._transport.ready(self._seconds(timeout))
 
     async def wait_until_ready(self, timeout: float = 60.0) -> None:
-        """Wait until the server can answer requests.
-
-        Raises:
-            DeadlineError: It was not ready within `timeout` seconds.
-        """
+        """Wait until the server can answer; DeadlineError: not within `timeout` seconds."""
         end = time.monotonic() + timeout
         while not await self.ready(timeout=max(POLL_SECONDS, end - time.monotonic())):
             if time.monotonic() >= end:

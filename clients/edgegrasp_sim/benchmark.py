@@ -62,11 +62,7 @@ class BenchmarkConfig:
         object.__setattr__(self, "engine", chosen)
 
     def object_set(self) -> ObjectSet:
-        """The objects to draw scenes from.
-
-        Raises:
-            FileNotFoundError: `objects` does not hold this scene and split.
-        """
+        """The objects to draw scenes from; FileNotFoundError if `objects` holds none for them."""
         if self.objects is None:
             return ObjectSet.builtin(self.scene)
         return ObjectSet.from_folder(self.objects, self.scene, self.split)

@@ -244,11 +244,7 @@ def write_parts(
     inertia: NDArray[np.float64],  # (3, 3) about it, kg m²
     folder: Path,  # gets the meshes and `<name>.urdf`; created if missing
 ) -> Path:
-    """Write an object whose contacts use convex parts, so that hollow objects stay hollow.
-
-    Returns:
-        The URDF file.
-    """
+    """Write an object of convex parts, so that hollow ones stay hollow; returns its URDF file."""
     folder.mkdir(parents=True, exist_ok=True)
     meshes = {f"{name}_visual": visible, f"{name}_collision": parts}
     for mesh, surfaces in meshes.items():
@@ -394,11 +390,7 @@ def _write_object(mesh: Path, folder: Path) -> int:
 
 
 def _read(mesh: Path) -> Any:
-    """The triangles of a file as one mesh.
-
-    Raises:
-        ValueError: there are none, they cannot be read, or they lie in a plane.
-    """
+    """The triangles of a file as one mesh; raises ValueError unless they enclose a volume."""
     import trimesh
 
     try:

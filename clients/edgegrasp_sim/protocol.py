@@ -163,9 +163,5 @@ def protocol_names() -> list[str]:
 
 
 def protocol_from(table: dict[str, Any]) -> Protocol:
-    """Build a protocol from its tables, as read from TOML or a result's manifest.
-
-    Raises:
-        ValueError: a constant is missing, unknown or makes no sense.
-    """
+    """Build a protocol from the tables of TOML or a manifest; ValueError: a constant is wrong."""
     return TypeAdapter(Protocol).validate_python(table)

@@ -48,11 +48,7 @@ class Replay:
         self.simulation.close()
 
     def find(self, seed: int, index: int, attempt: int = 0) -> Round:
-        """A recorded round that has an attempt of this number.
-
-        Raises:
-            ValueError: there is none.
-        """
+        """A recorded round that has an attempt of this number; ValueError: there is none."""
         done = self.rounds.get((seed, index))
         if done is None:
             known = ", ".join(f"{s}/{i}" for s, i in list(self.rounds)[:10])

@@ -75,22 +75,14 @@ class ResultFolder:
         return self._file(seed, index).is_file()
 
     def rounds(self) -> list[Round]:
-        """The finished rounds, by seed and index.
-
-        Raises:
-            FileNotFoundError: this folder contains no benchmark.
-        """
+        """The finished rounds, by seed and index; FileNotFoundError: there is no benchmark."""
         self.manifest()
         files = (self.path / "rounds").glob("*.json")
         rounds = [ROUND.validate_json(file.read_bytes()) for file in files]
         return sorted(rounds, key=lambda item: (item.seed, item.index))
 
     def manifest(self) -> dict[str, Any]:
-        """What was run.
-
-        Raises:
-            FileNotFoundError: this folder contains no benchmark.
-        """
+        """What was run; FileNotFoundError: there is no benchmark in this folder."""
         file = self.path / "manifest.json"
         if not file.is_file():
             raise FileNotFoundError(f"{self.path} contains no benchmark: manifest.json is missing")

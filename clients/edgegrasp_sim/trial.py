@@ -207,11 +207,7 @@ class RoundDriver:
         return grasp
 
     def execute(self, grasp: PlannedGrasp) -> Attempt:
-        """Execute a grasp planned in the last view.
-
-        Raises:
-            ValueError: its pose is not a rigid transform.
-        """
+        """Execute a grasp planned in the last view; ValueError: its pose is not rigid."""
         result = self.simulation.execute_grasp(grasp.T_world_hand, grasp.motion)
         attempt = Attempt(
             cause=result.cause,

@@ -522,11 +522,7 @@ class ModelCatalogue:
         return sorted(self._detectors)
 
     def get(self, name: str = "") -> GraspDetector:
-        """The detector of that name; the default for an empty name.
-
-        Raises:
-            UnknownModel: There is none.
-        """
+        """The detector of that name; the default for an empty name; UnknownModel: there is none."""
         try:
             return self._detectors[name or self.default]
         except KeyError:

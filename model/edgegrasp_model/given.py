@@ -113,11 +113,7 @@ def _contact_rows(candidates: Candidates, balls: Int64, crop: BallCrop, size: in
 
 
 def check_edges(edges: object, rows: int) -> Int64:
-    """Check (M, 2) rows of the cloud as sent.
-
-    Raises:
-        InvalidRequest: Wrong type or shape, too many, or a row that the cloud does not have.
-    """
+    """Check (M, 2) rows of the cloud as sent; InvalidRequest: wrong type, shape or range."""
     fix = "Send integers of shape (M, 2): rows of the cloud, approach and contact point each."
     if not isinstance(edges, np.ndarray):
         raise InvalidRequest("edges", f"a {type(edges).__name__}", fix)
@@ -132,11 +128,7 @@ def check_edges(edges: object, rows: int) -> Int64:
 
 
 def check_hand_poses(poses: object) -> Float32:
-    """Check (M, 4, 4) poses T_cloud_hand.
-
-    Raises:
-        InvalidRequest: Wrong type or shape, too many, or a pose that is not a rigid transform.
-    """
+    """Check (M, 4, 4) poses T_cloud_hand; InvalidRequest: wrong type or shape, or not rigid."""
     fix = "Send floats of shape (M, 4, 4): T_cloud_hand."
     if not isinstance(poses, np.ndarray):
         raise InvalidRequest("hand_poses", f"a {type(poses).__name__}", fix)

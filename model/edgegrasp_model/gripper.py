@@ -139,11 +139,7 @@ class Gripper:
 
 
 def gripper_from_fields(fields: Mapping[str, Any] | GripperGeometry) -> Gripper:
-    """Build a gripper from the fields of a gripper file, as they also come in a request.
-
-    Raises:
-        InvalidGripper: A field is missing, unknown or out of range, or they contradict each other.
-    """
+    """Build a gripper from the fields of its file or of a request; raises InvalidGripper."""
     try:
         geometry = GripperGeometry.model_validate(fields)
     except ValidationError as error:
@@ -166,11 +162,7 @@ def gripper_from_fields(fields: Mapping[str, Any] | GripperGeometry) -> Gripper:
 
 
 def load_gripper(name_or_path: str | Path = "panda") -> Gripper:
-    """Load a shipped gripper by name, or a user's own by path.
-
-    Raises:
-        InvalidGripper: The file does not exist or does not describe a gripper.
-    """
+    """Load a shipped gripper by name, or a user's own by path; raises InvalidGripper."""
     return gripper_from_fields(gripper_fields(name_or_path))
 
 

@@ -776,11 +776,7 @@ class DetectOptions(Strict):
 
 
 def parse_options(fields: object) -> DetectOptions:
-    """Build options from decoded JSON.
-
-    Raises:
-        InvalidRequest: A field is unknown, of the wrong type or out of range.
-    """
+    """Build options from decoded JSON; InvalidRequest: a field is unknown or its value wrong."""
     return parse(DetectOptions, fields, "options", DetectOptions.model_fields)
 
 

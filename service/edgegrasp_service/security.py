@@ -78,11 +78,7 @@ class Tokens:
 
 
 def load_tokens(settings: Settings) -> Tokens:
-    """The tokens in the files named by the settings.
-
-    Raises:
-        InvalidSettings: A file cannot be read or has an invalid token.
-    """
+    """The tokens in the files that the settings name; InvalidSettings: they cannot be used."""
     tokens = _read_tokens("token_file", settings.token_file)
     return Tokens(tokens + _read_tokens("admin_token_file", settings.admin_token_file))
 
@@ -119,11 +115,7 @@ def _digest(token: str) -> bytes:
 
 
 class ServerTls:
-    """TLS of both transports, with client certificates if a CA is set.
-
-    Raises:
-        InvalidSettings: A file cannot be read, or certificate and key do not match.
-    """
+    """TLS of both transports; InvalidSettings: a file cannot be read, or does not match its key."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings

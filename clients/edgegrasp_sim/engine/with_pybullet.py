@@ -47,11 +47,7 @@ _STRAIGHT, _HALF_TURN = [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]  # xyzw
 
 
 class PybulletWorld(World):
-    """One physics server.
-
-    Raises:
-        RuntimeError: PyBullet could not start a server: none is left in this process.
-    """
+    """One physics server; raises RuntimeError if none is left in this process."""
 
     name = "pybullet"
     constants = CONSTANTS

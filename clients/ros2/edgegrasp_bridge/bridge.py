@@ -352,22 +352,14 @@ def _object_result(
 
 
 def depth_array(image: Any) -> Array:
-    """The depths (H, W) of a sensor_msgs/Image: uint16 millimetres, or float32 metres.
-
-    Raises:
-        ValueError: Of an encoding that is no depth.
-    """
+    """The depths (H, W) of a sensor_msgs/Image, uint16 mm or float32 m; else a ValueError."""
     if image.encoding not in DEPTHS:
         raise ValueError(f"encoding: got {image.encoding!r} for depths. Send {', '.join(DEPTHS)}.")
     return image_array(image)
 
 
 def image_array(image: Any) -> Array:
-    """The values of a sensor_msgs/Image: (H, W), or (H, W, C) of several channels.
-
-    Raises:
-        ValueError: Of an encoding that is no depth and no mask.
-    """
+    """The values of a sensor_msgs/Image: (H, W), or (H, W, C); ValueError: of another encoding."""
     if image.encoding not in ENCODINGS:
         known = ", ".join(ENCODINGS)
         raise ValueError(f"encoding: got {image.encoding!r}. Send one of: {known}.")
@@ -395,11 +387,7 @@ def camera_matrix(camera: Any) -> Float64:
 
 
 def cloud_points(cloud: Any) -> Float64:
-    """Points (N, 3) of a sensor_msgs/PointCloud2, NaN where there is no reading.
-
-    Raises:
-        InvalidRequest: It has no x, y, z of floats, or is not whole.
-    """
+    """Points (N, 3) of a sensor_msgs/PointCloud2, NaN for holes; InvalidRequest: it is broken."""
     points = read_point_cloud2(cloud).points
     return np.asarray(points, dtype=np.float64).reshape(-1, 3)
 

@@ -40,11 +40,7 @@ TO_ENCODE = 0.1  # share of a request's time that is kept for writing its answer
 
 
 def load_catalogue(settings: Settings) -> "ModelCatalogue":
-    """Load the detectors that the settings name and warm them up; takes seconds.
-
-    Raises:
-        EdgeGraspError: Weights cannot be used, or the device is not there.
-    """
+    """Load the detectors of the settings and warm them up; EdgeGraspError: one cannot be used."""
     # Torch takes seconds to import, and some tests do without it.
     from edgegrasp_model.detector import ModelCatalogue, choose_device
 

@@ -58,11 +58,7 @@ def read_request(job: Job) -> dict[str, Any]:
 
 
 def plain_options(message: grasp_pb2.DetectOptions) -> dict[str, Any]:
-    """The options that are set.
-
-    Raises:
-        InvalidRequest: One is set in two fields.
-    """
+    """The options that are set; InvalidRequest: one is set in two fields."""
     options = _set_fields(message)
     if "object_choice" in options:
         if "objects" in options:
