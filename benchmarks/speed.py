@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from benchmarks.measuring import RESULTS, RUNS, interleaved, machine, served, write_results
+from examples.your_planner import plan
 
 from edgegrasp_cli.real_scenes import load_scenes
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue
@@ -29,7 +30,6 @@ from edgegrasp_sim.engine import ENGINES, installed
 from edgegrasp_sim.objects import CLUTTER, SceneKind
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.top_down import plan_top_down
 from edgegrasp_sim.trial import run_round
 from edgegrasp_training.recipes import VOXEL_SIZE, recipe
 
@@ -170,7 +170,7 @@ def simulator(kind: SceneKind) -> dict[str, dict[str, float]]:
             for pose in poses:
                 simulation.try_grasp(pose, shake=True)
             labelled = time.process_time()
-            run_round(simulation, plan_top_down, kind, protocol, seed=seed, index=0)
+            run_round(simulation, plan, kind, protocol, seed=seed, index=0)
             end = time.process_time()
             seconds[engine].append((seen - start + labelled - begin, end - labelled))
             labels[engine] += len(poses)

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from edgegrasp_cli.main import app
 
 Command = Callable[..., str]
-TOP_DOWN = "edgegrasp_sim.top_down:plan_top_down"
+TOP_DOWN = "examples.your_planner:plan"
 
 
 @pytest.fixture(scope="session")

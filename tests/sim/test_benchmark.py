@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from examples.your_planner import plan
 
 from edgegrasp_sim.benchmark import (
     BenchmarkConfig,
@@ -18,19 +19,18 @@ from edgegrasp_sim.benchmark import (
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.results import ResultFolder, attempts_digest
-from edgegrasp_sim.top_down import plan_top_down
 
 PAPER = load_protocol("edgegrasp")
 TWO_OBJECTS = replace(PAPER, scene=replace(PAPER.scene, num_objects=(2,)))
 
 # Called, it gives the planner; spawned workers can import it.
-make_planner = partial(partial, plan_top_down)
+make_planner = partial(partial, plan)
 
 
 DIES_ONCE = """
 import os, signal
 from pathlib import Path
-from edgegrasp_sim.top_down import plan_top_down
+from examples import your_planner
 
 MARK = Path(__file__).with_suffix(".died")
 
@@ -38,7 +38,7 @@ def plan(observation, seed):
     if not MARK.exists():
         MARK.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return plan_top_down(observation, seed)
+    return your_planner.plan(observation, seed)
 """
 
 

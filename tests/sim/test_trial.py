@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from examples.your_planner import plan
 
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.hand import FailureCause
@@ -12,7 +13,6 @@ from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.results import summarise
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.top_down import plan_top_down
 from edgegrasp_sim.trial import (
     PlannedGrasp,
     Planner,
@@ -55,7 +55,7 @@ def cubes(engine: str) -> Iterator[ClutterSimulation]:
 
 
 def test_top_down_grasps_clear_a_scene_of_cubes(cubes, paper_with) -> None:
-    done = run_round(cubes, plan_top_down, PACKED, paper_with(3), seed=0, index=0)
+    done = run_round(cubes, plan, PACKED, paper_with(3), seed=0, index=0)
     assert done.end is RoundEnd.CLEARED
     assert done.successes == len(done.objects) == 3
     for attempt in done.attempts:
@@ -101,13 +101,13 @@ def test_scenes_and_views_do_not_depend_on_the_planner(engine, run, paper_with) 
         first_clouds.append(seen.cloud)
         return PlannedGrasp(IN_THE_AIR, 1.0, 0.04)
 
-    run(plan_top_down, PILE, 2, seed=4, index=0)
+    run(plan, PILE, 2, seed=4, index=0)
     run(keep_first, PILE, 2, seed=4, index=1)
     with ClutterSimulation(engine=engine) as other:
         run_round(other, keep_first, PILE, paper_with(2), seed=4, index=1)
     assert np.array_equal(first_clouds[0], first_clouds[2])
     with pytest.raises(ValueError, match="seed is -1"):
-        run(plan_top_down, PILE, 2, seed=-1)
+        run(plan, PILE, 2, seed=-1)
 
 
 @pytest.mark.parametrize("name", ["giga", "vgn", "table"])
