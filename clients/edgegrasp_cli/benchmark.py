@@ -240,8 +240,7 @@ def attempt(
     from rich.console import Console
 
     from edgegrasp_camera.picture import draw_grasps
-    from edgegrasp_sim.replay import Replay
-    from edgegrasp_sim.report import attempt_title
+    from edgegrasp_sim.report import Replay, attempt_title
     from edgegrasp_sim.results import ResultFolder
 
     folder = ResultFolder(results)

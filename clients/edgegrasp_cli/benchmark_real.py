@@ -287,7 +287,7 @@ def draw_labels(path: Path, scene: "RealScene", labels: "Int64") -> None:
     from matplotlib import colormaps
     from matplotlib.image import imsave
 
-    from edgegrasp_sim.segmentation import renumbered
+    from edgegrasp_cli.real_scenes import renumbered
 
     truth, paints = scene.object_of_point, colormaps["tab20"](np.arange(20))[:, :3]
     found = renumbered(truth, np.maximum(labels + 1, 0))

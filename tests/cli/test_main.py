@@ -74,7 +74,7 @@ def test_unknown_command() -> None:
     ("missing", "words", "extra"),
     [
         ("edgegrasp_client", ["models", "--server", "127.0.0.1:1"], "service"),
-        ("edgegrasp_sim.replay", ["replay", "attempt", "FOLDER"], "service,sim"),
+        ("edgegrasp_sim.report", ["replay", "attempt", "FOLDER"], "service,sim"),
         ("edgegrasp_cli.serve", ["serve"], "service"),
         ("matplotlib", ["detect", "absent.ply", "--picture", "grasps.png"], "service,view"),
     ],
