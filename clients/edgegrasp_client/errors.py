@@ -1,19 +1,4 @@
-"""Exceptions of the client, the same over both transports.
-
-GraspClientError
-  + InvalidRequestError         the cloud or an option is wrong: field, value, fix
-      + UnknownModelError       the server has no weights of that name
-      + StartCollisionError     the arm touches something where the request has it
-      + PayloadTooLargeError    the request exceeds the server's limits
-  + AccessDeniedError           no token, an unknown one, or one without the right to this
-  + ServerUnavailableError      no connection, weights still loading, the server is stopping, or
-                                its worker or a proxy lost the request
-      + OverloadedError         the server is full: retry_after
-      + WorkerLostError         the worker process of the request died; tried again once
-  + DeadlineError               no answer within the timeout
-  + ServerFailedError           the server failed on a good request
-  + ProtocolError               the answer is not from a grasp service: is the address right?
-"""
+"""Exceptions of the client, the same over both transports; all are GraspClientErrors."""
 
 
 class GraspClientError(Exception):
@@ -54,19 +39,19 @@ class AccessDeniedError(GraspClientError):
 
 
 class ServerUnavailableError(GraspClientError):
-    """No connection, weights still loading, or the server is stopping; another try may help."""
+    """No connection, a server that loads or stops, or a lost request; another try may help."""
 
 
 class OverloadedError(ServerUnavailableError):
-    """The server is full."""
+    """The server is full, for `retry_after` seconds."""
 
     def __init__(self, message: str, retry_after: float = 1.0) -> None:
         super().__init__(message)
-        self.retry_after = retry_after  # seconds until another try is worth it
+        self.retry_after = retry_after
 
 
 class WorkerLostError(ServerUnavailableError):
-    """The worker process of the request died or was killed."""
+    """The worker process of the request died or was killed; the client asks once more."""
 
 
 class DeadlineError(GraspClientError):

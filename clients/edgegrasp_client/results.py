@@ -85,18 +85,9 @@ _STAGES = (
     *("approach_points", "pairs", "in_contact_region", "candidates", "in_direction"),
     *("clear_of_support", "checked", "collision_free", "given", "scored", "above_min_score"),
     *("suppressed", "on_arm", "hand_collision", "out_of_reach", "arm_collision", "no_place"),
-    *(
-        "reachable",
-        "with_trajectory",
-        "returned",
-        "description",
-        "network",
-        "ranking",
-        "arm",
-        "total",
-    ),
+    *("reachable", "with_trajectory", "returned", "description", "network", "ranking", "arm"),
+    *("total"),
 )
-
 
 Record = TypeVar("Record")
 Read = Callable[[Any, str], Any]

@@ -1,13 +1,4 @@
-"""Errors the model and the pipeline raise.
-
-EdgeGraspError
-  + InvalidRequest        the caller's input is wrong: names the field, the value and the fix
-      + StartCollision    the arm touches something where the request has it
-  + UnknownModel          no weights of that name are loaded
-  + InvalidCheckpoint     a weights file cannot be used
-  + InvalidGripper        a gripper file cannot be used
-  + InvalidDevice         the device to compute on is not there
-"""
+"""Errors that the model and the pipeline raise, all EdgeGraspErrors."""
 
 import reprlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -116,12 +107,7 @@ class InvalidGripper(EdgeGraspError):  # noqa: N818
 
 
 class InvalidDevice(EdgeGraspError):  # noqa: N818
-    """The device to compute on is not there.
-
-    Args:
-        name: What was asked for.
-        fix: What to ask for instead, as an imperative sentence.
-    """
+    """The device to compute on is not there; `fix` is an imperative sentence."""
 
     def __init__(self, name: str, fix: str) -> None:
         super().__init__(f"device: got {brief(name)}. {fix}")
