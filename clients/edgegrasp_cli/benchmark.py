@@ -213,7 +213,7 @@ def compare(
     )
 
 
-replay = typer.Typer(help="Make what a benchmark recorded again.", no_args_is_help=True)
+replay = typer.Typer(help="Repeat a recorded attempt of a benchmark.", no_args_is_help=True)
 
 
 @replay.callback()

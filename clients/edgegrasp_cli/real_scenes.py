@@ -68,7 +68,7 @@ class RealScene:
 
 @dataclass(frozen=True)
 class Segmentation:
-    """One image against its labels. Shares are 1 where there is nothing to be wrong about."""
+    """One image against its labels. Shares are 1 if there is nothing to compare."""
 
     pixel_precision: float  # of the pixels called an object, whichever
     pixel_recall: float  # of the pixels labelled as an object, whichever

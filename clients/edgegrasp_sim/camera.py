@@ -19,7 +19,7 @@ Float = TypeVar("Float", bound=np.floating)
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """The point cloud that one or several depth images show, and what planners may know besides."""
+    """The point cloud of one or several depth images, and other input of a planner."""
 
     # (N, 3) float32, world frame, metres; order of the pixels, one image after another.
     cloud: NDArray[np.float32]

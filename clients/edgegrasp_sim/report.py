@@ -84,7 +84,7 @@ class Replay:
         """Repeat a round up to and including an attempt.
 
         Returns:
-            The attempt as it comes out now, and what was seen before it.
+            The attempt when repeated, and the image before it.
 
         Raises:
             ValueError: there is no such attempt.
