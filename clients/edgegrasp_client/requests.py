@@ -87,12 +87,6 @@ class RequestFields(DetectOptions, total=False):
 class Request:
     """A cloud or depth images, options, and the arrays that come with them.
 
-    Attributes:
-        options: As of `plain_options`.
-        arrays: Those that are given, as they are sent: (N, 3) float32 or (N,) int32; edges (M, 2)
-            and hand poses (M, 4, 4) as they are.
-        scores: Whether there is something to score.
-
     Raises:
         InvalidRequestError: No cloud or more than one; or an array or option is wrong.
     """
@@ -101,8 +95,8 @@ class Request:
         self,
         cloud: Cloud | None,
         fields: Mapping[str, Any],  # as RequestFields
-        to_score: Mapping[str, Array | None]
-        | None = None,  # edges and hand_poses, one of them None
+        # edges and hand_poses, one of them None
+        to_score: Mapping[str, Array | None] | None = None,
     ) -> None:
         given, self.cloud, self.scores = dict(fields), cloud, to_score is not None
         self.depth_images: Sequence[DepthImage] | None = given.pop("depth_images", None)
@@ -114,6 +108,7 @@ class Request:
         if to_score and (to_score["edges"] is None) == (to_score["hand_poses"] is None):
             value = "nothing" if to_score["edges"] is None else "edges beside hand_poses"
             raise invalid("edges", value, "Give edges or hand_poses.")
+        # (N, 3) float32 or (N,) int32; edges (M, 2) and hand poses (M, 4, 4) as they were given.
         self.arrays = {
             name: _sent(name, array) for name, array in beside.items() if array is not None
         }
@@ -121,11 +116,6 @@ class Request:
 
 class StreamRequest:
     """One request of a stream; `cloud` and `fields` as of `GraspClient.detect`.
-
-    Attributes:
-        request: The cloud and what comes with it.
-        request_id: The id of the answer; empty: the number of the request, from 0.
-        timeout: Seconds after which the answer is no longer wanted; None: the stream's.
 
     Raises:
         InvalidRequestError: No cloud or more than one; or an array or option is wrong.
@@ -135,8 +125,8 @@ class StreamRequest:
         self,
         cloud: Cloud | None = None,
         *,
-        request_id: str = "",
-        timeout: float | None = None,
+        request_id: str = "",  # of the answer; empty: the number of the request, from 0
+        timeout: float | None = None,  # seconds until it is no longer wanted; None: the stream's
         **fields: Unpack[RequestFields],
     ) -> None:
         self.request = Request(cloud, fields)

@@ -465,13 +465,9 @@ def _with_viewpoint(
 
 
 class ModelCatalogue:
-    """Named detectors, one of them the default.
+    """Named detectors, one of them the default."""
 
-    Attributes:
-        pace: The default detector's, on this machine, once warm.
-    """
-
-    pace = Pace()
+    pace = Pace()  # the default detector's, on this machine, once warm
 
     def __init__(self, detectors: Mapping[str, GraspDetector], default: str = "") -> None:
         """Collect detectors by name, at least one; `default` as for `load`.

@@ -154,17 +154,13 @@ class JsonFormatter(logging.Formatter):
 
 
 class LogQueue(logging.handlers.QueueHandler):
-    """Passes lines to a writer thread; a failing stream does not stop the server.
-
-    Attributes:
-        dropped: Lines lost because the disk is full or the stream is closed or not read.
-    """
+    """Passes lines to a writer thread; a failing stream does not stop the server."""
 
     def __init__(self, stream: TextIO | None) -> None:
         self._lines: queue.Queue[str | None] = queue.Queue(MAX_WAITING)
         super().__init__(self._lines)
         self.setFormatter(JsonFormatter())
-        self.dropped = 0
+        self.dropped = 0  # lines lost as the disk is full, or the stream closed or not read
         self._stream = stream
         self._writer = threading.Thread(target=self._write, daemon=True)
         self._writer.start()

@@ -50,14 +50,6 @@ class Server:
 
     Raises:
         InvalidSettings: A certificate or a token cannot be used.
-
-    Attributes:
-        metrics: The values of /metrics.
-        service: The front without a transport.
-        pool: The workers.
-        http_url: e.g. "http://127.0.0.1:8000", once ports are open.
-        grpc_address: e.g. "127.0.0.1:50051", once ports are open.
-        reloader: Swaps weights, tokens and certificates.
     """
 
     def __init__(
@@ -80,7 +72,7 @@ class Server:
             check_outcomes(settings.outcomes_file)
         self.reloader = Reloader(self.service, self._tls, self.metrics.reloaded)
         self._watch()
-        self.http_url = self.grpc_address = ""
+        self.http_url = self.grpc_address = ""  # once ports are open: http://host:port, host:port
 
     def _watch(self) -> None:
         service, admission, pool = self.service, self.service.admission, self.pool

@@ -41,13 +41,7 @@ Observer = Callable[[Call], None]
 
 
 class GraspService:
-    """The front process without its transports.
-
-    Attributes:
-        tokens: Replaced on reload.
-        stopping: When set, new requests are refused.
-        in_flight: Number of calls in progress.
-    """
+    """The front process without its transports."""
 
     def __init__(
         self,
@@ -58,9 +52,9 @@ class GraspService:
     ) -> None:
         self.settings = settings
         self.pool = pool
-        self.tokens = tokens
-        self.stopping = asyncio.Event()
-        self.in_flight = 0
+        self.tokens = tokens  # replaced on reload
+        self.stopping = asyncio.Event()  # when set, new requests are refused
+        self.in_flight = 0  # number of calls in progress
         self.admission = Admission(pool.size, settings.max_queue_length, settings.max_held_bytes)
         self._observers = observers
         self._harmful = HarmfulRequests()

@@ -40,11 +40,7 @@ logger = logging.getLogger(__name__)
 
 
 class WorkerPool:
-    """Runs each job in a worker process of its own.
-
-    Attributes:
-        models: Facts of the loaded weights; empty before `start`.
-    """
+    """Runs each job in a worker process of its own."""
 
     def __init__(
         self,
@@ -55,7 +51,7 @@ class WorkerPool:
         self._settings = settings
         self._nursery_command = nursery
         self._replaced = replaced
-        self.models: list[dict[str, Any]] = []
+        self.models: list[dict[str, Any]] = []  # facts of loaded weights; empty before `start`
         self.robots: list[dict[str, Any]] = []
         self.size = settings.workers or len(os.sched_getaffinity(0))
         self._nursery: _Nursery | None = None
