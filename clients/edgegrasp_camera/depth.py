@@ -58,18 +58,11 @@ def intrinsics_of(value: Any) -> Intrinsics:
 
 
 def metres(depth: Array, scale: float | None = None, field: str = "depth") -> Float64:
-    """Depths in metres.
+    """Depths of an image (H, W) or (H, W, 1) in metres, (H, W); NaN where there is no reading.
 
-    Args:
-        depth: (H, W) or (H, W, 1), uint16 or floats; 0 or NaN where there is no reading.
-        scale: Metres for one unit; None: 0.001 of whole numbers, 1 of floats.
-        field: What the image is called in errors.
-
-    Returns:
-        (H, W), NaN where there is no reading.
-
-    Raises:
-        InvalidRequest: It is not an image of depths, or has negative depths.
+    No reading is 0 or NaN. `scale` is metres for one unit; None: 0.001 of whole numbers, 1 of
+    floats. Raises InvalidRequest, which names `field`, for what is no image of depths, and for
+    negative ones.
     """
     if depth.shape[2:] == (1,):
         depth = depth[..., 0]

@@ -312,12 +312,9 @@ def draw_detection(
 
 
 def lit(depth: Floats, fx: float, fy: float) -> Points:
-    """Brightness of a depth image lit by a lamp over the camera, from 0 to 1: (H, W).
+    """Brightness (H, W), 0 to 1, of a depth image lit by a lamp over the camera.
 
-    Args:
-        depth: (H, W) metres along the line of sight; NaN where there is nothing.
-        fx: pixels.
-        fy: pixels.
+    `depth` is (H, W) metres along the line of sight, NaN where there is nothing; fx and fy pixels.
     """
     down, right = np.gradient(np.asarray(depth, dtype=np.float64))
     x, y = right * fx / depth, down * fy / depth
@@ -330,15 +327,10 @@ def lit(depth: Floats, fx: float, fy: float) -> Points:
 def fork(
     T_cloud_hand: ArrayLike, width: float, palm_and_tip: tuple[float, float] = PANDA
 ) -> Points:
-    """A gripper's outline as four line pieces: stem, palm, both fingers.
+    """A gripper's outline as four line pieces (4, 2, 3), cloud frame: stem, palm, both fingers.
 
-    Args:
-        T_cloud_hand: (4, 4), z out of the palm, y the closing direction.
-        width: metres between the fingers' inner faces.
-        palm_and_tip: metres along z of the palm's surface and of the fingertips.
-
-    Returns:
-        (4, 2, 3) ends of each piece, metres, cloud frame.
+    `width` is metres between the fingers' inner faces; `palm_and_tip` are metres along the hand's z
+    of the palm's surface and of the fingertips.
     """
     half, (palm, tip) = width / 2, palm_and_tip
     in_hand = np.array(

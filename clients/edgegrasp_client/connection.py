@@ -79,14 +79,9 @@ class Addresses(NamedTuple):
 
 @contextmanager
 def local_server(*flags: str, program: Sequence[str] = ()) -> Iterator[Addresses]:
-    """Run `edgegrasp serve` on free ports for the duration of the context.
+    """Run `edgegrasp serve` with further flags on free ports while the context lasts.
 
-    Args:
-        flags: Further flags of `edgegrasp serve`.
-        program: The program to run; empty: the installed `edgegrasp`.
-
-    Yields:
-        Its addresses, once it is ready.
+    `program` runs it; empty: the installed `edgegrasp`. Yields its addresses, once it is ready.
 
     Raises:
         ServerUnavailableError: It is not installed or does not start; its stderr says why.

@@ -70,23 +70,14 @@ VGN = HandFrame(approach="z", closing="y", origin_z=0.062)
 def graspnet_frame(tip_z: float, depth: float = 0.02) -> HandFrame:
     """GraspNet-1Billion (graspnetAPI): x the approach, y the closing direction.
 
-    Args:
-        tip_z: Fingertips of the gripper, metres along our z (0.1122 for the Panda hand).
-        depth: The grasp's `depth` there: metres from its origin to the fingertips.
+    `tip_z` is where the gripper's fingertips are, metres along our z (0.1122 for the Panda hand),
+    and `depth` that of the grasp there: metres from its origin to the fingertips.
     """
     return HandFrame(approach="x", closing="y", origin_z=tip_z - depth)
 
 
 def to_frame(T_cloud_hand: ArrayLike, frame: HandFrame) -> Float64:
-    """Poses of another frame on the hand.
-
-    Args:
-        T_cloud_hand: (..., 4, 4) poses of our hand frame.
-        frame: The other frame.
-
-    Returns:
-        (..., 4, 4) T_cloud_frame.
-    """
+    """Poses (..., 4, 4) of another frame on the hand, in the cloud, from those of ours."""
     return np.asarray(T_cloud_hand, dtype=np.float64) @ frame.T_hand_frame
 
 
@@ -275,14 +266,7 @@ def read_isaac_grasps(text: str) -> list[IsaacGrasp]:
 
 
 def quaternion_from_matrix(rotation: ArrayLike) -> Float64:
-    """The unit quaternion of a rotation, its w not negative.
-
-    Args:
-        rotation: (3, 3) orthonormal up to rounding.
-
-    Returns:
-        (4,) x, y, z, w.
-    """
+    """The unit quaternion (4,) x, y, z, w of a rotation (3, 3), its w not negative."""
     r = np.asarray(rotation, dtype=np.float64)
     x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
     multiples = np.empty((4, 4))  # of the quaternion, by 4x, 4y, 4z and 4w
@@ -295,17 +279,7 @@ def quaternion_from_matrix(rotation: ArrayLike) -> Float64:
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Float64:
-    """The rotation of a quaternion.
-
-    Args:
-        quaternion: (4,) x, y, z, w; of any length but zero.
-
-    Returns:
-        (3, 3).
-
-    Raises:
-        ValueError: Its length is zero or not finite.
-    """
+    """The rotation (3, 3) of a quaternion x, y, z, w of any length; ValueError: of none."""
     q = np.asarray(quaternion, dtype=np.float64)
     length = np.linalg.norm(q)
     if not np.isfinite(length) or length < 1e-12:

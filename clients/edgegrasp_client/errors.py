@@ -8,11 +8,8 @@ class GraspClientError(Exception):
 class InvalidRequestError(GraspClientError):
     """The cloud or an option is wrong.
 
-    Args:
-        message: The whole sentence.
-        field: Request field at fault, e.g. "cloud" or "options.seed"; empty if unknown.
-        value: What the server received, in words.
-        fix: What to send instead, in words.
+    `field` is of the request, e.g. "options.seed", empty if unknown; `value` what the server
+    received, and `fix` what to send instead, in words.
     """
 
     def __init__(self, message: str, field: str = "", value: str = "", fix: str = "") -> None:

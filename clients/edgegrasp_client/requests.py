@@ -167,13 +167,9 @@ def option_of_text(value: Any) -> Any:
 def on_mask(mask: Array, options: Mapping[str, Any] | None = None) -> DetectOptions:
     """Options that allow approach and contact points only where a mask is not 0.
 
-    Args:
-        mask: (H, W) or (H, W, C), a value for each pixel of the depth image or row of the cloud,
-            as a segmentation network gives it; a fourth channel, transparency, is ignored.
-        options: Other options; regions in them are narrowed.
-
-    Returns:
-        The options with both regions. Points outside of the mask stay obstacles.
+    The mask is (H, W) or (H, W, C), for each pixel of the depth image or row of the cloud, as a
+    segmentation network gives it; a fourth channel, transparency, is ignored. Regions in `options`
+    are narrowed; points outside stay obstacles.
     """
     kept = mask[..., :3].any(axis=2) if mask.ndim == 3 else mask != 0
     asked = dict(options or {})
@@ -187,11 +183,9 @@ def on_mask(mask: Array, options: Mapping[str, Any] | None = None) -> DetectOpti
 def object_in_scene(
     object_points: ArrayLike, scene_points: ArrayLike
 ) -> tuple[Float32, NDArray[np.int32]]:
-    """Merge the cloud of an object with the cloud of the scene around it.
+    """Merge the cloud (N, 3) of an object with that of its scene, (M, 3), with it or without it.
 
-    Args:
-        object_points: (N, 3) metres, the object to grasp.
-        scene_points: (M, 3) metres, the same frame; with the object or without it.
+    Both are in metres and in one frame.
 
     Returns:
         `cloud` (K, 3) and `segment_ids` (K,) for `GraspClient.detect`: 1 the object, 0 the rest,
@@ -286,12 +280,8 @@ def point_cloud2_fields(cloud: PointCloud2) -> dict[str, Any]:
 def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
     """The fields of edgegrasp.v1.DepthImage; `data` as bytes, the pose as a (4, 4) list.
 
-    Args:
-        image: The image.
-        number: Which of the images it is, for errors.
-
-    Raises:
-        InvalidRequestError: A field is missing, unknown, or of a wrong type or shape.
+    Raises InvalidRequestError, with the image's number, for a field that is missing, unknown or
+    wrong.
     """
     path = f"depth_images.{number}"
     needed, known = DepthImage.__required_keys__, DepthImage.__annotations__

@@ -44,11 +44,8 @@ class GraspTracker:
     ) -> Iterator[tuple[Mapping[str, Any], Detection]]:
         """Find grasps in one image after the other, over one stream.
 
-        Of the images that come while one is at work, only the latest is sent.
-
-        Args:
-            client: Over gRPC or REST.
-            images: For each what `GraspClient.detect` gets, such as {"depth_images": [image]}.
+        `images` are what `GraspClient.detect` gets, such as {"depth_images": [image]}. Of those
+        that come while one is at work, only the latest is sent.
 
         Yields:
             An image and its answer. Raises GraspClientError, and whatever `images` raises.

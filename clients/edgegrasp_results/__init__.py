@@ -65,12 +65,10 @@ class Grasp:
         return self.retreat(distance)
 
     def retreat(self, distance: float = 0.1, direction: ArrayLike | None = None) -> Float32:
-        """The hand's pose (4, 4) after a straight retreat.
+        """The hand's pose (4, 4) after a straight retreat of so many metres.
 
-        Args:
-            distance: Metres.
-            direction: (3,) cloud frame, of any length but zero, such as the detection's `up`;
-                None: back along the approach.
+        `direction` is (3,), cloud frame, of any length but zero, such as the detection's `up`;
+        None: back along the approach.
         """
         way = -self.approach_direction if direction is None else np.asarray(direction, np.float32)
         pose: Float32 = self.T_cloud_hand.copy()

@@ -108,12 +108,7 @@ def run_benchmark(
 
 
 def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]:
-    """All that is needed to reproduce the figures.
-
-    Args:
-        config: what is run.
-        planner: how grasps are planned: its name, the weights' name and digest, options.
-    """
+    """What reproduces the figures; `planner` has name, weights, digest and options."""
     drawn = config.object_set()
     # Named where it is not the Panda's, so that earlier results can be resumed.
     hand: dict[str, Any] = {} if config.gripper is None else {"gripper": config.gripper}
@@ -171,13 +166,8 @@ def constants(engine: str) -> dict[str, float]:
 class RoundRunner:
     """A simulation with a planner, for one process.
 
-    Args:
-        config: what to run.
-        make_planner: called once.
-        digest: that the objects must have; they may be read on another machine.
-
     Raises:
-        ValueError: the objects have another digest.
+        ValueError: the objects, read on another machine maybe, have another digest.
     """
 
     def __init__(self, config: BenchmarkConfig, make_planner: PlannerFactory, digest: str) -> None:

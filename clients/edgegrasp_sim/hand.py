@@ -223,11 +223,7 @@ def panda() -> HandModel:
 
 
 def hand_of(gripper: Mapping[str, Any]) -> HandModel:
-    """The hand that a gripper file describes, of its boxes.
-
-    Args:
-        gripper: the fields of the file, which are right; see docs/frames.md.
-    """
+    """The hand of boxes that the fields of a valid gripper file describe: see docs/frames.md."""
     palm, finger = (np.array(gripper[part]["boxes"], float) for part in ("hand", "finger"))
     opening, root = float(gripper["max_opening"]), float(finger[:, 0, 2].min())
     finger[..., 2] -= root

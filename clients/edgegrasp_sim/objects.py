@@ -186,19 +186,12 @@ def blob(number: int, folder: Path, scale: float = 1.0) -> ObjectModel:
 
 
 def prepare_mesh(mesh: Path, cache: Path | None = None) -> Path:
-    """Make a simulated object of a mesh, or look it up in the cache.
+    """Make a simulated object of an `.obj` or `.stl` file, or look it up; returns its URDF file.
 
-    The mesh is scaled so that the box around it has a shortest side of `SHORTEST_SIDE`, and no
-    side over `LONGEST_SIDE`. Its own unit does not matter; its z axis points up in packed scenes.
-    The camera sees the mesh itself; contacts use its convex parts.
-
-    Args:
-        mesh: `.obj` or `.stl` file.
-        cache: folder of prepared objects, each by the digest of its file and of how it is
-            prepared; the user's cache folder by default.
-
-    Returns:
-        The object's URDF file.
+    The mesh is scaled so that the box around it has a shortest side of `SHORTEST_SIDE`, and no side
+    over `LONGEST_SIDE`. Its own unit does not matter; its z axis points up in packed scenes. The
+    camera sees the mesh itself; contacts use its convex parts. `cache`, by default in the user's,
+    keeps objects by the digest of their file and of how they are prepared.
 
     Raises:
         ValueError: the file contains no solid mesh.
@@ -219,15 +212,9 @@ def cache_folder() -> Path:
 
 
 def write_object(name: str, surface: str, folder: Path) -> Path:
-    """Write a computed object; the engine takes the convex hull of its surface.
+    """Write a computed object as `<name>.urdf`, and return that; the engine takes its convex hull.
 
-    Args:
-        name: of the object.
-        surface: OBJ file, metres.
-        folder: gets `<name>.obj` and `<name>.urdf`; created if missing.
-
-    Returns:
-        The URDF file.
+    `surface` is an OBJ file, metres; `folder` is created if missing.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.obj").write_text(surface)

@@ -31,15 +31,7 @@ def translation(x: float, y: float, z: float) -> Matrix:
 
 
 def require_pose(T: ArrayLike, field: str) -> Matrix:
-    """Check that `T` is a finite rigid transform.
-
-    Args:
-        T: (4, 4), metres.
-        field: the name that an error shall carry.
-
-    Raises:
-        ValueError: wrong shape, values that are not finite, or no rotation in the upper left.
-    """
+    """Check that `T` is a finite rigid transform (4, 4); the ValueError names `field`."""
     matrix = np.asarray(T, dtype=np.float64)
     if matrix.shape != (4, 4):
         raise ValueError(f"{field} has shape {matrix.shape}; pass one 4 x 4 transform")

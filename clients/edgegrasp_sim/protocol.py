@@ -119,10 +119,7 @@ class Protocol:
 
 
 def load_protocol(name: str) -> Protocol:
-    """Read a protocol that ships, or a file in the same format.
-
-    Args:
-        name: of a shipped protocol, or the path of a `.toml` file.
+    """Read a protocol that ships, by name, or a `.toml` file in the same format.
 
     Raises:
         FileNotFoundError: there is neither.

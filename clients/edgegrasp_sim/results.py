@@ -45,10 +45,7 @@ class ResultFolder:
         self.path = path
 
     def open(self, manifest: dict[str, Any]) -> None:
-        """Start a benchmark in this folder, or resume one that was interrupted.
-
-        Args:
-            manifest: its entry `run` must equal that of a benchmark already in the folder.
+        """Start a benchmark in this folder, or resume an interrupted one, whose `run` is equal.
 
         Raises:
             ValueError: the folder holds another benchmark.
@@ -260,10 +257,8 @@ def compare(first: ResultFolder, second: ResultFolder) -> dict[str, Any]:
 def below_gate(summary: dict[str, Any], gate: Path) -> list[str]:
     """Which rates of a result fall below a committed one, in words; empty if none does.
 
-    Args:
-        summary: of the result, as in `summary.json`.
-        gate: `summary.json` of the committed one; each rate may be as low as the lower end of
-            its interval.
+    `gate` is the committed `summary.json`; each rate may be as low as the lower end of its
+    interval.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -230,14 +230,9 @@ def _covered(layout: Layout, placed: Sequence[SceneObject]) -> float:
 def _drop(
     layout: Layout, number: int, where: tuple[Matrix, Matrix], height: float, seconds: float
 ) -> list[SceneObject]:
-    """Drop objects, turned any way, one after another.
+    """Drop objects, turned any way, one after another; each has `seconds` to come to rest.
 
-    Args:
-        layout: of the scene.
-        number: how many.
-        where: lowest and highest x and y, (2,) each, metres.
-        height: z that they are dropped from, metres.
-        seconds: given to each to come to rest.
+    `where` are the lowest and highest x and y, (2,) each, and `height` the z of the drop, metres.
     """
     rng = layout.rng
     dropped: list[SceneObject] = []

@@ -168,12 +168,10 @@ def random_sensor(rng: np.random.Generator) -> DepthSensor:
 
 
 def _shadow(depth: Float32, disparity_scale: float) -> Bools:
-    """Pixels hidden from a second viewpoint, which is beside the camera along the image's x.
+    """Pixels of a depth image (H, W), metres, hidden from a viewpoint beside the camera.
 
-    Args:
-        depth: (height, width) metres.
-        disparity_scale: its distance times the focal length, metres times pixels; negative to
-            the left.
+    `disparity_scale` is its distance along the image's x times the focal length, metres times
+    pixels.
     """
     height, width = depth.shape
     if disparity_scale == 0:

@@ -305,16 +305,12 @@ class ClutterSimulation:
     def try_grasp(
         self, T_world_hand: ArrayLike, *, shake: bool = False, to_the_end: bool = False
     ) -> GraspResult:
-        """Simulate a grasp and return to the scene as it was.
+        """Simulate a grasp and return to the scene as it was; ValueError: the pose is not rigid.
 
-        Args:
-            T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
-            shake: also shake a held object, see `GraspResult.held_after_shaking`.
-            to_the_end: simulate every step, as `execute_grasp` does. Otherwise the try ends once
-                its outcome is clear: twice as fast, with another outcome for 1 grasp in 100.
-
-        Raises:
-            ValueError: `T_world_hand` is not a rigid transform.
+        `T_world_hand` is the (4, 4) pose of the `panda_hand` link in the world, metres. With
+        `shake` a held object is also shaken, see `GraspResult.held_after_shaking`. `to_the_end`
+        simulates every step, as `execute_grasp` does; otherwise the try ends once its outcome is
+        clear: twice as fast, with another outcome for 1 grasp in 100.
         """
         result = self._run(T_world_hand, to_the_end=to_the_end, shake=shake)
         self._restore_rest()
@@ -325,11 +321,8 @@ class ClutterSimulation:
     ) -> GraspResult:
         """Grasp for real: a held object leaves the scene, and the others come to rest.
 
-        The outcome is that of `try_grasp(..., to_the_end=True)`.
-
-        Args:
-            T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
-            motion: how an arm comes there, where there is one.
+        The outcome is that of `try_grasp(..., to_the_end=True)`; an arm needs the motion that leads
+        there.
 
         Raises:
             ValueError: `T_world_hand` is not a rigid transform, or an arm has no motion.

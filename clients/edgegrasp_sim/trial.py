@@ -128,14 +128,7 @@ def run_round(
 class RoundDriver:
     """A round, step by step: `look`, `plan`, `execute`, as long as `end` is None.
 
-    Scene and views depend on `seed` and `index` alone.
-
-    Args:
-        simulation: is reset first.
-        scene: how scenes are made.
-        protocol: objects, camera, noise and what ends the round.
-        seed: not negative.
-        index: number of the round, not negative.
+    Scene and views depend on `seed` and `index` alone; neither is negative.
 
     Raises:
         ValueError: unknown scene, or a negative seed or index.

@@ -158,10 +158,8 @@ class GraspDetector:
     def detect(self, cloud: object, options: DetectOptions | None = None) -> Detection:
         """Detect grasps in a cloud.
 
-        Args:
-            cloud: (N, 3) float32 or float64 array, or (H, W, 3) with NaN holes, metres; or a
-                CloudInput. Its frame is the frame of the options and of the result.
-            options: What to ask for; the defaults if omitted.
+        The cloud is an (N, 3) float32 or float64 array, or (H, W, 3) with NaN holes, metres; or a
+        CloudInput. Its frame is the frame of the options and of the result.
 
         Returns:
             Ranked grasps. An empty list is a valid answer; its counts and warnings say why.
@@ -582,9 +580,8 @@ class ModelCatalogue:
 def choose_device(name: str = "auto") -> torch.device:
     """The device of that name, if it exists.
 
-    Args:
-        name: `cpu`; `cuda`, the first GPU; `cuda:1` the second, and so on; `auto`: the first GPU
-            where there is one, else the processor.
+    `cuda` is the first GPU, `cuda:1` the second; `auto` is the first GPU where there is one, else
+    the processor.
 
     Raises:
         InvalidDevice: It is no device's name, or there is no such device here.

@@ -14,13 +14,9 @@ from edgegrasp_camera import InvalidRequest as InvalidRequest
 def invalid_fields(
     error: ValidationError, fields: object, prefix: str, known: Iterable[str] = ()
 ) -> InvalidRequest:
-    """The first fault of a validation error, as field, value and fix.
+    """The first fault of pydantic in fields of a request under `prefix`, as field, value and fix.
 
-    Args:
-        error: Of pydantic.
-        fields: What was validated.
-        prefix: Name of the request field that holds it.
-        known: Known top-level fields, listed when an unknown one is sent.
+    `known` top-level fields are listed when an unknown one is sent.
     """
     first = error.errors(include_url=False)[0]
     named = first["type"] in ("missing", "extra_forbidden")

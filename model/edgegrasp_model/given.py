@@ -237,15 +237,9 @@ def from_hand_poses(
 
 
 def _approach_points(view: HandView, contact: Int64, crop_radius: float) -> Int64:
-    """For each hand, the point nearest to its axis, near its contact but not at it; -1: none.
+    """Rows (M,) of the cloud: of each hand's view the point nearest to its axis; -1: none.
 
-    Args:
-        view: The cloud from M hands.
-        contact: (M,) rows of the view.
-        crop_radius: Metres.
-
-    Returns:
-        (M,) rows of the cloud.
+    It is near the contact (M,), within `crop_radius` metres, but not at it.
     """
     result = np.full(len(contact), -1, dtype=np.int64)
     if len(view.row) == 0:

@@ -62,13 +62,9 @@ class Gripper:
         return self.tip_z + float(self.tip_advance(upright))
 
     def tip_advance(self, opening: ArrayLike) -> Floats:
-        """How far the fingertips have moved forward since the gripper was open, metres.
+        """Metres along z that the fingertips have moved since it was open, by opening (...).
 
-        Args:
-            opening: (...) metres between the fingers.
-
-        Returns:
-            (...) metres along z; 0 for fingers that close in a straight line.
+        0 for fingers that close in a straight line.
         """
         opening = np.asarray(opening)
         if self.linkage is None:
@@ -79,28 +75,17 @@ class Gripper:
         return advance
 
     def contact_z_at(self, opening: ArrayLike) -> Float32:
-        """Position of a contact along z once the fingers have closed to an opening.
+        """Metres along z of a contact once the fingers have closed to an opening (...), metres.
 
         A constant distance inside the fingertips, which move forward with a swinging finger.
-
-        Args:
-            opening: (...) metres between the fingers as they touch.
-
-        Returns:
-            (...) metres along z.
         """
         return (self.contact_z + self.tip_advance(opening)).astype(np.float32)
 
     def boxes(self, opening: ArrayLike, advance: ArrayLike | None = None) -> Float64:
-        """All boxes with the fingers `opening` metres apart: hand, then both fingers.
+        """Boxes with the fingers `opening` (...) metres apart: hand, then both fingers.
 
-        Args:
-            opening: (...) metres.
-            advance: (...) metres that the fingertips have moved forward; None: as the opening
-                implies.
-
-        Returns:
-            (..., B, 2, 3) min and max corners, hand frame.
+        Least and greatest corners (..., B, 2, 3), hand frame. `advance` is metres that the
+        fingertips have moved forward; None: as the opening implies.
         """
         opening = np.asarray(opening, dtype=np.float64)
         ahead = self.tip_advance(opening) if advance is None else np.asarray(advance)
@@ -202,12 +187,9 @@ def _first_fault(error: ValidationError) -> str:
 
 
 def choose_gripper(options: DetectOptions, default: Gripper, own: Mapping[str, Gripper]) -> Gripper:
-    """The gripper of a request, at the opening it asks for.
+    """The gripper of a request, at the opening it asks for; `default` if it names none.
 
-    Args:
-        options: gripper and collision.opening.
-        default: Used if the request names none.
-        own: The user's own, by name; they replace shipped ones of the same name.
+    The user's `own`, by name, replace shipped ones of the same name.
 
     Raises:
         InvalidRequest: No gripper has that name, or it does not open that far.

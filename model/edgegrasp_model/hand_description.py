@@ -118,14 +118,10 @@ def describe_hands(
 def points_around_fingers(
     around: Surroundings, T_cloud_hand: Float32, gripper: Gripper, view: HandView, limit: int
 ) -> tuple[Float32, Int64]:
-    """The points around the fingers of each hand; with one camera, x points to its side.
+    """The points around the fingers of hands (E, 4, 4); with one camera, x points to its side.
 
-    Args:
-        around: What they look at.
-        T_cloud_hand: (E, 4, 4).
-        gripper: Fingers open to its maximum.
-        view: `hand_views` of the same hands, within `reach_of` the gripper.
-        limit: Points kept of each hand, spread evenly over the cloud's order.
+    `view` are the `hand_views` of the same hands, within `reach_of` the open gripper. At most
+    `limit` points are kept of each, spread evenly over the cloud's order.
 
     Returns:
         (E, limit, 6) positions from between the fingertips in metres and normals, in hand frames,

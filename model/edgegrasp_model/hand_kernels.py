@@ -12,16 +12,9 @@ SLACK = 1e-5  # metres; a generous bound of float32 errors
 def points_in_hand_boxes(
     points: Float32, T_cloud_hand: Float32, low: Float32, high: Float32
 ) -> tuple[Int64, Int64, Float32]:
-    """Points between two corners of hand frames.
+    """Points (N, 3) between two corners (3,) of hands' frames T_cloud_hand (E, 4, 4), metres.
 
-    Args:
-        points: (N, 3) of the cloud.
-        T_cloud_hand: (E, 4, 4).
-        low: (3,) corner, hand frame, metres.
-        high: (3,) corner.
-
-    Returns:
-        Hand (P,) ascending, row (P,) ascending within each, position (P, 3) in its frame.
+    Hand (P,) ascending, row (P,) ascending within each, position (P, 3) in its frame.
     """
     columns, turn, shift = columns_of(points), *_to_hand(T_cloud_hand)
     count = np.empty(len(turn), dtype=np.int64)
@@ -63,14 +56,9 @@ def signed_distance_to_boxes(points: Float32, T_cloud_hand: Float32, boxes: Floa
 def free_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, behind: float) -> Float32:
     """How far (E,) hands can move along their z until a box has a point right ahead, metres.
 
-    Args:
-        points: (N, 3) of the cloud.
-        T_cloud_hand: (E, 4, 4).
-        boxes: (B, 2, 3) of the hand, hand frame.
-        behind: Metres of way behind a box in which points are in its way too.
-
-    Returns:
-        Negative where a hand would have to move back; infinity where nothing is ahead.
+    Points are (N, 3), T_cloud_hand (E, 4, 4), the hand's boxes (B, 2, 3); points up to `behind`
+    metres behind a box are in its way too. Negative where a hand would have to move back; infinity
+    where nothing is ahead.
     """
     turn, shift = _to_hand(T_cloud_hand)
     way = np.full(len(turn), np.inf, dtype=np.float32)
@@ -81,18 +69,11 @@ def free_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, behind: flo
 def extents_between(
     points: Float32, rows: Int64, first: Int64, last: Int64, T_cloud_hand: Float32, pads: Float32
 ) -> Float32:
-    """Least and greatest y of the points between the pads of some hands.
+    """Least and greatest y (E, 2) of the points between the pads of hands; (inf, -inf): none.
 
-    Args:
-        points: (N, 3) of the cloud.
-        rows: (P,) of points to look at, group after group.
-        first: (E,) places in `rows` where the group of each hand begins.
-        last: (E,) and where they end.
-        T_cloud_hand: (E, 4, 4).
-        pads: (2, 2) least and greatest x and z of the pads, hand frame.
-
-    Returns:
-        (E, 2) least and greatest y of those points; (inf, -inf) if there is none.
+    Points are (N, 3), and `rows` (P,) those to look at: of hand e, T_cloud_hand (E, 4, 4), the
+    places first[e] to last[e]. `pads` (2, 2) are least and greatest x and z of the pads, hand
+    frame.
     """
     turn, shift = _to_hand(T_cloud_hand)
     extent = np.empty((len(turn), 2), dtype=np.float32)
@@ -123,19 +104,12 @@ def distance_behind(
 def non_max_suppression(
     T_cloud_tcp: Float32, order: Int64, near: float, angle: float, most: int
 ) -> tuple[Int64, Int64]:
-    """Non-maximum suppression: keep the first of each group of near duplicates.
+    """Non-maximum suppression: keep the first of each group of near duplicates, `most` at most.
 
-    A hand and the same hand turned by 180 degrees about its approach count as one.
-
-    Args:
-        T_cloud_tcp: (E, 4, 4).
-        order: (M,) rows, the best first.
-        near: Metres between two TCPs within which they are near,
-        angle: and radians between two hands within which near ones are duplicates.
-        most: How many to keep.
-
-    Returns:
-        (at most `most`,) rows kept, in order, and the rows dropped as duplicates of one of them.
+    Those are within `near` metres of each other, T_cloud_tcp (E, 4, 4), and `angle` radians; a hand
+    and the same hand turned by 180 degrees about its approach count as one. `order` (M,) are rows,
+    the best first. Returns the rows kept, in order, and the rows dropped as duplicates of one of
+    them.
     """
     turn = np.ascontiguousarray(T_cloud_tcp[:, :3, :3])
     place = np.ascontiguousarray(T_cloud_tcp[:, :3, 3])

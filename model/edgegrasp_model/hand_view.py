@@ -15,14 +15,7 @@ APPROACH_LENGTH = 0.05  # metres of straight approach that the hand description 
 
 
 def reach_of(gripper: Gripper) -> Float32:
-    """Bounds of what a gripper's boxes meet on a straight approach, and of what is near them.
-
-    Args:
-        gripper: Open to its maximum.
-
-    Returns:
-        (2, 3) lowest and highest corner, hand frame.
-    """
+    """Corners (2, 3), hand frame, of what an open gripper's boxes meet on a straight approach."""
     boxes = gripper.open_boxes
     low = boxes[:, 0].min(axis=0) - np.array([NEAR, NEAR, APPROACH_LENGTH])
     high = boxes[:, 1].max(axis=0) + np.array([NEAR, NEAR, 2 * NEAR])
@@ -51,12 +44,6 @@ class HandView:
 
 
 def hand_views(cloud: Cloud, T_cloud_hand: Float32, reach: Float32) -> HandView:
-    """Transform the cloud into each hand's frame, keeping points within reach.
-
-    Args:
-        cloud: N points.
-        T_cloud_hand: (E, 4, 4).
-        reach: (2, 3) corners of what is kept, hand frame.
-    """
+    """Transform the cloud into hands' frames (E, 4, 4), keeping what is between corners (2, 3)."""
     hand, row, position = points_in_hand_boxes(cloud.points, T_cloud_hand, *reach)
     return HandView(hand, row, position, len(T_cloud_hand))

@@ -20,27 +20,17 @@ DIAGONAL = 1e-12  # off-diagonal sum, as a share of the trace, at which Jacobi's
 
 
 def least_spread(points: Float32 | Float64, rows: NDArray[np.integer]) -> Float32:
-    """Unit direction (M, 3), of either sign, in which points spread least.
-
-    Args:
-        points: (N, 3).
-        rows: (M, K) which of them belong together.
-    """
+    """Unit direction (M, 3), either sign, in which points (N, 3) of rows (M, K) spread least."""
     direction = np.empty((len(rows), 3), dtype=np.float32)
     _least_spread(points.astype(np.float32), rows.astype(np.int64), direction)
     return direction
 
 
 def nearest_in_groups(points: Float32, bounds: Int64, k: int) -> Int64:
-    """The k nearest points of the same group, nearest first; the own row fills up small groups.
+    """Rows (P, k) of the k nearest points of the same group, the point itself first.
 
-    Args:
-        points: (P, 3), group after group.
-        bounds: (G + 1,) where each group begins, and the last ends.
-        k: How many, the point itself included.
-
-    Returns:
-        (P, k) rows of `points`.
+    Points are (P, 3), group after group, from bounds[g] to bounds[g + 1]; the own row fills up
+    small groups.
     """
     nearest = np.empty((len(points), k), dtype=np.int64)
     if len(points):
@@ -117,8 +107,7 @@ def columns_of(points: Float32) -> Float32:
 def compiled(*freedom: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Compile a function on its first call, and cache it on disk if possible.
 
-    Args:
-        freedom: What the compiler may change in float arithmetic, LLVM's fast-math flags.
+    `freedom` is what the compiler may change in float arithmetic, LLVM's fast-math flags.
     """
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": set(freedom)}
 

@@ -46,14 +46,10 @@ class UnseenSpace(NamedTuple):
 def unseen_space(
     depths: Sequence["DepthMap"], T_cloud_hand: Float32, first_met: Float32, gripper: Gripper
 ) -> UnseenSpace:
-    """Evaluate the depth maps at the hands of some candidates.
+    """Evaluate the cameras' depth maps at the hands of candidates, (E, 4, 4) in the maps' frame.
 
-    Args:
-        depths: What each camera saw; empty if the cameras are unknown, then everything counts as
-            seen.
-        T_cloud_hand: (E, 4, 4), in the maps' frame.
-        first_met: (E, 2) greatest and least y of the points between the fingers, hand frame.
-        gripper: Fingers open to its maximum.
+    Without maps, where the cameras are unknown, everything counts as seen. `first_met` is (E, 2)
+    greatest and least y of the points between the fingers of the open gripper, hand frame.
     """
     if not depths:
         nothing = np.zeros(len(T_cloud_hand), dtype=np.float32)
@@ -287,12 +283,9 @@ class DepthMap:
 
     @classmethod
     def of_cloud(cls, points: Float32, viewpoint: Float32, up: Float32) -> Self:
-        """The depth map of a camera at `viewpoint`.
+        """The depth map of a camera at `viewpoint`, of points (N, 3) in the same frame, metres.
 
-        Args:
-            points: (N, 3), at least one, metres.
-            viewpoint: (3,) in the same frame.
-            up: (3,) fixes the map's roll, so that it rotates with the scene.
+        `up` fixes the map's roll, so that it rotates with the scene.
         """
         frame = CameraFrame.toward(points.mean(axis=0, dtype=np.float64), viewpoint, up)
         cell, distance = frame.seen(points)

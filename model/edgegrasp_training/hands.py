@@ -24,12 +24,7 @@ STEEPEST = 0.75  # most of it, in radii
 def hand_of_scene(name: str, rng: np.random.Generator) -> dict[str, Any] | None:
     """The fields of the gripper of a scene; None for the Panda, whose hand has shapes of its own.
 
-    Args:
-        name: Of a gripper, a .toml file, or `random`.
-        rng: The scene's own stream.
-
-    Raises:
-        InvalidGripper: There is no such gripper.
+    `name` is of a gripper, a .toml file, or `random`; raises InvalidGripper if there is none.
     """
     if name == RANDOM:
         return random_gripper(rng)

@@ -50,16 +50,10 @@ def prepare_to_train(network: nn.Module) -> None:
 
 
 def start_from(network: nn.Module, start: nn.Module) -> int:
-    """Copy the weights of a trained network; a hand network may read more numbers.
+    """Copy a trained network's weights into one to train; a hand network may read more numbers.
 
-    Additional numbers start with weight 0, so both networks score alike.
-
-    Args:
-        network: To train; gets the weights.
-        start: Takes lengths in metres.
-
-    Returns:
-        How many numbers of the hand description `start` reads; 0 for networks of balls.
+    Additional numbers start with weight 0, so both networks score alike. Returns how many numbers
+    of the hand description `start`, which takes lengths in metres, reads; 0 for networks of balls.
 
     Raises:
         ValueError: The networks differ in more than that.

@@ -67,13 +67,7 @@ def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -
 
 
 def household_objects(folder: Path, count: int, rng: np.random.Generator) -> ObjectSet:
-    """Draw household objects and write them into a folder, each of its own size and truly hollow.
-
-    Args:
-        folder: Gets the files, from which `ObjectSet.from_folder` reads them again.
-        count: How many.
-        rng: Draws them.
-    """
+    """Draw household objects, each of its own size and truly hollow, into a folder."""
     models = []
     for number in range(count):
         family, parts = household_mesh(rng)

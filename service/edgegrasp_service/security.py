@@ -35,9 +35,7 @@ class Token:
 class Tokens:
     """Checks the tokens of requests.
 
-    Args:
-        known: The tokens. Without ordinary tokens none is required; without admin tokens nobody may
-            reload weights.
+    Without ordinary tokens none is required; without admin tokens nobody may reload weights.
     """
 
     def __init__(self, known: Iterable[Token] = ()) -> None:
@@ -50,15 +48,11 @@ class Tokens:
         return any(not token.is_admin for token in self._known.values())
 
     def check(self, authorization: str | None, *, admin: bool = False) -> Token | None:
-        """The valid token of a request; None if none is needed.
-
-        Args:
-            authorization: Its header of that name.
-            admin: Whether the call needs an admin token.
+        """The valid token of a request, by its header `authorization`; None if none is needed.
 
         Raises:
             Unauthenticated: The token is missing or unknown.
-            PermissionDenied: The token does not permit the call.
+            PermissionDenied: The token does not permit the call, which needs an admin's.
         """
         if not admin and not self.required:
             return None

@@ -93,10 +93,8 @@ class Server:
     ) -> None:
         """Open both ports, load the weights, serve until `stop` is set, then drain.
 
-        Args:
-            stop: Set it to stop the server.
-            opened: Called when both ports answer; requests are refused as not ready.
-            ready: Called when requests are answered.
+        `opened` is called when both ports answer, though requests are refused as not ready; `ready`
+        when they are answered.
 
         Raises:
             AddressInUse: A port cannot be bound.

@@ -303,13 +303,9 @@ def moveit_grasps(found: Found, settings: Settings, lookup: Lookup) -> Message:
 
 
 def object_results(found: Found, settings: Settings, object_id: str = "", most: int = 0) -> Message:
-    """Result of GenerateGrasps: the grasps of each object, or of the one that was asked for.
+    """Result of GenerateGrasps: `most` grasps of each object, or of the one asked for; 0: all.
 
-    Args:
-        found: The grasps.
-        settings: The node's parameters.
-        object_id: Name of the object whose cloud was sent; empty: all, by their numbers.
-        most: Grasps for each at most; 0: all.
+    `object_id` names the object whose cloud was sent; empty: all, by their numbers.
     """
     numbers = [thing.number for thing in found.detection.objects]
     groups: list[tuple[str, list[Grasp]]] = [

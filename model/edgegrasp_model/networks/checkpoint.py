@@ -35,12 +35,7 @@ NETWORKS: dict[Architecture, Callable[[NetworkConfig], nn.Module]] = {
 def save_checkpoint(path: Path, network: nn.Module, metadata: CheckpointMetadata) -> None:
     """Writes a checkpoint atomically: a reader sees the old file or the new one, never half of it.
 
-    The same weights and metadata make the same bytes.
-
-    Args:
-        path: File to write, usually `<name>.safetensors`.
-        network: Built from `metadata.network`.
-        metadata: Its description; the digest of the file is not written.
+    The same weights and metadata make the same bytes; the network is built from `metadata.network`.
     """
     tensors = {name: value.contiguous().cpu() for name, value in network.state_dict().items()}
     values = asdict(metadata) | {

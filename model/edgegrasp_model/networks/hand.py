@@ -129,9 +129,7 @@ class HandNet(nn.Module):
     def forward(self, batch: HandBatch, left_out: torch.Generator | None = None) -> Tensor:
         """Scores the edge grasps of a batch: logits (E,) of success.
 
-        Args:
-            batch: What E hands see.
-            left_out: In training, draws the inputs that dropout removes; None: no dropout.
+        In training, `left_out` draws the inputs that dropout removes; None: no dropout.
         """
         known = batch.description[:, : self.config.description_size]
         description = (known - self.mean) / self.std  # (E, F)

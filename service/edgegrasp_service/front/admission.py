@@ -63,12 +63,10 @@ class Admission:
 
     @asynccontextmanager
     async def admit(self, client: str, deadline: float, size: int) -> AsyncIterator[Ticket]:
-        """Hold a place in the server.
+        """Hold a place in the server for a client: its token's name, or else its address.
 
-        Args:
-            client: The name of the token, or else the address.
-            deadline: On the event loop's clock; the body of the context is cancelled then.
-            size: Largest size of the body in bytes. Waits until there is room for it.
+        The body of the context is cancelled at the deadline, on the event loop's clock. Waits until
+        there is room for `size`, the most bytes of the body.
 
         Raises:
             Overloaded: There is no place, or its turn would come after its deadline.

@@ -98,11 +98,7 @@ class GraspService:
 
     @asynccontextmanager
     async def admit(self, call: Call, size: int) -> AsyncIterator[Ticket]:
-        """Hold a slot for a request until its answer is sent or its deadline passes.
-
-        Args:
-            call: The request.
-            size: Largest size of the body in bytes, reserved for it.
+        """Hold a slot and `size` bytes until the answer is sent or the deadline passes.
 
         Raises:
             NotReady: Weights are not loaded yet, or the server is stopping.

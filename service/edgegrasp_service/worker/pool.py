@@ -315,11 +315,7 @@ class _Worker:
             return None
 
     async def run(self, job: Job, deadline: float) -> Answer:
-        """Run a job. On cancellation the process is killed unless it finishes soon.
-
-        Args:
-            job: What to do.
-            deadline: On the event loop's clock; the process stops working after it.
+        """Run a job until a deadline of the event loop's clock; if cancelled, soon kill it.
 
         Raises:
             HarmfulRequest: The job killed the process.
