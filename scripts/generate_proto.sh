@@ -14,5 +14,4 @@ mkdir -p "$out/proto"
     --mypy_grpc_out="quiet:$out/proto" "$root"/proto/edgegrasp/v1/*.proto \
     "$root"/proto/edgegrasp/oip/*.proto
 "$python" "$root/scripts/contract.py" "$out/proto"
-"$python" "$root/scripts/openapi.py" "$out/proto"
-"$python" "$root/scripts/client_options.py" "$out/clients"
+"$python" "$root/scripts/from_options.py" "$out"
