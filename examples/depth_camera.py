@@ -1,9 +1,7 @@
-"""A depth camera's images, and the grasps in them.
+"""Images of a simulated depth camera: depth.png (16 bits, millimetres) and color.png of a table.
 
 usage: python examples/depth_camera.py FOLDER [--sensor stereo] [--seed 0]
-
-Renders a table as a depth camera of some kind sees it, writes depth.png (16 bits, millimetres) and
-color.png, and asks for grasps in them, as for images of a real camera.
+       edgegrasp detect --depth FOLDER/depth.png --intrinsics 540,540,320,239 --picture grasps.png
 """
 
 import argparse
@@ -12,13 +10,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from edgegrasp_client import DepthImage, GraspClient
-from edgegrasp_client.connection import local_server
 from edgegrasp_sim.camera import CAMERA, look_at
 from edgegrasp_sim.sensor import SENSORS
 from edgegrasp_sim.simulation import ClutterSimulation
-
-INTRINSICS = (540.0, 540.0, 320.0, 239.0)  # fx, fy, cx, cy of the rendered images, pixels
 
 
 def write_images(folder: Path, sensor: str, seed: int) -> None:
@@ -37,18 +31,13 @@ def write_images(folder: Path, sensor: str, seed: int) -> None:
 
 
 def main() -> None:
-    """Write the images and print the best grasps."""
+    """Write the images that the arguments ask for."""
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--sensor", choices=list(SENSORS), default="structured-light")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     write_images(arguments.folder, arguments.sensor, arguments.seed)
-    with local_server() as addresses, GraspClient(addresses.http_url) as client:
-        image: DepthImage = {"depth": arguments.folder / "depth.png", "intrinsics": INTRINSICS}
-        detection = client.detect(depth_images=[image], top_k=5)
-    for grasp in detection.grasps:
-        print(f"score {grasp.score:.3f}  object {grasp.object}  TCP {grasp.T_cloud_tcp[:3, 3]}")
 
 
 if __name__ == "__main__":

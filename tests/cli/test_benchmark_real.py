@@ -190,7 +190,9 @@ def test_what_is_no_scene_is_refused(refused, scene: Path, tmp_path: Path) -> No
 
 
 def test_the_scenes_of_real_cameras_can_be_read(shared_dir: Path) -> None:
-    for file in sorted(shared_dir.glob("real_*/*.npz")):
+    files = sorted(shared_dir.glob("real_*/*.npz"))
+    assert files
+    for file in files:
         scene = load_scene(file)
         assert scene.objects
         if scene.normal is None:  # hidden by the heap

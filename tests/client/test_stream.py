@@ -16,7 +16,8 @@ from edgegrasp_client import (
 
 def test_answers_are_those_of_single_requests(client, cloud) -> None:
     requests = [StreamRequest(cloud, seed=seed, top_k=3) for seed in range(6)]
-    answers = client.detect_stream(requests)
+    answers = list(client.detect_stream(requests))
+    assert len(answers) == 6
     for seed, answer in enumerate(answers):
         assert answer.request_id == str(seed)
         alone = client.detect(cloud, seed=seed, top_k=3)

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -69,11 +70,11 @@ def test_your_gripper(real_server) -> None:
 
 
 def test_depth_camera(tmp_path: Path) -> None:
-    shown = example("depth_camera.py", tmp_path)
-    assert shown.count("score 0.") == 5
+    example("depth_camera.py", tmp_path)
     with Image.open(tmp_path / "depth.png") as depth, Image.open(tmp_path / "color.png") as color:
         assert depth.mode == "I;16"
         assert depth.size == color.size == (640, 480)
+        assert (np.asarray(depth) > 0).mean() > 0.5
 
 
 def test_follow_an_object(real_server) -> None:
@@ -121,7 +122,10 @@ def test_training_on_your_objects(tmp_path: Path) -> None:
     programs = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     words = (tmp_path / "objects", tmp_path / "out", 2, 1)
     environment = os.environ | {"PATH": programs}
-    done = run("bash", EXAMPLES / "train_on_your_objects.sh", *words, env=environment)
+    # On one processor no command starts further processes, which take longer than two scenes.
+    alone = partial(os.sched_setaffinity, 0, {min(os.sched_getaffinity(0))})
+    script = EXAMPLES / "train_on_your_objects.sh"
+    done = run("bash", script, *words, env=environment, preexec_fn=alone)
     assert (tmp_path / "out" / "run" / "edgegrasp-plus.safetensors").is_file()
     assert "GSR" in done.stdout
 
