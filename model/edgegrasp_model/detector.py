@@ -15,7 +15,7 @@ from torch import nn
 
 from edgegrasp_camera.arrays import Array, Float32, Float64, Floats, Int64
 from edgegrasp_model.candidates.collision import CollisionCheck, clearances, collides
-from edgegrasp_model.candidates.sample import Sample, Sampler
+from edgegrasp_model.candidates.sample import NOTHING, Sample, Sampler
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import (
     Scorer,
@@ -33,6 +33,7 @@ from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch, hand_batch
 from edgegrasp_model.options import Collision, DetectOptions
 from edgegrasp_model.ranking import (
+    GOOD_SCORE,
     SURE_SCORE,
     debug_info,
     detected_objects,
@@ -70,6 +71,8 @@ NO_APPROACH_POINT = (
     "list at least half of its points; to select around a single point, send a sphere."
 )
 NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
+# Rating from which an object gets no approach points in each round.
+ROUNDS = (1.0, SURE_SCORE, GOOD_SCORE, GOOD_SCORE)
 MANY_HANDS = 30  # number of training grippers from which weights suit any gripper
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 PREFERRED = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
@@ -183,27 +186,21 @@ class GraspDetector:
     def evaluate(self, prepared: Prepared) -> Scored | None:
         """Second stage: sample candidates and score them; None if there is no scene.
 
-        Starts with half of the approach points, then puts the other half on objects without a sure
-        grasp, with tilted hands too, then adds further ones if few hands are collision-free.
+        In rounds: around half of the approach points; around the other half, on objects without a
+        sure grasp; and around further ones on objects without a good grasp, with tilted hands too.
         """
-        scene = prepared.scene
+        scene, scored = prepared.scene, None
         if scene is None or not scene.approach_allowed.any() or prepared.options.follows_only:
             return None
         sampler = self.sampler(prepared)
-        with prepared.timed("candidates"):
-            first = sampler.first()
-        scored = self._score(prepared, first)
-        with prepared.timed("candidates"):
-            second = sampler.second(self._sure_objects(prepared, scored))
-        if second is not None:
-            scored = scored.and_further(self._score(prepared, second))
-        further = sampler.further()
-        while True:
+        for enough in ROUNDS:
             with prepared.timed("candidates"):
-                more = next(further, None)
-            if more is None:
-                return scored
-            scored = scored.and_further(self._score(prepared, more))
+                done = self._objects_with(prepared, scored, enough)
+                sample = sampler.sample(done, leaning=enough == GOOD_SCORE)
+            if sample is not None:
+                found = self._score(prepared, sample)
+                scored = found if scored is None else scored.and_further(found)
+        return scored
 
     def sampler(self, prepared: Prepared) -> Sampler:
         """The sampler of a request that has a scene."""
@@ -418,13 +415,14 @@ class GraspDetector:
         with prepared.timed("network"):
             return Scored(sample, self.run(batch))
 
-    def _sure_objects(self, prepared: Prepared, scored: Scored) -> Int64:
-        """The numbers of the objects that have a sure grasp."""
-        assert prepared.scene is not None
-        sure = self._rating(scored.logits) >= SURE_SCORE
+    def _objects_with(self, prepared: Prepared, scored: Scored | None, least: float) -> Int64:
+        """The numbers of the objects that have a grasp of this rating."""
+        if scored is None or prepared.scene is None:
+            return NOTHING
+        held = self._rating(scored.logits) >= least
         if prepared.options.collision.mode != "ignore":
-            sure &= scored.sample.collision_free
-        approach_index = scored.sample.candidates.approach_index[sure]
+            held &= scored.sample.collision_free
+        approach_index = scored.sample.candidates.approach_index[held]
         return np.asarray(prepared.scene.object_of_point[approach_index])
 
     def _batch(self, scene: Scene, sample: Sample, view: HandView, gripper: Gripper) -> Batch:

@@ -6,6 +6,7 @@ seen, how the hand is oriented to gravity and support, how much of the space aro
 did not see, the hand's own measures, and the visible extent of the object around it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -46,6 +47,7 @@ class Surroundings:
     # wider than it seems. None: nowhere.
     at_side: Bools | None = None
     object_of_point: Int64 | None = None  # (N,) None: all points are of one
+    depths: Sequence[DepthMap] | None = None  # what each camera saw; None: computed when needed
 
     @property
     def viewpoint(self) -> Float32 | None:
@@ -92,7 +94,9 @@ def describe_hands(
     mirrored = hands[:, :3, :3].copy()
     mirrored[:, :, 0] *= side[:, None]
     seen = _look(view, cloud.normals, mirrored, side, around.at_side, ends)
-    depths = DepthMap.of_each(cloud.points, around.viewpoints, up)
+    depths = around.depths
+    if depths is None:
+        depths = DepthMap.of_each(cloud.points, around.viewpoints, up)
     unseen = unseen_space(depths, hands, seen.first_met, ends)
     columns = [
         *seen.hits.T,

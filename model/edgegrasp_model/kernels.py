@@ -4,7 +4,7 @@ NumPy would need many passes over large arrays; these loops take one point at a 
 processor's cache.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numba
@@ -63,40 +63,40 @@ def extents_across(
 
 def level_spread(
     points: Float32, rows: Int64, toward: Float32, radius: float, drop: float
-) -> tuple[Float32, Float32, Float32]:
-    """How the neighbourhood of each point is distributed, seen from some direction.
+) -> Iterator[tuple[Float32, Float32, Float32]]:
+    """How the neighbourhood of each point is distributed, seen from some directions.
 
     Args:
         points: (N, 3) of the cloud.
         rows: (M,) of the points to look at.
-        toward: (M, 3) unit, toward the viewpoint.
+        toward: (T, M, 3) unit, toward each viewpoint.
         radius: Metres around each point in which others count,
         drop: and how much lower they may lie, metres.
 
-    Returns:
-        The direction orthogonal to `toward` in which they spread least, (M, 3) unit; how far (M,)
-        the point lies from their mean along it, not negative; their standard deviation (M,) along
-        it. Metres.
+    Yields:
+        For each viewpoint the direction orthogonal to `toward` in which they spread least, (M, 3)
+        unit; how far (M,) the point lies from their mean along it, not negative; their standard
+        deviation (M,) along it. Metres.
     """
     cells = np.floor((points - points.min(axis=0)) / np.float32(radius)).astype(np.int64) + 1
     sizes = cells.max(axis=0) + 2
     key = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
     order = np.argsort(key, kind="stable")
-    least = np.empty((len(rows), 3), dtype=np.float32)
-    offset, deviation = np.empty((2, len(rows)), dtype=np.float32)
+    least = np.empty(toward.shape, dtype=np.float32)
+    offset, deviation = np.empty((2, *toward.shape[:2]), dtype=np.float32)
     _level_spread(
         columns_of(points[order]),
         key[order],
         points[rows],
         key[rows],
         sizes,
-        np.ascontiguousarray(toward),
+        toward,
         np.array([radius, drop], dtype=np.float32),
         least,
         offset,
         deviation,
     )
-    return least, offset, deviation
+    yield from zip(least, offset, deviation, strict=True)
 
 
 def columns_of(points: Float32) -> Float32:
@@ -304,20 +304,21 @@ def _level_spread(
                     around[1, found] = columns[1, j]
                     around[2, found] = columns[2, j]
                     found += 1
-        _set_level_axes(toward[m], axes)
         near = around[0, :found], around[1, :found], around[2, :found]
-        count, a, b, aa, ab, bb = _moments(near, middle[m], axes, reach)
-        a, b = a / count, b / count
-        aa, ab, bb = aa / count - a * a, ab / count - a * b, bb / count - b * b
-        turn = 0.5 * np.arctan2(-2.0 * ab, bb - aa)
-        s, t = np.cos(turn), np.sin(turn)  # the direction of least variance
-        outward = -(a * s + b * t)
-        if outward < 0.0:
-            s, t, outward = -s, -t, -outward
-        for d in range(3):
-            least[m, d] = s * axes[1, d] + t * axes[2, d]
-        offset[m] = outward
-        deviation[m] = np.sqrt(max(0.0, s * s * aa + 2.0 * s * t * ab + t * t * bb))
+        for way in range(len(toward)):
+            _set_level_axes(toward[way, m], axes)
+            count, a, b, aa, ab, bb = _moments(near, middle[m], axes, reach)
+            a, b = a / count, b / count
+            aa, ab, bb = aa / count - a * a, ab / count - a * b, bb / count - b * b
+            turn = 0.5 * np.arctan2(-2.0 * ab, bb - aa)
+            s, t = np.cos(turn), np.sin(turn)  # the direction of least variance
+            outward = -(a * s + b * t)
+            if outward < 0.0:
+                s, t, outward = -s, -t, -outward
+            for d in range(3):
+                least[way, m, d] = s * axes[1, d] + t * axes[2, d]
+            offset[way, m] = outward
+            deviation[way, m] = np.sqrt(max(0.0, s * s * aa + 2.0 * s * t * ab + t * t * bb))
 
 
 @compiled("contract")

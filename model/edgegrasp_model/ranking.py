@@ -22,7 +22,7 @@ from edgegrasp_model.results import Outcome, Ungraspable
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.support import Support
-from edgegrasp_model.unseen import DepthMap, unseen_space
+from edgegrasp_model.unseen import unseen_space
 from edgegrasp_results import DebugInfo, DetectedObject, FoundSupport, Grasp
 
 COLLIDING = 0.5  # factor on the score of a colliding grasp in the ranking
@@ -166,8 +166,7 @@ def openings(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> tuple[Flo
 
 def _far_side_hidden(scene: Scene, T_cloud_hand: Float32, met: Float32, gripper: Gripper) -> Bools:
     """Hands (E,) beyond whose fingers the object may go on unseen; `met`: what they touch first."""
-    depths = DepthMap.of_each(scene.cloud.points, scene.viewpoints, UP)
-    beyond = unseen_space(depths, T_cloud_hand, met, seen_part(gripper)).beyond
+    beyond = unseen_space(scene.depths, T_cloud_hand, met, seen_part(gripper)).beyond
     return np.asarray(np.maximum(*beyond) > HIDDEN)
 
 

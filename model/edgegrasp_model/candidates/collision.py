@@ -19,7 +19,7 @@ from edgegrasp_model.scene.cloud import UP, Cloud
 from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.segment import FIXED
-from edgegrasp_model.unseen import DepthMap, enters_unseen
+from edgegrasp_model.unseen import enters_unseen
 
 FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
 MIN_FIXED = 8  # voxels of background between the fingers that keep them from closing
@@ -46,8 +46,7 @@ def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Col
     hit = hits(scene, T_cloud_hand, gripper, request)
     free = np.flatnonzero(~hit)
     hit[free] = closes_on_background(scene, T_cloud_hand[free], gripper)
-    depths = DepthMap.of_each(scene.cloud.points, scene.viewpoints, UP)
-    hit[free] |= enters_unseen(depths, T_cloud_hand[free], gripper)
+    hit[free] |= enters_unseen(scene.depths, T_cloud_hand[free], gripper)
     return hit
 
 

@@ -23,12 +23,12 @@ from edgegrasp_model.hand_kernels import free_way
 from edgegrasp_model.hand_view import APPROACH_LENGTH
 from edgegrasp_model.kernels import extents_across, level_spread
 from edgegrasp_model.options import SupportPlane
-from edgegrasp_model.scene.cloud import UP
+from edgegrasp_model.scene.cloud import UP, unit
 
 OUTLINE_RADIUS = 0.016  # metres of surface from which the outline's direction is estimated
 MIN_OUTWARD = 0.002  # metres from a neighbourhood's mean to a point on the outline
 THIN = 0.003  # metres of standard deviation across a rim, all of which counts as outline
-LEAN, LEANING = np.float32(np.radians(30.0)), 4  # radians off vertical; directions around it
+LEAN, LEANING = np.radians(30.0), 4  # radians off vertical; directions around it
 DROP = 0.006  # metres below an edge from which a surface counts as another one
 GAP = 0.007  # metres without a point in which a surface ends
 ONE_VIEW = np.cos(np.radians(15.0))  # radians; directions closer than this show the same outline
@@ -57,27 +57,25 @@ def outlines(
         rows: (M,) of the points to look at.
         leaning: Also from all around, LEAN off above.
     """
-    seen = [_outline(points, np.broadcast_to(UP, points.shape), rows)]
-    for viewpoint in () if viewpoints is None else viewpoints:
-        toward = viewpoint - points
-        toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
-        seen.append(_outline(points, toward, rows[toward[rows] @ UP < ONE_VIEW]))
+    toward = [np.broadcast_to(UP, points.shape)]
+    toward += [unit(eye - points) for eye in ([] if viewpoints is None else viewpoints)]
     if leaning:
-        turns = np.linspace(0.0, 2 * np.pi, LEANING, endpoint=False, dtype=np.float32)
-        for turn in turns:
-            level = np.array([np.cos(turn), np.sin(turn), 0.0], dtype=np.float32)
-            toward = np.cos(LEAN) * UP + np.sin(LEAN) * level
-            seen.append(_outline(points, np.broadcast_to(toward, points.shape), rows))
-    return seen
-
-
-def _outline(points: Float32, toward: Float32, rows: Int64) -> Outline:
-    """A point is on the outline if its neighbours at its height or above all lie on one side."""
-    heading, is_edge = np.zeros_like(points), np.zeros(len(points), dtype=bool)
-    least, outward, spread = level_spread(points, rows, toward[rows], OUTLINE_RADIUS, DROP)
-    heading[rows] = least
-    is_edge[rows] = (outward > MIN_OUTWARD) | (spread < THIN)
-    return Outline(toward, heading, is_edge)
+        for turn in np.linspace(0.0, 2 * np.pi, LEANING, endpoint=False):
+            way = np.array([np.sin(LEAN) * np.cos(turn), np.sin(LEAN) * np.sin(turn), np.cos(LEAN)])
+            toward.append(np.broadcast_to(way.astype(np.float32), points.shape))
+    ways = np.stack([each[rows] for each in toward])
+    found: list[Outline] = []
+    for each, way, (least, outward, spread) in zip(
+        toward, ways, level_spread(points, rows, ways, OUTLINE_RADIUS, DROP), strict=True
+    ):
+        heading, is_edge = np.zeros_like(points), np.zeros(len(points), dtype=bool)
+        # A point is on the outline if its neighbours at its height or above lie on one side.
+        heading[rows] = least
+        is_edge[rows] = (outward > MIN_OUTWARD) | (spread < THIN)
+        if found:
+            is_edge[rows] &= way @ UP < ONE_VIEW
+        found.append(Outline(each, heading, is_edge))
+    return found
 
 
 def outline_grasps(

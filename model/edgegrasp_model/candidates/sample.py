@@ -1,7 +1,7 @@
 """From a scene to the candidates that the network scores."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import reduce
 
@@ -27,8 +27,6 @@ from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 
-FURTHER_ATTEMPTS = 3  # of further approach points, if few hands are collision-free
-FEW = 16  # collision-free hands of a scene
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
 APPROACH_POINTS_EACH = 8, 64  # of an object
 MIN_APPROACH_POINTS, MAX_APPROACH_POINTS = 32, 64  # of a scene, for each view
@@ -42,6 +40,7 @@ SIDE_ANGLE = math.radians(30)  # between the hand's direction and the horizontal
 MIN_APPROACH_UP = -0.1  # where nothing is asked for: cosine of the outward approach and up
 
 
+NOTHING = np.empty(0, dtype=np.int64)
 APPROACH_STREAM, CANDIDATE_STREAM = 0, 1  # random streams of one request
 
 
@@ -114,38 +113,32 @@ class Sampler:
         self._objects, self._wanted = share_approach_points(scene, self._rows, options)
         half = options.num_approach_points is None
         self._first = (self._wanted + 1) // 2 if half else self._wanted
-        self._used = self._rows[:0]
+        self._used, self._round = self._rows[:0], 0
 
-    def first(self) -> Sample:
-        """Candidates around half of the approach points; around all if their number is given."""
-        self._used = self._spread(self._first)
-        return self._around(self._used)
+    def sample(self, done: Int64 = NOTHING, *, leaning: bool = False) -> Sample | None:
+        """Candidates around further approach points; None if there is no point to add.
 
-    def second(self, sure: Int64 | None = None) -> Sample | None:
-        """Candidates around the other half, only on objects whose number is not in `sure` (S,)."""
+        Half of the points in the first round, all if their number is given; in the second as many
+        as are left; in each further one as many as an object gets in the first two together.
+
+        Args:
+            done: (D,) numbers of objects that need no more.
+            leaning: Whether tilted hands are tried too.
+        """
+        open_ = np.where(np.isin(self._objects, done), 0, self._wanted)
         left = (self._wanted - self._first).sum()
-        unsure = np.where(np.isin(self._objects, () if sure is None else sure), 0, self._wanted)
-        more = self._spread(unsure * left // max(unsure.sum(), 1))
-        return self._around(more, leaning=True) if len(more) else None
-
-    def further(self) -> Iterator[Sample]:
-        """Candidates around further approach points, while few hands are collision-free."""
-        usable = "checked" if self.options.collision.mode == "ignore" else "collision_free"
-        for attempt in range(FURTHER_ATTEMPTS):
-            if self.counts[usable] >= FEW or (attempt and self.counts[usable]):
-                return
-            self._used = self._rows[:0]
-            more = self._spread(self._wanted)
-            if attempt and len(self._rows) <= len(more):  # they would repeat the first ones
-                return
-            yield self._around(more, leaning=True)
+        counts = [self._first, open_ * left // max(open_.sum(), 1), open_][min(self._round, 2)]
+        more = self._spread(counts)
+        self._round += 1
+        self._used = np.concatenate([self._used, more])
+        return self._around(more, leaning=leaning) if len(more) else None
 
     def all(self) -> Sample:
-        """All rounds, whatever the scores of the first."""
-        samples = [self.first(), self.second(), *self.further()]
+        """Two rounds, whatever their scores."""
+        samples = self.sample(), self.sample(leaning=True)
         return reduce(Sample.and_further, [one for one in samples if one is not None])
 
-    def _around(self, approach_index: Int64, *, leaning: bool = False) -> Sample:
+    def _around(self, approach_index: Int64, *, leaning: bool) -> Sample:
         scene, options, gripper, counts = self.scene, self.options, self.gripper, self.counts
         crop = crop_balls(scene.cloud.points, approach_index, self.crop_radius)
         drawn, outcome = _constrained(

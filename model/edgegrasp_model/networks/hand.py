@@ -97,7 +97,7 @@ def hand_batch(
     scene: Scene, candidates: Candidates, gripper: Gripper, network: NetworkConfig, view: HandView
 ) -> HandBatch:
     """The input of the hand network for some candidates of a scene."""
-    known = scene.support, scene.viewpoints, scene.at_side, scene.object_of_point
+    known = scene.support, scene.viewpoints, scene.at_side, scene.object_of_point, scene.depths
     around = Surroundings(scene.cloud, UP, *known)
     sizes = network.hand_points, view, network.description_size
     return HandBatch.of_hands(around, candidates, gripper, *sizes)

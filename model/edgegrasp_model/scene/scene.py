@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -55,6 +56,7 @@ from edgegrasp_model.scene.support import (
     choose_support,
     correct_depth_scale,
 )
+from edgegrasp_model.unseen import DepthMap
 
 MIN_POINTS = 4  # fewer are too few for a surface
 MIN_NORMAL = 1e-3  # a voxel's mean normal shorter than this has no direction
@@ -84,6 +86,11 @@ class Scene:
     viewpoints: Float32 | None = None  # (W, 3) the cameras, if known
     confidence: dict[int, float] = field(default_factory=dict)  # probability of each, if found
     at_side: Bools | None = None  # (V,) where a side of the workspace cuts the cloud off
+
+    @cached_property
+    def depths(self) -> list[DepthMap]:
+        """What each camera saw."""
+        return DepthMap.of_each(self.cloud.points, self.viewpoints, UP)
 
 
 @dataclass(frozen=True)

@@ -181,7 +181,6 @@ def group(pixels: Pixels) -> Int64:
     number = np.where(held, UNKNOWN, FIXED)
     if not held.any():
         return number
-    centre = points + votes
     index, pairs, strength = np.arange(held.size).reshape(held.shape), [], []
     right, lower = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])  # neighbours
     for link, (first, second) in zip(links, (right, lower), strict=True):
@@ -191,22 +190,13 @@ def group(pixels: Pixels) -> Int64:
         strength.append(link[first][joined])
     order = np.argsort(-np.concatenate(strength), kind="stable")
     component = np.arange(held.size)
-    flat = np.nan_to_num(centre.reshape(-1, 3)).astype(np.float64)
-    _join(np.concatenate(pairs)[order], component, flat.copy(), SMALLEST, APART)
+    centre = np.nan_to_num(points + votes).reshape(-1, 3).astype(np.float64)
+    _join(np.concatenate(pairs)[order], component, centre, SMALLEST, APART)
     rows = np.flatnonzero(held)
     _, part, count = np.unique(component[rows], return_inverse=True, return_counts=True)
-    flat = flat[rows]
-    mean = np.stack([np.bincount(part, flat[:, d]) for d in range(3)], axis=1) / count[:, None]
     area = np.bincount(part, (points[..., 2].reshape(-1)[rows] * footprint) ** 2)
-    large = np.flatnonzero((count >= SMALLEST) & (area >= SMALLEST_AREA))
-    if len(large) == 0:
-        return number
-    # Parts of an object that are separated by something in front vote for the same centre.
-    apart = np.linalg.norm(mean[large, None] - mean[large], axis=-1)
-    _, merged = connected_components(apart < APART, directed=False)
-    of_part = np.full(len(count), UNKNOWN)
-    of_part[large] = merged
-    number.reshape(-1)[rows] = of_part[part]
+    large = (count >= SMALLEST) & (area >= SMALLEST_AREA)
+    number.reshape(-1)[rows] = np.where(large, np.cumsum(large) - 1, UNKNOWN)[part]
     return number
 
 
