@@ -45,8 +45,11 @@ def held_by(grasp: Grasp, scene: Scene, gripper: Gripper) -> Held:
         held |= scene.object_of_point == grasp.object
     if not held.any():
         return Held(points[held], points)
-    near = cKDTree(points[held]).query(points, distance_upper_bound=BESIDE)[0] <= BESIDE
-    return Held(points[held], points[~near])
+    own = points[held]
+    low, high = own.min(axis=0) - BESIDE, own.max(axis=0) + BESIDE
+    near = ((points > low) & (points < high)).all(axis=1)
+    near[near] = cKDTree(own).query(points[near], distance_upper_bound=BESIDE)[0] <= BESIDE
+    return Held(own, points[~near])
 
 
 def can_leave(held: Held, scene: Scene, way: Float64, collision: Collision) -> bool:
@@ -60,7 +63,10 @@ def can_leave(held: Held, scene: Scene, way: Float64, collision: Collision) -> b
     """
     if not len(held.points):
         return True
-    tree = cKDTree(held.others) if len(held.others) else None
+    ends = np.concatenate([held.points, held.points + way])
+    low, high = ends.min(axis=0) - MEETS, ends.max(axis=0) + MEETS
+    others = held.others[((held.others > low) & (held.others < high)).all(axis=1)]
+    tree = cKDTree(others) if len(others) else None
     lowest = _lowest(scene, held.points)
     steps = max(1, int(np.ceil(np.linalg.norm(way) / STEP)))
     for share in np.arange(1, steps + 1) / steps:

@@ -40,7 +40,7 @@ MAX_JUMP = 1.0  # most radians that a joint turns between two of them
 OFF_LINE = 0.002  # most metres between the hand and its straight line
 SHARE = 0.99  # share of the limits that is used, as splines overshoot a little
 DT = 0.01  # seconds between the rows of a trajectory
-FINE = 0.002  # radians between the joints that are checked along a trajectory
+FINE = 0.005  # radians between the joints that are checked along a trajectory
 PATH_STEP = 0.03  # radians between the joints that are checked along a path
 CLOSE, CLOSE_ANGLE = 5e-4, 1e-3  # metres and radians of the inverse kinematics
 TRAVEL_COST = 0.02  # cost, as a share of a score, per radian of the joint that turns most
@@ -231,28 +231,38 @@ class _Arm:
             ways.append(replace(grasp, T_cloud_hand=poses[0], T_cloud_tcp=poses[1]))
             if self._T_base_cloud[:3, :3] @ grasp.T_cloud_hand[:3, 0] @ self._start_x < 0.0:
                 ways.reverse()
-        failed = []
-        for way in ways:
-            pick = self._reach(way)
-            if pick.line is not None:
-                return pick
-            failed.append(replace(pick, grasp=grasp))
-        return min(failed, key=lambda pick: pick.outcome == "out_of_reach")
+        approaches, outcome = [self._approach(way) for way in ways], "out_of_reach"
+        for way, poses in zip(ways, approaches, strict=True):
+            line = self._reach(poses)
+            if line is not None:
+                pick = _Pick(way, ArmPlan(True, line[0], line[-1]), "reachable", line)
+                placed = pick if self._place is None else self._with_place(pick, self._place)
+                if placed is not None:
+                    return placed
+                outcome = "no_place"
+        if outcome == "out_of_reach" and any(map(self._near_enough, approaches)):
+            outcome = "arm_collision"
+        return _Pick(grasp, ArmPlan(False), outcome)
 
-    def _reach(self, grasp: Grasp) -> _Pick:
-        """Joints at the pregrasp and along the straight approach."""
+    def _approach(self, grasp: Grasp) -> list[Float64]:
+        """Poses T_base_hand (4, 4) along the straight approach."""
         T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand.astype(np.float64)
         length = self._options.collision.approach_length
-        poses = _straight(T_base_hand, T_base_hand[:3, 2], -length, 0.0)
+        return _straight(T_base_hand, T_base_hand[:3, 2], -length, 0.0)
+
+    def _reach(self, poses: Sequence[Float64]) -> list[Float64] | None:
+        """Joints at the pregrasp and along the straight approach."""
         for start in self._starts:
             first = self._solve(self._to_pregrasp, poses[0], start)
             line = None if first is None else self._follow(self._along, poses, first)
             if line is not None:
-                pick = _Pick(grasp, ArmPlan(True, line[0], line[-1]), "reachable", line)
-                return pick if self._place is None else self._with_place(pick, self._place)
+                return line
+        return None
+
+    def _near_enough(self, poses: Sequence[Float64]) -> bool:
+        """Whether the arm would reach both ends of an approach if nothing were in the way."""
         first = self._solve(self._ignoring, poses[0], self._start)
-        free = first is not None and self._solve(self._ignoring, poses[-1], first) is not None
-        return _Pick(grasp, ArmPlan(False), "arm_collision" if free else "out_of_reach")
+        return first is not None and self._solve(self._ignoring, poses[-1], first) is not None
 
     def motion(self, pick: _Pick) -> _Pick:
         """Add a collision-checked trajectory, if one is found."""
@@ -288,8 +298,8 @@ class _Arm:
         )
         return replace(pick, plan=replace(pick.plan, trajectory=trajectory))
 
-    def _with_place(self, pick: _Pick, place: Place) -> _Pick:
-        """Add where the object is put down and how, where there is a way."""
+    def _with_place(self, pick: _Pick, place: Place) -> _Pick | None:
+        """Add where the object is put down and how; None: there is no way."""
         assert pick.plan is not None
         assert pick.line is not None
         held = held_by(pick.grasp, self._scene, self._robot.gripper)
@@ -304,7 +314,7 @@ class _Arm:
                 end = put.down[-1]
                 plan = replace(pick.plan, place_joints=end, T_base_place=self._robot.hand_pose(end))
                 return replace(pick, plan=plan, put=put)
-        return _Pick(pick.grasp, ArmPlan(False), "no_place")
+        return None
 
     def _put_down(
         self,
@@ -348,7 +358,7 @@ class _Arm:
     def _solver(self, scene: core.Scene, restarts: int, check: bool = True) -> _Ik:
         """An inverse kinematics solver that depends on a seed and not on time."""
         options = SimpleIkOptions(
-            GROUP, max_iters=40, max_time=10.0, max_restarts=restarts, step_size=0.5,
+            GROUP, max_iters=20, max_time=10.0, max_restarts=restarts, step_size=1.0,
             max_linear_error_norm=CLOSE, max_angular_error_norm=CLOSE_ANGLE,
             check_collisions=check,
         )  # fmt: skip

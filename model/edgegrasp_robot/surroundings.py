@@ -11,7 +11,7 @@ from roboplan import core
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_camera.arrays import Bools, Float64
+from edgegrasp_camera.arrays import Bools, Float64, Floats
 from edgegrasp_model.errors import InvalidRequest, StartCollision
 from edgegrasp_model.options import Box, OrientedBox, RobotArm
 from edgegrasp_model.scene.cloud import unit
@@ -230,10 +230,12 @@ def _voxels(
         plane = np.append(scene.support.normal, -scene.support.offset)
         plane = (plane @ scene.frame.T_canonical_cloud).astype(flat.dtype)
         kept = flat @ plane[:3] > CELL / 2 - plane[3]  # NaN is not
-    seen = scene.frame.points(flat[kept])
-    base = np.linalg.inv(T_base_scene)[:3, 3]
-    seen = seen[np.einsum("ij,ij->i", seen - base, seen - base) < AROUND**2]
-    centers = _centers(seen)
+    # In cells of the scene's frame, from the arm's base.
+    T, base = scene.frame.T_canonical_cloud, np.linalg.inv(T_base_scene)[:3, 3]
+    cells = flat[kept] @ (T[:3, :3].T / CELL).astype(flat.dtype)
+    cells += ((T[:3, 3] - base) / CELL).astype(flat.dtype)
+    cells = cells[np.einsum("ij,ij->i", cells, cells) < (AROUND / CELL) ** 2]
+    centers = _centers(cells + (base / CELL).astype(flat.dtype))
     return centers[~_near_robot(robot, joints, moved(T_base_scene, centers), SEEN_SELF)]
 
 
@@ -250,13 +252,13 @@ def _hidden(scene: Scene, voxels: Float64, T_base_scene: Float64) -> Float64:
         kept = np.einsum("ij,ij->i", places - base, places - base) < AROUND**2
         if scene.support is not None:
             kept &= scene.support.heights(places) > CELL / 2
-        hidden.append(places[kept])
+        hidden.append(places[kept] / CELL)
     return _centers(*hidden)
 
 
-def _centers(*groups: Float64) -> Float64:
-    """Centers (V, 3) of the voxels in which each group of points (N, 3) has one."""
-    cells = [np.floor(points / CELL).astype(np.int64) for points in groups]
+def _centers(*groups: Floats) -> Float64:
+    """Centers (V, 3) of the voxels in which each group of places (N, 3), in cells, has one."""
+    cells = [np.floor(places).astype(np.int32) for places in groups]
     if not all(map(len, cells)):
         return np.empty((0, 3))
     corner = np.min([cell.min(axis=0) for cell in cells], axis=0)
