@@ -80,6 +80,9 @@ class DetectFlags(BaseModel):
         description='Where to put the object: {"region": {"min": …, "max": …}} or T_base_object, '
         "base frame",
     )
+    avoid_unseen: bool = Field(
+        False, description="The robot's arm avoids what no camera saw behind a surface"
+    )
     trajectory: Path | None = Field(
         None, description="JSON file to write the arm's motion to the best pick to"
     )
@@ -288,6 +291,7 @@ def _robot_option(asked: DetectFlags) -> dict[str, Any]:
     joints = [float(part) for part in str(asked.joints).split(",") if part]
     pose = value_of_text("--base", str(asked.base))
     robot = {"name": asked.robot, "joints": joints, "T_base_cloud": pose}
+    robot["avoid_unseen"] = asked.avoid_unseen
     if asked.place is not None:
         robot["place"] = value_of_text("--place", asked.place)
     return {"robot": robot}

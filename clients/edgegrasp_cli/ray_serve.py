@@ -21,7 +21,7 @@ from edgegrasp_service.errors import problem_document, report
 from edgegrasp_service.front.grpc import ERROR_METADATA, error_detail
 from edgegrasp_service.front.http import METHODS, requested_timeout
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.answer import answer, load_catalogue
+from edgegrasp_service.worker.answer import answer, load_catalogue, load_robots
 from edgegrasp_service.worker.job import Answer, Facts, Job, Method
 
 
@@ -42,6 +42,8 @@ class Grasps:
             return JSONResponse({"status": method.lower()})
         if method == "ListModels":
             return JSONResponse({"models": self._catalogue.describe()})
+        if method == "ListRobots":
+            return JSONResponse({"robots": self._robots()})
         if method not in get_args(Method) or request.method != "POST":
             return Response(status_code=404)
         content_type = request.headers.get("content-type", "")
@@ -78,6 +80,16 @@ class Grasps:
         """Answer over gRPC."""
         models = [grasp_pb2.Model(**facts) for facts in self._catalogue.describe()]
         return grasp_pb2.ListModelsResponse(models=models)
+
+    async def ListRobots(  # noqa: N802  # as the RPC
+        self, request: grasp_pb2.ListRobotsRequest
+    ) -> grasp_pb2.ListRobotsResponse:
+        """Answer over gRPC."""
+        robots = [grasp_pb2.Robot(**facts) for facts in self._robots()]
+        return grasp_pb2.ListRobotsResponse(robots=robots)
+
+    def _robots(self) -> list[dict[str, Any]]:
+        return [robot.describe() for robot in load_robots(self._settings).values()]
 
     async def _answer_call(
         self, method: Method, request: Any, context: RayServegRPCContext

@@ -176,6 +176,7 @@ def test_answers_are_those_of_one_process_though_a_replica_dies(cluster: Cluster
             assert {one.name for one in client.models()} == {
                 m["name"] for m in catalogue.describe()
             }
+            assert client.robots() == []
             with pytest.raises(UnknownModelError):
                 client.detect(points, model="none of them")
             with pytest.raises(InvalidRequestError, match="seed"):

