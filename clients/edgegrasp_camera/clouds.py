@@ -94,10 +94,8 @@ POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8:
 def read_point_cloud2(cloud: PointCloud2, max_points: int = sys.maxsize) -> CloudInput:
     """Read x, y, z of a cloud, and normals and colours if present.
 
-    Sizes are checked before anything is allocated, since the message is untrusted.
-
-    Returns:
-        Points (N, 3), or (H, W, 3) where the height is 2 or more.
+    Points are (N, 3), or (H, W, 3) where the height is 2 or more. Sizes are checked before anything
+    is allocated, since the message is untrusted.
 
     Raises:
         InvalidRequest: A field is missing, unknown or wrong, or they contradict each other.

@@ -53,11 +53,9 @@ NPZ_IMAGE = {"depth", "intrinsics"}  # of a camera whose frame is the cloud's
 
 
 def read_file(file_format: str, data: bytes, max_points: int) -> CloudInput:
-    """Read a point cloud file.
+    """Read a point cloud file: its arrays, of whatever shape and dtype, in native byte order.
 
-    Returns:
-        The arrays in the file, of whatever shape and dtype, in native byte order; points (N, 3)
-        for ply and xyz, (N, 3) or (H, W, 3) for pcd.
+    Points are (N, 3) for ply and xyz, (N, 3) or (H, W, 3) for pcd.
 
     Raises:
         InvalidRequest: The file is truncated, or not a file of that format.
@@ -110,12 +108,9 @@ def _reading(field: str, file_format: str, size: int, fix: str) -> Iterator[None
 
 
 def read_npy(data: bytes, max_points: int, field: str = "cloud") -> Array:
-    """Read an .npy file.
+    """Read the array of an .npy file, of whatever shape and dtype, in native byte order.
 
     A row, or a pixel, counts as one point; `field` is what the file is in the request.
-
-    Returns:
-        The array in it, of whatever shape and dtype, in native byte order.
 
     Raises:
         InvalidRequest: The file is truncated, or not a .npy file of numbers.
@@ -194,10 +189,7 @@ def _unzipped(archive: zipfile.ZipFile, info: zipfile.ZipInfo, max_points: int) 
 
 
 def read_png(data: bytes, max_points: int, field: str) -> Array:
-    """Read an image.
-
-    Returns:
-        (H, W) bool, uint8 or uint16, or (H, W, C) uint8 of C channels.
+    """Read an image: (H, W) bool, uint8 or uint16, or (H, W, C) uint8 of C channels.
 
     Raises:
         InvalidRequest: The file is truncated, or not a PNG.

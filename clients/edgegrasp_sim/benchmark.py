@@ -82,10 +82,7 @@ def run_benchmark(
     # Called with every round as it finishes, in any order.
     on_round: Callable[[Round], None] | None = None,
 ) -> list[Round]:
-    """Run all rounds that `folder` does not hold yet; outcomes do not depend on where.
-
-    Returns:
-        All rounds of `config`, by seed and index.
+    """Run all rounds that `folder` does not hold yet, and return all, by seed and index.
 
     Raises:
         ValueError: `workers` below 1, or the planner's pose is not a rigid transform.

@@ -86,16 +86,10 @@ EVALUATION_VIEWS = ViewRange((0.6, 0.75), (np.pi / 4, np.pi / 3), (0.0, np.pi))
 
 
 def look_at(eye: Matrix, target: Matrix) -> Matrix:
-    """Pose of a camera at `eye` that looks at `target` with world z up in the image.
+    """Pose T_world_camera (4, 4) at `eye` that looks at `target` with world z up in the image.
 
     Camera axes: x to the right of the image, y down, z along the line of sight. Where that is
-    vertical, the image's x is the world's.
-
-    Returns:
-        `T_world_camera`, (4, 4).
-
-    Raises:
-        ValueError: eye and target coincide.
+    vertical, the image's x is the world's. Raises ValueError where eye and target coincide.
     """
     sight = np.asarray(target, dtype=np.float64) - eye
     if np.linalg.norm(sight) < 1e-9:

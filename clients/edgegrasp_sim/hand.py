@@ -282,11 +282,7 @@ def _retreat(
     *,
     to_the_end: bool,
 ) -> SceneObject | None:
-    """Retreat; unless `to_the_end`, only until it is clear what the hand holds.
-
-    Returns:
-        The object in contact with the hand, None if there is none.
-    """
+    """Retreat; unless `to_the_end`, only until it is clear what the hand holds: that, or None."""
     watch = _Watch(gripper, objects)
     for _ in gripper.retreat(T_world_hand):
         if not to_the_end and watch.is_clear():

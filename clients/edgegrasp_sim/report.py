@@ -81,13 +81,9 @@ class Replay:
         return done
 
     def repeat(self, seed: int, index: int, attempt: int) -> tuple[Attempt, Observation]:
-        """Repeat a round up to and including an attempt.
+        """Repeat a round up to and including an attempt; ValueError: there is no such attempt.
 
-        Returns:
-            The attempt when repeated, and the image before it.
-
-        Raises:
-            ValueError: there is no such attempt.
+        Returns the attempt when repeated, and the image before it.
         """
         done = self.find(seed, index, attempt)
         driver = RoundDriver(self.simulation, self.scene, self.protocol, seed=seed, index=index)

@@ -300,12 +300,9 @@ def paired_difference(
 ) -> tuple[float, tuple[float, float]] | None:
     """How a ratio of sums differs between two runs over the same scenes, by the bootstrap.
 
-    Scenes are resampled, so that differences between scenes cancel out.
-
-    Counts are (2, S): of each run in each scene.
-
-    Returns:
-        Second run's ratio minus the first's, and its 95 % interval; None if a run has no counts.
+    Scenes are resampled, so that differences between scenes cancel out. Counts are (2, S): of each
+    run in each scene. Returns the second run's ratio minus the first's, and its 95 % interval; None
+    if a run has no counts.
     """
     above, below = np.asarray(numerators, float), np.asarray(denominators, float)
     if (below.sum(axis=1) == 0).any():

@@ -185,10 +185,7 @@ class ClutterSimulation:
         scales: tuple[float, float] | None = None,
         table_thickness: float = OPEN_THICKNESS,  # of packed and pile scenes, metres
     ) -> int:
-        """Make a new scene at rest.
-
-        Returns:
-            How many objects are there.
+        """Make a new scene at rest; returns how many objects are there.
 
         Raises:
             ValueError: unknown scene, no object set for it, or `num_objects` below 1.

@@ -80,13 +80,10 @@ def describe_hands(
     # none.
     size: int = HAND_DESCRIPTION_SIZE,
 ) -> Float32:
-    """The hand-frame description of each candidate.
+    """The hand-frame description of candidates, (E, HAND_DESCRIPTION_SIZE) or less the extents.
 
-    With several cameras, only the space that none of them saw is described.
-
-    Returns:
-        (E, HAND_DESCRIPTION_SIZE), or without the extents: counts (logarithm of 1 + n), metres
-        and cosines.
+    Counts (logarithm of 1 + n), metres and cosines. With several cameras, only the space that none
+    of them saw is described.
     """
     cloud, up, hands = around.cloud, around.up, candidates.T_cloud_hand
     view = view or hand_views(cloud, hands, reach_of(gripper))

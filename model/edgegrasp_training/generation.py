@@ -122,8 +122,7 @@ def generate(
 ) -> Iterator[tuple[int, int, int]]:
     """Generate the scenes that are missing, in any order; workers do not change the result.
 
-    Yields:
-        For each finished scene its index, the grasps tried in it and those that held.
+    Yields the index of each finished scene, the grasps tried in it and those that held.
 
     Raises:
         ValueError: The folder holds views of another engine.

@@ -42,12 +42,10 @@ Rings = Float64  # (R, S, 3) corners of each ring along a part, any unit
 
 
 def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -> ObjectSet:
-    """Draw objects of a set and computed ones, each stretched at random.
+    """Draw up to `NUM_VARIED` objects of a set and computed ones, each stretched at random.
 
-    The folder gets descriptions and computed objects; other meshes stay where they are.
-
-    Returns:
-        Up to `NUM_VARIED` objects, each under the name it had.
+    Each keeps its name. The folder gets descriptions and computed objects; other meshes stay where
+    they are.
     """
     drawn: dict[str, ObjectModel] = {}
     for _ in range(NUM_VARIED):

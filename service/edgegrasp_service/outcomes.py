@@ -44,9 +44,8 @@ def append_outcome(tried: TriedGrasp, catalogue: Any, path: Path) -> None:
 def append_line(path: Path, line: bytes) -> None:
     """Append a whole line or nothing; an incomplete last line is removed first.
 
-    Raises:
-        PayloadTooLarge: The file is full.
-        DiskFull: The disk is, or the file cannot be written.
+    Raises PayloadTooLarge where the file is full, DiskFull where the disk is, or it cannot be
+    written.
     """
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)

@@ -21,15 +21,10 @@ def nearest_in_ball(
     crop: BallCrop,
     k: int = 16,
 ) -> Int64:
-    """Joins the points of balls to their k nearest in the same ball.
+    """Rows (P, k) of `crop.ball_rows`: the k nearest in the same ball, the point itself first.
 
-    The point itself is one of its k neighbours; where a ball holds fewer than k points, the own
-    row fills the rest, which changes no maximum over neighbours.
-
-    Returns:
-        (P, k) rows of `crop.ball_rows`, nearest (the point itself) first.
-
-    Source: paper section IV (its PointNet++ graph of 16 nearest).
+    Where a ball holds fewer than k points, the own row fills the rest, which changes no maximum
+    over neighbours. Source: paper section IV (its PointNet++ graph of 16 nearest).
     """
     centre = points[np.asarray(approach_index, dtype=np.int64)[crop.ball_of_point]]
     centred = points[crop.ball_rows] - centre
