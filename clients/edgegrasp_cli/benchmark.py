@@ -1,4 +1,4 @@
-"""`edgegrasp benchmark`, and `compare` and `replay` for what it wrote."""
+"""`edgegrasp benchmark`, and `edgegrasp compare` for what it wrote."""
 
 import json
 import sys
@@ -211,53 +211,6 @@ def compare(
         f"{worse}, as many in {figures['scenes'] - better - worse}.",
         soft_wrap=True,
     )
-
-
-replay = typer.Typer(help="Repeat a recorded attempt of a benchmark.", no_args_is_help=True)
-
-
-@replay.callback()
-def _replay() -> None:
-    """A group of one command."""
-
-
-@replay.command()
-def attempt(
-    results: Annotated[Path, typer.Argument(help="Folder that `benchmark --output` wrote.")],
-    round: Annotated[int, Option(help="Number of the round, from 0.")] = 0,  # noqa: A002
-    number: Annotated[int, Option("--attempt", help="Number of the attempt in it, from 0.")] = 0,
-    seed: Annotated[
-        int | None, Option(help="Seed of the round; else the benchmark's first.")
-    ] = None,
-    objects: Annotated[
-        Path | None, Option(help="Object folder, if it is elsewhere by now.")
-    ] = None,
-    picture: Annotated[
-        Path | None, Option(help="PNG to write: the cloud seen, and the gripper.")
-    ] = None,
-) -> None:
-    """Repeat one recorded attempt, in its scene and view."""
-    from rich.console import Console
-
-    from edgegrasp_camera.picture import draw_grasps
-    from edgegrasp_sim.report import Replay, attempt_title
-    from edgegrasp_sim.results import ResultFolder
-
-    folder = ResultFolder(results)
-    first = folder.manifest()["seeds"][0]
-    waiting = Console(stderr=True).status("Making the attempt again…")
-    with waiting, Replay(folder, objects) as repeated:
-        done = repeated.find(first if seed is None else seed, round, number)
-        now, seen = repeated.repeat(done.seed, round, number)
-    before, title = done.attempts[number], attempt_title(done, number)
-    if picture is not None:
-        draw_grasps(
-            picture, seen.cloud, [before], camera_position=seen.camera_position, title=title
-        )
-    print(title)
-    if any(getattr(now, name) != getattr(before, name) for name in ("cause", "object", "opening")):
-        sys.exit(f"edgegrasp replay: the result differs: {now.cause or 'success'}")
-    print("the result is the same")
 
 
 @contextmanager

@@ -25,7 +25,7 @@ COMMANDS = {
     "benchmark-real": ("benchmark_real", "service,view", "Judge grasps in scenes of real cameras."),
     "benchmark-tracking": ("benchmark_tracking", "train,view", "Follow grasps of moving objects."),
     "compare": ("benchmark", "train", "Compare two benchmarks scene by scene."),
-    "replay": ("benchmark", "service,sim", "Make a recorded attempt again."),
+    "replay": ("replay", "service,sim", "Make a recorded attempt or request again."),
     "generate-data": ("train", "train", "Make labelled edge grasps in simulation."),
     "train": ("train", "train", "Train weights on generated data."),
     "generate-scenes": ("train", "train", "Make depth images to train the scene network."),

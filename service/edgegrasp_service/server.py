@@ -30,7 +30,7 @@ from edgegrasp_service.front.grpc import GrpcServer
 from edgegrasp_service.front.http import HttpMiddleware, create_router
 from edgegrasp_service.front.service import GraspService, Observer, Reloader
 from edgegrasp_service.observability import LogQueue, Metrics, log_call, start_logging, write_line
-from edgegrasp_service.outcomes import check_outcomes
+from edgegrasp_service.recording import Recorder, check_outcomes
 from edgegrasp_service.security import ServerTls, load_tokens
 from edgegrasp_service.settings import UNIX, Settings
 from edgegrasp_service.worker.job import PIECE
@@ -62,12 +62,17 @@ class Server:
         self._tls = ServerTls(settings) if settings.tls_certificate else None
         self.metrics = Metrics(lambda: self.pool.models)
         self.pool = WorkerPool(settings, nursery, self.metrics.workers_replaced.inc)
+        self._recorder: Recorder | None = None
         self.service = GraspService(
             settings,
             self.pool,
             load_tokens(settings),
             (self.metrics.count_call, log_call, *observers),
         )
+        if settings.record_folder is not None:
+            hold = self.service.admission.hold
+            self._recorder = Recorder(settings.record_folder, settings.record_bytes, hold)
+            self.service.record = self._recorder.record
         if settings.outcomes_file is not None:
             check_outcomes(settings.outcomes_file)
         self.reloader = Reloader(self.service, self._tls, self.metrics.reloaded)
@@ -131,6 +136,8 @@ class Server:
                 stopped.cancel()
                 trimming.cancel()
                 self.pool.close()
+                if self._recorder is not None:
+                    self._recorder.close()
 
     async def _load(self, grpc_server: GrpcServer, ready: Callable[[], None]) -> None:
         await self.pool.start()

@@ -89,6 +89,8 @@ class Settings(BaseModel):
         description="time for a client to take an answer, plus its size at min_bytes_per_second",
     )
     min_bytes_per_second: Count = Field(50_000, description="least speed of bodies and answers")
+    record_folder: Path | None = Field(None, description="folder to record requests and answers in")
+    record_bytes: Size = Field(1024 * MIB, description="most recorded; the oldest are deleted")
     outcomes_file: Path | None = Field(
         None, description="file that /v1/outcomes appends to, up to 64 MiB; none: no such path"
     )

@@ -1,13 +1,17 @@
 """The program as a whole: its help, and what it says where something is missing."""
 
 import importlib.metadata
+import json
 import sys
+from pathlib import Path
 
 import pytest
 from tests.programs import run as run_program
 from typer.testing import CliRunner
 
+from edgegrasp.v1 import grasp_pb2
 from edgegrasp_cli import main
+from edgegrasp_service.worker.job import Answer, Facts, Job
 
 HEAVY = {
     "torch",
@@ -88,3 +92,20 @@ def test_the_command_line_is_an_extra() -> None:
     program = "import sys; sys.modules['typer'] = None; import edgegrasp_cli.main"
     said = run_program(sys.executable, "-c", program, code=1).stderr
     assert "pip install 'edgegrasp[cli]'" in said
+
+
+@pytest.mark.parametrize("transport", ["http", "grpc"])
+def test_a_recorded_request_is_answered_again(transport, run, refused, tmp_path, monkeypatch):
+    def body(model: str, seconds: float) -> bytes:
+        if transport == "http":
+            return json.dumps({"model": model, "seconds": {"total": seconds}}).encode()
+        response = grasp_pb2.DetectGraspsResponse(model=model, seconds={"total": seconds})
+        return response.SerializeToString()
+
+    def replay(path: Path, settings: object) -> tuple[Job, Answer, Answer]:
+        job, facts = Job("DetectGrasps", transport, b"", 60.0), Facts(grasps=7)
+        return job, Answer(body("plus", 1.0), facts), Answer(body(path.stem, 2.0), facts)
+
+    monkeypatch.setattr("edgegrasp_cli.replay.answer_again", replay)
+    assert "7 grasps\nthe answer is the same" in run("replay", "request", "plus.job")
+    assert "differs" in refused("replay", "request", "small.job")

@@ -11,7 +11,7 @@ import pytest
 
 from edgegrasp_service.errors import DiskFull, InvalidSettings
 from edgegrasp_service.front.http import DOCUMENT
-from edgegrasp_service.outcomes import append_line, check_outcomes
+from edgegrasp_service.recording import append_line, check_outcomes
 from edgegrasp_training.outcomes import read_outcomes
 
 TRIED = {"model": "dummy", "score": 0.9, "held": True, "request_id": "a1"}

@@ -114,10 +114,22 @@ class Admission:
             self.held_bytes += size - ticket.bytes
             self._client_bytes[ticket.client] += size - ticket.bytes
             ticket.bytes = size
-            for waiting in self._waiting:
-                if not waiting.done():
-                    waiting.set_result(None)
-            self._waiting.clear()
+            self._wake()
+
+    def _wake(self) -> None:
+        for waiting in self._waiting:
+            if not waiting.done():
+                waiting.set_result(None)
+        self._waiting.clear()
+
+    def hold(self, size: int) -> bool:
+        """Reserve bytes of no request, or free them (negative); returns whether they fit."""
+        if size > 0 and self.held_bytes + size > self._max_bytes:
+            return False
+        self.held_bytes += size
+        if size < 0:
+            self._wake()
+        return True
 
     def worked(self, seconds: float) -> None:
         """Record how long a worker took."""

@@ -1,4 +1,4 @@
-"""The core of both transports: check, admit, run and report a request."""
+"""The core of both transports: check, admit, run, record and report a request."""
 
 import asyncio
 import contextlib
@@ -38,6 +38,7 @@ HARMFUL_SECONDS = 600.0  # seconds for which it is refused
 MOST_HARMFUL = 1000  # requests remembered
 
 Observer = Callable[[Call], None]
+Recorder = Callable[[Job, Answer], None]
 
 
 class GraspService:
@@ -57,6 +58,7 @@ class GraspService:
         self.in_flight = 0  # number of calls in progress
         self.admission = Admission(pool.size, settings.max_queue_length, settings.max_held_bytes)
         self._observers = observers
+        self.record: Recorder | None = None  # called with each job and its answer
         self._harmful = HarmfulRequests()
 
     @property
@@ -148,6 +150,8 @@ class GraspService:
         call.stages |= answer.facts.seconds
         call.bytes_out = len(answer.body)
         self.admission.resize(ticket, call.bytes_out)
+        if self.record is not None:
+            self.record(job, answer)
         return answer
 
     async def drain(self, grace: float) -> None:

@@ -18,7 +18,7 @@ from edgegrasp_model.options import DetectOptions, parse, parse_options
 from edgegrasp_model.request_cloud import GIVEN, decode_array, decode_cloud
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Detection, Scoring
-from edgegrasp_service import outcomes
+from edgegrasp_service import recording
 from edgegrasp_service.errors import (
     DeadlineExceeded,
     PayloadTooLarge,
@@ -122,7 +122,7 @@ class _Work:
             raise UnsupportedMediaType("Content-Type", repr(kind[:40]), fix)
         assert path is not None
         fields = http_bodies.read_json("body", self._job.body)
-        outcomes.append_outcome(parse(outcomes.TriedGrasp, fields, "body"), self._catalogue, path)
+        recording.append_outcome(parse(recording.TriedGrasp, fields, "body"), self._catalogue, path)
 
     def _detect(self) -> Detection:
         with self._stage("decode"):

@@ -1,0 +1,109 @@
+"""`edgegrasp replay`: repeat an attempt of a benchmark, or a request recorded by a server."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from edgegrasp_service.settings import Settings
+    from edgegrasp_service.worker.job import Answer, Job
+
+Option = typer.Option
+
+replay = typer.Typer(
+    help="Repeat a recording: an attempt of a benchmark, or a request.",
+    no_args_is_help=True,
+    add_completion=False,
+)
+
+
+@replay.command()
+def attempt(
+    results: Annotated[Path, typer.Argument(help="Folder that `benchmark --output` wrote.")],
+    round: Annotated[int, Option(help="Number of the round, from 0.")] = 0,  # noqa: A002
+    number: Annotated[int, Option("--attempt", help="Number of the attempt in it, from 0.")] = 0,
+    seed: Annotated[
+        int | None, Option(help="Seed of the round; else the benchmark's first.")
+    ] = None,
+    objects: Annotated[
+        Path | None, Option(help="Object folder, if it is elsewhere by now.")
+    ] = None,
+    picture: Annotated[
+        Path | None, Option(help="PNG to write: the cloud seen, and the gripper.")
+    ] = None,
+) -> None:
+    """Repeat one recorded attempt, in its scene and view."""
+    from rich.console import Console
+
+    from edgegrasp_camera.picture import draw_grasps
+    from edgegrasp_sim.report import Replay, attempt_title
+    from edgegrasp_sim.results import ResultFolder
+
+    folder = ResultFolder(results)
+    first = folder.manifest()["seeds"][0]
+    waiting = Console(stderr=True).status("Making the attempt again…")
+    with waiting, Replay(folder, objects) as repeated:
+        done = repeated.find(first if seed is None else seed, round, number)
+        now, seen = repeated.repeat(done.seed, round, number)
+    before, title = done.attempts[number], attempt_title(done, number)
+    if picture is not None:
+        draw_grasps(
+            picture, seen.cloud, [before], camera_position=seen.camera_position, title=title
+        )
+    print(title)
+    if any(getattr(now, name) != getattr(before, name) for name in ("cause", "object", "opening")):
+        sys.exit(f"edgegrasp replay: the result differs: {now.cause or 'success'}")
+    print("the result is the same")
+
+
+@replay.command()
+def request(
+    file: Annotated[Path, typer.Argument(help="A file that a server with --record-folder wrote.")],
+    config: Annotated[Path | None, Option(help="TOML file with the server's settings.")] = None,
+) -> None:
+    """Answer a recorded request again, in this process, and compare with the recorded answer.
+
+    Weights and limits are those of --config and of EDGEGRASP_* variables, as for `serve`.
+    """
+    from edgegrasp_service.settings import load_settings
+
+    job, recorded, answer = answer_again(file, load_settings(config))
+    print(f"{answer.facts.grasps} grasps" if answer.error is None else answer.error.detail)
+    before, now = (_without_times(job, one.body) for one in (recorded, answer))
+    if now != before:
+        sys.exit("edgegrasp replay: the answer differs from the recorded one")
+    print("the answer is the same")
+
+
+def answer_again(file: Path, settings: "Settings") -> "tuple[Job, Answer, Answer]":
+    """A recorded request, the answer that is recorded, and the answer now; raises ValueError."""
+    from edgegrasp_service.worker import answer as worker
+    from edgegrasp_service.worker.job import Answer, Job, receive
+
+    with file.open("rb") as stream:
+        job, recorded = receive(stream), receive(stream)
+    if not isinstance(job, Job) or not isinstance(recorded, Answer):
+        raise ValueError(f"{file} is not a recorded request")
+    job = replace(job, remaining=settings.max_request_seconds)
+    return job, recorded, worker.answer(job, worker.load_catalogue(settings), settings)
+
+
+def _without_times(job: Any, body: bytes) -> Any:
+    """An answer without the seconds it took; None for an error, whose body is empty."""
+    from google.protobuf import json_format
+
+    from edgegrasp.v1 import grasp_pb2
+
+    if not body:
+        return None
+    if job.transport == "http":
+        answer = json.loads(body)
+    else:
+        message = getattr(grasp_pb2, f"{job.method}Response").FromString(body)
+        answer = json_format.MessageToDict(message)
+    answer.pop("seconds", None)
+    return answer

@@ -1,0 +1,141 @@
+"""Files that the server writes: recorded requests for `edgegrasp replay`, and outcomes."""
+
+import asyncio
+import errno
+import fcntl
+import logging
+import os
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import orjson
+from pydantic import BaseModel, ConfigDict, Field
+
+from edgegrasp_service.errors import DiskFull, InvalidSettings, PayloadTooLarge
+from edgegrasp_service.worker.job import Answer, Job, pack
+
+logger = logging.getLogger(__name__)
+
+MAX_LINE = 4096  # bytes of an outcome, and more
+MAX_OUTCOMES = 64 * 2**20  # bytes at which their file takes no more
+
+
+class Recorder:
+    """Writes each request and its answer to a file TIME-ID.job, as the messages of a worker.
+
+    The oldest files are deleted beyond `most` bytes in total. `hold` reserves the bytes waiting to
+    be written and frees them (negative); requests it has no room for are not recorded.
+
+    Raises:
+        InvalidSettings: The folder cannot be made or read.
+    """
+
+    def __init__(self, folder: Path, most: int, hold: Callable[[int], bool]) -> None:
+        try:
+            folder.mkdir(exist_ok=True)
+            with os.scandir(folder) as found:
+                files = [(one.path, one.stat().st_size) for one in found if one.name[-4:] == ".job"]
+        except OSError as error:
+            raise InvalidSettings(
+                f"record_folder: got {str(folder)!r}. {error.strerror}."
+            ) from None
+        self._folder = folder
+        self._most = most
+        self._hold = hold
+        self._files = deque(sorted(files))  # path and size, the oldest first
+        self._bytes = sum(size for _, size in files)
+        self._thread = ThreadPoolExecutor(1, "recorder")
+
+    def record(self, job: Job, answer: Answer) -> None:
+        """Queue one request and its answer for writing."""
+        size = job.size + len(answer.body)
+        if not self._hold(size):
+            logger.warning("%s is not recorded: the disk is too slow", job.request_id)
+            return
+        loop = asyncio.get_running_loop()
+        writing = loop.run_in_executor(self._thread, self._write, datetime.now(UTC), job, answer)
+        writing.add_done_callback(lambda _: self._hold(-size))
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._thread.shutdown()
+
+    def _write(self, time: datetime, job: Job, answer: Answer) -> None:
+        name = "".join(letter if letter.isalnum() else "_" for letter in job.request_id)
+        path = self._folder / f"{time:%Y%m%dT%H%M%S%fZ}-{name}.job"
+        try:
+            with path.open("wb") as file:
+                file.writelines((*pack(job), *pack(answer)))
+            self._files.append((str(path), path.stat().st_size))
+            self._bytes += self._files[-1][1]
+            while self._bytes > self._most:
+                oldest, size = self._files.popleft()
+                self._bytes -= size
+                Path(oldest).unlink(missing_ok=True)
+        except OSError as error:
+            logger.warning("%s is not recorded: %s", job.request_id, error)
+            path.unlink(missing_ok=True)
+
+
+# Outcomes: what became of grasps, a line each, for `edgegrasp train --outcomes`
+
+
+class TriedGrasp(BaseModel):
+    """A grasp that a robot executed."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    model: str = Field(min_length=1, max_length=200, description="weights that scored it")
+    score: float = Field(ge=0.0, le=1.0, description="as it was answered")
+    held: bool = Field(description="whether it held")
+    request_id: str = Field("", max_length=200, description="of the request that found it")
+
+
+def append_outcome(tried: TriedGrasp, catalogue: Any, path: Path) -> None:
+    """Append a grasp and the digest of its weights.
+
+    Raises:
+        UnknownModel: There are no such weights.
+        PayloadTooLarge: The file is full.
+        DiskFull: The disk is, or the file cannot be written.
+    """
+    catalogue.get(tried.model)
+    digest = {row["name"]: row["digest"] for row in catalogue.describe()}[tried.model]
+    line = tried.model_dump() | {"digest": digest, "time": datetime.now(UTC).isoformat()}
+    append_line(path, orjson.dumps(line) + b"\n")
+
+
+def append_line(path: Path, line: bytes) -> None:
+    """Append a whole line or nothing; an incomplete last line is removed first.
+
+    Raises PayloadTooLarge where the file is full, DiskFull where the disk is, or it cannot be
+    written.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        with os.fdopen(descriptor, "r+b", buffering=0) as file:
+            fcntl.flock(file, fcntl.LOCK_EX)  # workers write one at a time
+            end = file.seek(0, os.SEEK_END)
+            if end > MAX_OUTCOMES:
+                raise PayloadTooLarge("outcomes", "more than the file takes", "Move the file away.")
+            start = file.seek(max(0, end - MAX_LINE))
+            end = start + file.read(MAX_LINE).rfind(b"\n") + 1
+            file.truncate(end)
+            file.seek(end)
+            if file.write(line) != len(line):
+                file.truncate(end)
+                raise OSError(errno.ENOSPC, "No space left on device")
+    except OSError as error:
+        raise DiskFull(f"The outcome is not kept: {error.strerror}.") from None
+
+
+def check_outcomes(path: Path) -> None:
+    """Raise InvalidSettings unless outcomes can be written to the file."""
+    try:
+        append_line(path, b"")
+    except (DiskFull, PayloadTooLarge) as error:
+        raise InvalidSettings(f"outcomes_file: got {str(path)!r}. {error}") from None
