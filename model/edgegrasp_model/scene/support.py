@@ -22,6 +22,7 @@ DEVIATIONS = 4.0  # of its own points that still belong to it
 BOW = 0.025  # metres by which a bowed support may rise over its plane
 TILT = math.radians(30)  # between the plane and a given `up`
 NEAR_OBJECTS, FAR_WEIGHT = 0.15, 0.1  # metres around an object; what points count elsewhere
+CLOSE, CLOSER = 0.08, (0.008, 0.005, 0.004)  # metres around an object; from the plane there
 FEWEST = 60  # points that a plane is fitted to, and by which its residual is measured
 CELL = 0.02  # metres, in which surfaces are counted
 LEAST_AREA = 0.008  # square metres of a support that are seen; the top of an object is smaller
@@ -161,17 +162,42 @@ def _fitted(
         plane = fit_plane(part, weight, rng, up)
     if plane is None:
         return None
-    found = measured(part, plane, THICK)
+    found = measured(part, _close_to(plane, part.points, around), THICK)
     places = found.frame.points(part.points)
     cells = np.floor(places[np.abs(places[:, 2]) < MOST_MARGIN, :2] / CELL)
     return found if len(np.unique(cells, axis=0)) * CELL**2 > LEAST_AREA else None
 
 
-def near_objects(points: Float32, objects: Float32) -> Float64:
+def _close_to(plane: SupportPlane, points: Float32, objects: Float32) -> SupportPlane:
+    """The plane of the points (N, 3) close to objects (M, 3): of a bin's floor, not the table's."""
+    held = np.abs(plane.heights(points)) < MOST_MARGIN
+    held &= near_objects(points, objects, CLOSE) == 1.0
+    near, normal, offset = points[held].astype(np.float64), np.array(plane.normal), plane.offset
+    if len(near) < FEWEST or len(objects) == 0:
+        return plane
+    for within in CLOSER:
+        height = near @ normal - offset
+        near = near[np.abs(height - np.median(height)) < within]
+        if len(near) < FEWEST:
+            break
+        normal, offset = _least_squares(near, normal)
+    x, y, z = normal.tolist()
+    return SupportPlane(normal=(x, y, z), offset=offset)
+
+
+def _least_squares(points: Float64, toward: Float64) -> tuple[Float64, float]:
+    """Normal (3,), on the side of `toward` (3,), and offset of the plane through points (N, 3)."""
+    middle = points.mean(axis=0)
+    _, vectors = np.linalg.eigh(np.cov((points - middle).T))  # ascending
+    normal = vectors[:, 0] if vectors[:, 0] @ toward >= 0 else -vectors[:, 0]
+    return normal, float(normal @ middle)
+
+
+def near_objects(points: Float32, objects: Float32, within: float = NEAR_OBJECTS) -> Float64:
     """Weight of each point (N, 3) of a support: full near an object (M, 3), small elsewhere."""
     if len(objects) == 0:
         return np.ones(len(points))
-    apart, _ = cKDTree(objects).query(points, distance_upper_bound=NEAR_OBJECTS)
+    apart, _ = cKDTree(objects).query(points, distance_upper_bound=within)
     return np.where(np.isfinite(apart), 1.0, FAR_WEIGHT)
 
 
@@ -229,10 +255,7 @@ def fit_plane(
         near = np.abs(points @ normal - offset) < within * thick
         if near.sum() < FEWEST // 2:
             break
-        middle = points[near].mean(axis=0)
-        _, vectors = np.linalg.eigh(np.cov((points[near] - middle).T))  # ascending
-        normal = vectors[:, 0] if vectors[:, 0] @ normal >= 0 else -vectors[:, 0]
-        offset = float(normal @ middle)
+        normal, offset = _least_squares(points[near], normal)
     if up is not None and normal @ up < math.cos(max_tilt + 1e-9):
         return None
     x, y, z = normal.tolist()
