@@ -10,8 +10,10 @@ from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import SupportPlane, parse_options
 from edgegrasp_model.scene.cloud import CloudInput, check_cloud
 from edgegrasp_model.scene.scene import build_scene, select_points
+from edgegrasp_model.scene.segment import FIXED, Segmentation
 from edgegrasp_model.scene.support import (
     Seen,
+    choose_support,
     correct_depth_scale,
     fit_plane,
 )
@@ -53,6 +55,24 @@ def test_the_table_is_found_in_any_frame(seed: int, share: float) -> None:
     normal = turn.apply([0, 0, 1])
     assert np.dot(plane.normal, normal) > np.cos(0.03)
     assert abs(plane.heights(shift[None] + 0.05 * normal)[0]) < 0.002
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_floor_of_a_bin_counts_and_not_the_table_beside_it(seed: int) -> None:
+    """Its floor is 12 mm over a table that is seen to one side, with as many points."""
+    rng = np.random.default_rng(seed)
+    floor = rng.uniform((-0.2, -0.15, 0.012), (0.2, 0.15, 0.012), (4000, 3))
+    table = rng.uniform((0.22, -0.3, 0.0), (0.6, 0.3, 0.0), (4000, 3))
+    held = rng.uniform((-0.04, -0.04, 0.02), (0.04, 0.04, 0.06), (500, 3))
+    points = np.concatenate([floor, table, held])
+    points = (points + rng.normal(0, 0.001, points.shape)).astype(np.float32)
+    number = np.repeat([FIXED, 0], [8000, 500])
+    up, of_object = np.array([0.0, 0.0, 1.0]), (number == 0).astype(np.float32)
+    shown = Segmentation(number, of_object, 1 - of_object, np.ones(1), up)
+    seen, inside = Seen(points, np.array([0.0, -0.5, 0.8])), np.ones(len(points), dtype=bool)
+    found = choose_support(seen, inside, shown, number == 0, parse_options({}), [])
+    assert found is not None
+    assert np.abs(found.plane.heights(floor[np.abs(floor[:, 0]) < 0.1])).max() < 0.001
 
 
 def test_a_wall_is_a_plane_only_where_it_may_be_steep() -> None:
