@@ -51,7 +51,6 @@ from edgegrasp_model.scene.segment import (
     without_long,
 )
 from edgegrasp_model.scene.support import (
-    Seen,
     Support,
     choose_support,
     correct_depth_scale,
@@ -128,12 +127,14 @@ def select_points(
         sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
-    seen = Seen(sent.points, None if viewpoints is None else viewpoints.mean(axis=0))
+    eye = None if viewpoints is None else viewpoints.mean(axis=0)
     shown = _segmentation(sent, viewpoints, options)
     named = _given_numbers(sent) if sent.segment_ids is not None or shown is None else shown.number
-    support = choose_support(seen, inside, shown, named >= 0, options, warnings)
+    support = choose_support(sent.points, eye, inside, shown, named >= 0, options, warnings)
     up = _up(options, support, None if viewpoints is None else shown)
-    height, margin = _heights(seen, support)
+    height, margin = np.ones(len(sent.points), dtype=np.float32), 0.0
+    if support is not None:
+        height, margin = support.heights(sent.points), support.margin
     labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
     labels[sent.row[np.abs(height) <= margin]] = SUPPORT
     above = np.flatnonzero(height > margin)
@@ -148,7 +149,8 @@ def select_points(
         if support is None and (viewpoints is None or not (number >= 0).any()):
             # A single object without its support, although no camera separates an object from what
             # touches it.
-            close = viewpoints is not None and seen.distance().max(initial=0.0) < CLOSE
+            away = np.inf if eye is None else np.linalg.norm(sent.points - eye, axis=1)
+            close = np.max(away, initial=0.0) < CLOSE
             number, confidence = np.full_like(number, FIXED if close else 0), {}
         number = without_long(number, sent.points, options.max_object_size)
         if counts["above_support"] and not (inside & (number >= 0)).any():
@@ -181,21 +183,13 @@ def _segmentation(
     return segment(sent.points, views, options.known_up, _down_in_image(sent, viewpoints))
 
 
-def _heights(seen: Seen, support: Support | None) -> tuple[Float32, Float32]:
-    """As `Support.heights`; without a support, everything counts as above it."""
-    if support is not None:
-        return support.heights(seen)
-    everywhere = np.ones(len(seen.points), dtype=np.float32)
-    return everywhere, 0 * everywhere
-
-
 def _recognised(
     shown: Segmentation,
     support: Support | None,
     above: Int64,
     plan: Float64,
     height: Float32,
-    margin: Float32,
+    margin: float,
 ) -> tuple[Int64, dict[int, float]]:
     """The object (M,) of each point above the support, and the confidence of each object.
 
@@ -205,13 +199,13 @@ def _recognised(
         above: (M,) which of them rise above it.
         plan: (M, 2) places along it, metres.
         height: (N,) metres over it.
-        margin: (N,) metres over it that belong to it.
+        margin: Metres over it that belong to it.
     """
     number, confidence = shown.number[above], dict(enumerate(shown.confidence.tolist()))
     if support is not None:
         likely = (shown.object + shown.support)[above] > LIKELY
-        number = with_risen(number, plan, height[above], margin[above], likely)
-        if math.isnan(support.growth):
+        number = with_risen(number, plan, height[above], margin, likely)
+        if math.isnan(support.residual):
             number = with_clusters(number, plan)
             confidence |= dict.fromkeys(
                 range(len(confidence), number.max(initial=-1) + 1), UNRECOGNISED
