@@ -1,5 +1,6 @@
 """`edgegrasp benchmark-tracking`: grasps followed through a camera's images, and then executed."""
 
+import itertools
 import json
 import time
 from collections.abc import Callable, Iterator
@@ -25,6 +26,9 @@ TIMEOUT = 60.0  # seconds for a server's answer
 NOISE, MISSING = (0.0003, 0.0015), 0.005  # metres, and for each square metre of depth; of pixels
 EYE, TARGET = np.array([0.15, -0.35, 0.65]), np.array([0.15, 0.15, 0.05])  # of the camera, metres
 OBJECTS = 3  # in a simulated scene
+REPEATED = 8  # images of a still scene in which the first grasp is looked for anew
+ALIKE = 0.02, 10.0  # metres and degrees within which it is the same one
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # a hand of two equal fingers is the same after it
 # Which grasps are executed: the first at the start; the first, and the last one, in the end.
 SUCCESSES = ("still", "open_loop", "followed")
 
@@ -61,6 +65,7 @@ class Followed:
     first: Any = None  # grasps; None: there was none
     last: Any = None
     success: dict[str, bool] = field(default_factory=dict)
+    alike: float | None = None  # share of pairs of images that have the same first grasp anew
 
 
 class Scene:
@@ -195,6 +200,8 @@ def benchmark_tracking(
                 followed = follow(client, scene, asked.seconds, clock)
                 if followed.first is not None:
                     followed.success = scene.execute(followed)
+                    if name == "still":
+                        followed.alike = found_again(client, scene)
                     done.setdefault(label if scenes else name, []).append(followed)
     rows = {name: summary(each) for name, each in done.items()}
     output.mkdir(parents=True, exist_ok=True)
@@ -228,11 +235,31 @@ def follow(client: Any, scene: Scene, seconds: float, clock: Callable[[], float]
         done.last, shown = best or done.last, best and best.id
         if best is not None and best.id == done.first.id:
             true = scene.moved(now) @ done.first.T_cloud_tcp
-            turn = Rotation.from_matrix(best.T_cloud_tcp[:3, :3].T @ true[:3, :3]).magnitude()
             apart = np.linalg.norm(best.T_cloud_tcp[:3, 3] - true[:3, 3])
             done.seconds.append(now)
-            done.off.append((1000 * float(apart), float(np.degrees(turn))))
+            done.off.append((1000 * float(apart), _degrees(best.T_cloud_tcp, true)))
     return done
+
+
+def found_again(client: Any, scene: Scene) -> float:
+    """Share of pairs of images of a still scene with the same first grasp, nothing followed."""
+    images = [client.detect(**scene.look(number / RATE)).grasps for number in range(REPEATED)]
+    alike = [
+        bool(some and others) and _alike(some[0].T_cloud_tcp, others[0].T_cloud_tcp)
+        for some, others in itertools.combinations(images, 2)
+    ]
+    return sum(alike) / len(alike)
+
+
+def _alike(one: "Float64", other: "Float64") -> bool:
+    near = np.linalg.norm(one[:3, 3] - other[:3, 3]) <= ALIKE[0]
+    return bool(near and min(_degrees(one, other), _degrees(one @ HALF_TURN, other)) <= ALIKE[1])
+
+
+def _degrees(one: "Float64", other: "Float64") -> float:
+    """Between the rotations of two poses (4, 4)."""
+    turn = Rotation.from_matrix(one[:3, :3].T @ other[:3, :3])
+    return float(np.degrees(turn.magnitude()))
 
 
 def summary(done: list[Followed]) -> dict[str, Any]:
@@ -253,6 +280,7 @@ def summary(done: list[Followed]) -> dict[str, Any]:
             for share in (50, 95)
         },
         **{name: sum(one.success[name] for one in done) for name in done[0].success},
+        "alike": None if done[0].alike is None else float(np.mean([one.alike for one in done])),
     }
 
 
@@ -285,12 +313,16 @@ def _print(rows: dict[str, dict[str, Any]]) -> None:
 
     held = [name for name in next(iter(rows.values()), {}) if name in SUCCESSES]
     counts, measured = ("scenes", "images", "switches"), ("mm", "degrees", "ms")
-    table = Table("", *counts, *measured, *held, box=None)
+    table = Table("", *counts, *measured, *held, "alike", box=None)
     for label, row in rows.items():
         pairs = ((row[f"{name}_50"], row[f"{name}_95"]) for name in measured)
         texts = ("-" if low is None else f"{low:.1f}, {high:.1f}" for low, high in pairs)
         table.add_row(
-            label, *(str(row[name]) for name in counts), *texts, *(str(row[name]) for name in held)
+            label,
+            *(str(row[name]) for name in counts),
+            *texts,
+            *(str(row[name]) for name in held),
+            "-" if row["alike"] is None else f"{row['alike']:.0%}",
         )
     Console(width=110).print(table)
 
