@@ -12,6 +12,7 @@ from edgegrasp_model.scene.cloud import CloudInput, check_cloud
 from edgegrasp_model.scene.scene import build_scene, select_points
 from edgegrasp_model.scene.segment import FIXED, Segmentation
 from edgegrasp_model.scene.support import (
+    Seen,
     choose_support,
     correct_depth_scale,
     fit_plane,
@@ -38,7 +39,7 @@ def largest(
     """The plane of points that all count alike, without knowing the camera."""
     up = np.asarray(up, float) / np.linalg.norm(up)
     rng = np.random.default_rng(seed)
-    return fit_plane(points, None, np.ones(len(points)), rng, up, max_tilt)
+    return fit_plane(Seen(points, None), np.ones(len(points)), rng, up, max_tilt)
 
 
 @given(seed=st.integers(0, SEED), share=st.floats(0.4, 0.9))
@@ -68,8 +69,8 @@ def test_the_floor_of_a_bin_counts_and_not_the_table_beside_it(seed: int) -> Non
     number = np.repeat([FIXED, 0], [8000, 500])
     up, of_object = np.array([0.0, 0.0, 1.0]), (number == 0).astype(np.float32)
     shown = Segmentation(number, of_object, 1 - of_object, np.ones(1), up)
-    seen = points, np.array([0.0, -0.5, 0.8]), np.ones(len(points), dtype=bool)
-    found = choose_support(*seen, shown, number == 0, parse_options({}), [])
+    seen, inside = Seen(points, np.array([0.0, -0.5, 0.8])), np.ones(len(points), dtype=bool)
+    found = choose_support(seen, inside, shown, number == 0, parse_options({}), [])
     assert found is not None
     assert np.abs(found.plane.heights(floor[np.abs(floor[:, 0]) < 0.1])).max() < 0.001
 

@@ -51,6 +51,7 @@ from edgegrasp_model.scene.segment import (
     without_long,
 )
 from edgegrasp_model.scene.support import (
+    Seen,
     Support,
     choose_support,
     correct_depth_scale,
@@ -127,14 +128,12 @@ def select_points(
         sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
-    eye = None if viewpoints is None else viewpoints.mean(axis=0)
+    seen = Seen(sent.points, None if viewpoints is None else viewpoints.mean(axis=0))
     shown = _segmentation(sent, viewpoints, options)
     named = _given_numbers(sent) if sent.segment_ids is not None or shown is None else shown.number
-    support = choose_support(sent.points, eye, inside, shown, named >= 0, options, warnings)
+    support = choose_support(seen, inside, shown, named >= 0, options, warnings)
     up = _up(options, support, None if viewpoints is None else shown)
-    height, margin = np.ones(len(sent.points), dtype=np.float32), 0.0
-    if support is not None:
-        height, margin = support.heights(sent.points), support.margin
+    height, margin = _heights(seen, support)
     labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
     labels[sent.row[np.abs(height) <= margin]] = SUPPORT
     above = np.flatnonzero(height > margin)
@@ -149,8 +148,7 @@ def select_points(
         if support is None and (viewpoints is None or not (number >= 0).any()):
             # A single object without its support, although no camera separates an object from what
             # touches it.
-            away = np.inf if eye is None else np.linalg.norm(sent.points - eye, axis=1)
-            close = np.max(away, initial=0.0) < CLOSE
+            close = viewpoints is not None and seen.distance().max(initial=0.0) < CLOSE
             number, confidence = np.full_like(number, FIXED if close else 0), {}
         number = without_long(number, sent.points, options.max_object_size)
         if counts["above_support"] and not (inside & (number >= 0)).any():
@@ -183,13 +181,21 @@ def _segmentation(
     return segment(sent.points, views, options.known_up, _down_in_image(sent, viewpoints))
 
 
+def _heights(seen: Seen, support: Support | None) -> tuple[Float32, Float32]:
+    """As `Support.heights`; without a support, everything counts as above it."""
+    if support is not None:
+        return support.heights(seen)
+    everywhere = np.ones(len(seen.points), dtype=np.float32)
+    return everywhere, 0 * everywhere
+
+
 def _recognised(
     shown: Segmentation,
     support: Support | None,
     above: Int64,
     plan: Float64,
     height: Float32,
-    margin: float,
+    margin: Float32,
 ) -> tuple[Int64, dict[int, float]]:
     """The object (M,) of each point above the support, and the confidence of each object.
 
@@ -199,13 +205,13 @@ def _recognised(
         above: (M,) which of them rise above it.
         plan: (M, 2) places along it, metres.
         height: (N,) metres over it.
-        margin: Metres over it that belong to it.
+        margin: (N,) metres over it that belong to it.
     """
     number, confidence = shown.number[above], dict(enumerate(shown.confidence.tolist()))
     if support is not None:
         likely = (shown.object + shown.support)[above] > LIKELY
-        number = with_risen(number, plan, height[above], margin, likely)
-        if math.isnan(support.residual):
+        number = with_risen(number, plan, height[above], margin[above], likely)
+        if math.isnan(support.growth):
             number = with_clusters(number, plan)
             confidence |= dict.fromkeys(
                 range(len(confidence), number.max(initial=-1) + 1), UNRECOGNISED

@@ -41,7 +41,7 @@ BESIDE = 0.012  # metres from an object within which missed points may belong to
 STANDS_OUT = 0.004  # least metres that such points rise above the support's margin
 FEWEST_CELLS, FEWEST_EACH = 5, 4  # cells of a cluster, each BESIDE wide; points per cell
 MOST_CELLS = 2000  # along a side of the ground plan
-REACH = 0.02  # metres from a point to its pixel
+REACH, REACH_GROWTH = 0.012, 0.012  # metres, and share of the depth, from a point to its pixel
 
 
 class Segmentation(NamedTuple):
@@ -295,7 +295,7 @@ def joined(points: Float32, number: Int64, count: int) -> Int64:
 
 
 def with_risen(
-    number: Int64, plan: Float64, height: Float32, margin: float, likely: Bools
+    number: Int64, plan: Float64, height: Float32, margin: Float32, likely: Bools
 ) -> Int64:
     """The numbers (N,), with points that rise above the support added to the object beside them.
 
@@ -305,7 +305,7 @@ def with_risen(
         number: (N,) as from `segment`.
         plan: (N, 2) metres along the support.
         height: (N,) metres over it.
-        margin: Metres over it that belong to it.
+        margin: (N,) metres over it that belong to it.
         likely: (N,) whether they show an object or a support rather than background.
     """
     rows = np.flatnonzero((number < 0) & (height > margin + STANDS_OUT) & likely)
@@ -383,7 +383,7 @@ def _look_up(
     rows, columns, _ = seen.shape
     T, per_pixel = T_camera_cloud.astype(np.float32), np.float32(1.0 / pixel_size)
     left, top = np.float32(corner[0]) * per_pixel, np.float32(corner[1]) * per_pixel
-    reach = np.float32(REACH)
+    reach, growth = np.float32(REACH), np.float32(REACH_GROWTH)
     for n in range(len(points)):
         a, b, c = points[n, 0], points[n, 1], points[n, 2]
         z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
@@ -396,7 +396,7 @@ def _look_up(
         if u < 0 or v < 0 or u >= columns or v >= rows:
             continue
         i, j = int(v), int(u)
-        nearest, row, column = reach * reach, -1, -1
+        nearest, row, column = (reach + growth * z) ** 2, -1, -1
         for k in range(i, min(i + 2, rows)):
             for m in range(j, min(j + 2, columns)):
                 dx, dy, dz = seen[k, m, 0] - x, seen[k, m, 1] - y, seen[k, m, 2] - z

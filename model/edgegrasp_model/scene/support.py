@@ -1,28 +1,36 @@
 """The support plane: given, the largest one seen, or fitted to what the network calls support."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import DetectOptions, RansacPlane, SupportPlane
 from edgegrasp_model.scene.cloud import MAX_DISTANCE, CanonicalFrame, CheckedCloud, thinned
 from edgegrasp_model.scene.regions import inside_workspace
 from edgegrasp_model.scene.segment import Segmentation
 
-THICK = 0.006  # metres from a plane within which points may belong to it
+THICK, GROWTH = 0.004, 0.006  # metres from a plane, plus this per squared metre of distance
 MOST_MARGIN = 0.02  # metres over it that belong to it at most; THICK do at least
 GIVEN_MARGIN = 0.005  # metres over a plane that is given
-DEVIATIONS = 6.0  # medians of its own points' distances that still belong to it
+DEVIATIONS = 4.0  # of its own points that still belong to it
+BOW = 0.025  # metres by which a bowed support may rise over its plane
 TILT = math.radians(30)  # between the plane and a given `up`
+NEAR_OBJECTS, FAR_WEIGHT = 0.15, 0.1  # metres around an object; what points count elsewhere
 CLOSE, CLOSER = 0.08, (0.008, 0.005, 0.004)  # metres around an object; from the plane there
 FEWEST = 60  # points that a plane is fitted to, and by which its residual is measured
 CELL = 0.02  # metres, in which surfaces are counted
+LEAST_AREA = 0.008  # square metres of a support that are seen; the top of an object is smaller
+USUAL_DISTANCE = 0.7  # metres to a camera that is not known
 BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
 TRIES, SAMPLE = 150, 1200  # planes tried, and points that judge them
+REFINEMENTS = 4  # least squares over the plane's points
+STIFF = 1e-6 * np.eye(6)  # keeps a support flat if little of it is seen
 SUPPORT_STREAM = 2  # random stream of one request
 # Of depths that a known plane corrects:
 NEAR = 0.01  # metres from the plane within which points belong to it
@@ -39,28 +47,57 @@ class Support:
     least: float  # metres above it that always belong to it
     residual: float = math.nan  # metres, median distance of its points; NaN where it is not seen
     share: float = 0.0  # of the points that lie in it
+    growth: float = math.nan  # noise of its points, metres per squared metre of distance
+    # Rise over the plane at (x, y): of 1, x, y, x^2, x y, y^2.
+    bow: Float64 = field(default_factory=lambda: np.zeros(6))
 
     @property
     def normal(self) -> Float64:
         """(3,) unit."""
         return np.asarray(self.frame.T_canonical_cloud[2, :3])
 
-    @property
-    def margin(self) -> float:
-        """Metres over it that belong to it."""
-        if math.isnan(self.residual):
-            return self.least
-        return max(min(DEVIATIONS * self.residual, MOST_MARGIN), self.least)
+    def heights(self, seen: "Seen") -> tuple[Float32, Float32]:
+        """Heights of points over the support, which may be bowed, and its margin.
 
-    def heights(self, points: Float32) -> Float32:
-        """Heights (N,) of points (N, 3) over it, metres."""
-        heights: Float32 = points @ self.normal.astype(np.float32)
-        return heights + np.float32(self.frame.T_canonical_cloud[2, 3])
+        The noise of depth cameras grows with the square of the distance.
+
+        Args:
+            seen: N points.
+
+        Returns:
+            The height (N,) of each, and the height (N,) up to which it belongs to the support.
+        """
+        height, squared = np.empty((2, len(seen.points)), dtype=np.float32)
+        eye = np.zeros(3) if seen.viewpoint is None else seen.viewpoint
+        _heights(seen.points, self.frame.T_canonical_cloud, self.bow, eye, height, squared)
+        if math.isnan(self.growth):
+            return height, np.full_like(height, self.least)
+        if seen.viewpoint is None:
+            squared[:] = USUAL_DISTANCE**2
+        squared *= np.float32(DEVIATIONS * self.growth)
+        return height, np.clip(squared, self.least, max(MOST_MARGIN, self.least), out=squared)
+
+
+class Seen(NamedTuple):
+    """N points and their viewpoint."""
+
+    points: Float32  # (N, 3) metres
+    viewpoint: Float64 | None  # (3,) the camera, or the mean of several; None: unknown
+
+    def distance(self) -> Float64:
+        """Metres (N,) from the camera."""
+        if self.viewpoint is None:
+            return np.full(len(self.points), USUAL_DISTANCE)
+        apart = self.points - self.viewpoint
+        return np.asarray(np.sqrt(np.einsum("nd,nd->n", apart, apart)))
+
+    def thickness(self) -> Float64:
+        """Metres (N,) from a plane within which points may belong to it."""
+        return THICK + GROWTH * np.square(self.distance())
 
 
 def choose_support(
-    points: Float32,
-    viewpoint: Float64 | None,
+    seen: Seen,
     inside: Bools,
     shown: Segmentation | None,
     objects: Bools,
@@ -70,8 +107,7 @@ def choose_support(
     """The support plane of a request.
 
     Args:
-        points: (N, 3) cloud frame, metres.
-        viewpoint: (3,) the camera, or the mean of several; None: unknown.
+        seen: N points.
         inside: (N,) which of them lie in the workspace.
         shown: What the network says of them, where it was asked.
         objects: (N,) which of them are of an object.
@@ -79,7 +115,7 @@ def choose_support(
         warnings: Gets what is wrong with it, or that there is none.
     """
     request = options.support
-    if request is None or len(points) == 0:
+    if request is None or len(seen.points) == 0:
         return None
     up = options.known_up
     found: Support | None
@@ -87,24 +123,24 @@ def choose_support(
         # A bin's floor is not measured by the table around it; a followed object's workspace is
         # no bin.
         around = np.inf if options.follows_only else BELOW_WORKSPACE * np.abs(request.normal)
-        over = inside_workspace(points, options.workspace, around)
-        found = measured(points[over], viewpoint, request, GIVEN_MARGIN)
+        over = inside_workspace(seen.points, options.workspace, around)
+        found = measured(Seen(seen.points[over], seen.viewpoint), request, GIVEN_MARGIN)
     else:
         rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
         if isinstance(request, RansacPlane):
-            weight = by_surface(points) * inside
-            plane = fit_plane(points, viewpoint, weight, rng, up, request.max_tilt)
-            found = None if plane is None else measured(points, viewpoint, plane, request.distance)
+            weight = by_surface(seen.points) * inside
+            plane = fit_plane(seen, weight, rng, up, request.max_tilt)
+            found = None if plane is None else measured(seen, plane, request.distance)
             found = None if found is None or found.share < request.min_share else found
         else:
             assert shown is not None
-            found = _fitted(points, viewpoint, shown, objects, up, rng)
+            found = _fitted(seen, shown, objects, up, rng)
         if found is None:
             warnings.append(
                 "no support plane is seen: objects are returned without one. Send support, or the "
                 "true up, if there is one in view."
             )
-    if found is not None and viewpoint is not None and found.plane.heights(viewpoint) < 0:
+    if found is not None and seen.viewpoint is not None and found.plane.heights(seen.viewpoint) < 0:
         warnings.append(
             "the viewpoint lies below the support plane: check viewpoint, up and support."
         )
@@ -112,35 +148,32 @@ def choose_support(
 
 
 def _fitted(
-    points: Float32,
-    viewpoint: Float64 | None,
-    shown: Segmentation,
-    objects: Bools,
-    up: Float64 | None,
-    rng: np.random.Generator,
+    seen: Seen, shown: Segmentation, objects: Bools, up: Float64 | None, rng: np.random.Generator
 ) -> Support | None:
-    """The plane of the points classified as support."""
+    """The plane of the points classified as support, weighted toward those near objects."""
     on, held = np.flatnonzero(shown.support > 0.5), np.flatnonzero(objects)
-    part, around = points[on[thinned(len(on))]], points[held[thinned(len(held), 500)]]
-    weight, up = np.ones(len(part)), shown.up if up is None else up
-    plane = fit_plane(part, viewpoint, weight, rng, up)
+    part = Seen(seen.points[on[thinned(len(on))]], seen.viewpoint)
+    around = seen.points[held[thinned(len(held), 500)]]
+    weight, up = near_objects(part.points, around), shown.up if up is None else up
+    plane = fit_plane(part, weight, rng, up)
     if plane is not None and len(held) and np.median(plane.heights(around)) < -MOST_MARGIN:
         # This plane is the top of something larger, and the objects stand below it.
-        weight[plane.heights(part) > -MOST_MARGIN] = 0.0
-        plane = fit_plane(part, viewpoint, weight, rng, up)
+        weight[plane.heights(part.points) > -MOST_MARGIN] = 0.0
+        plane = fit_plane(part, weight, rng, up)
     if plane is None:
         return None
-    return measured(part, viewpoint, _close_to(plane, part, around), THICK)
+    found = measured(part, _close_to(plane, part.points, around), THICK)
+    places = found.frame.points(part.points)
+    cells = np.floor(places[np.abs(places[:, 2]) < MOST_MARGIN, :2] / CELL)
+    return found if len(np.unique(cells, axis=0)) * CELL**2 > LEAST_AREA else None
 
 
 def _close_to(plane: SupportPlane, points: Float32, objects: Float32) -> SupportPlane:
     """The plane of the points (N, 3) close to objects (M, 3): of a bin's floor, not the table's."""
-    if len(objects) == 0:
-        return plane
-    apart, _ = cKDTree(objects).query(points, distance_upper_bound=CLOSE)
-    held = np.isfinite(apart) & (np.abs(plane.heights(points)) < MOST_MARGIN)
+    held = np.abs(plane.heights(points)) < MOST_MARGIN
+    held &= near_objects(points, objects, CLOSE) == 1.0
     near, normal, offset = points[held].astype(np.float64), np.array(plane.normal), plane.offset
-    if len(near) < FEWEST:
+    if len(near) < FEWEST or len(objects) == 0:
         return plane
     for within in CLOSER:
         height = near @ normal - offset
@@ -160,6 +193,14 @@ def _least_squares(points: Float64, toward: Float64) -> tuple[Float64, float]:
     return normal, float(normal @ middle)
 
 
+def near_objects(points: Float32, objects: Float32, within: float = NEAR_OBJECTS) -> Float64:
+    """Weight of each point (N, 3) of a support: full near an object (M, 3), small elsewhere."""
+    if len(objects) == 0:
+        return np.ones(len(points))
+    apart, _ = cKDTree(objects).query(points, distance_upper_bound=within)
+    return np.where(np.isfinite(apart), 1.0, FAR_WEIGHT)
+
+
 def by_surface(points: Float32) -> Float64:
     """Weight of each point (N, 3), so that equal areas count alike."""
     cell = np.floor(points / CELL).astype(np.int64)
@@ -168,8 +209,7 @@ def by_surface(points: Float32) -> Float64:
 
 
 def fit_plane(
-    points: Float32,
-    viewpoint: Float64 | None,
+    seen: Seen,
     weight: Floats,
     rng: np.random.Generator,
     up: Float64 | None = None,
@@ -178,8 +218,7 @@ def fit_plane(
     """The plane that holds the most of weighted points, facing the camera (RANSAC).
 
     Args:
-        points: (N, 3) that may belong to it.
-        viewpoint: (3,) the camera; None: unknown.
+        seen: N points that may belong to it.
         weight: (N,) what each counts.
         rng: Source of the samples.
         up: (3,) unit; None: any tilt will do.
@@ -194,13 +233,14 @@ def fit_plane(
     chosen = rng.choice(
         held, min(SAMPLE, len(held)), replace=False, p=weight[held] / weight[held].sum()
     )
-    points = points[chosen].astype(np.float64)
+    sample = Seen(seen.points[chosen], seen.viewpoint)
+    points, thick = sample.points.astype(np.float64), sample.thickness()
     corners = points[rng.integers(len(points), size=(TRIES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
     wide = length > 1e-6
     normals, origin = normals[wide] / length[wide, None], corners[wide, 0]
-    toward = _toward(viewpoint, origin, up)
+    toward = _toward(seen, origin, up)
     normals = np.where((np.einsum("td,td->t", normals, toward) < 0)[:, None], -normals, normals)
     if up is not None:
         level = normals @ up >= math.cos(max_tilt + 1e-9)
@@ -208,11 +248,11 @@ def fit_plane(
     if len(normals) == 0:
         return None
     heights = points @ normals.T - np.einsum("td,td->t", normals, origin)
-    worth = (np.abs(heights) < THICK).sum(axis=0)
+    worth = (np.abs(heights) < thick[:, None]).sum(axis=0)
     best = int(worth.argmax())
     normal, offset = normals[best], float(normals[best] @ origin[best])
     for within in (1.0, 0.7, 0.5):
-        near = np.abs(points @ normal - offset) < within * THICK
+        near = np.abs(points @ normal - offset) < within * thick
         if near.sum() < FEWEST // 2:
             break
         normal, offset = _least_squares(points[near], normal)
@@ -222,33 +262,59 @@ def fit_plane(
     return SupportPlane(normal=(x, y, z), offset=offset)
 
 
-def _toward(viewpoint: Float64 | None, origin: Float64, up: Float64 | None) -> Float64:
+def _toward(seen: Seen, origin: Float64, up: Float64 | None) -> Float64:
     """Directions (T, 3) that normals should point toward: the camera, else up, else +z."""
-    if viewpoint is not None:
-        return np.asarray(viewpoint - origin)
+    if seen.viewpoint is not None:
+        return np.asarray(seen.viewpoint - origin)
     return np.broadcast_to(np.array([0.0, 0.0, 1.0]) if up is None else up, origin.shape)
 
 
-def measured(
-    points: Float32, viewpoint: Float64 | None, plane: SupportPlane, least: float
-) -> Support:
-    """The support of a plane, and how well points (N, 3) agree with it where it is seen.
+def measured(seen: Seen, plane: SupportPlane, least: float) -> Support:
+    """The support of a plane, and how well the points agree with it where it is seen.
 
     Args:
-        points: Cloud frame.
-        viewpoint: (3,) the camera; None: unknown.
-        plane: Of the same frame.
+        seen: N points.
+        plane: Of the cloud's frame.
         least: Metres over it that belong to it anyway.
     """
-    sample = points[thinned(len(points))]
-    frame = CanonicalFrame.of_scene(sample, plane.normal, viewpoint)
+    sample = Seen(seen.points[thinned(len(seen.points))], seen.viewpoint)
+    frame = CanonicalFrame.of_scene(sample.points, plane.normal, seen.viewpoint)
     frame.T_canonical_cloud[2, 3] = -plane.offset / np.linalg.norm(plane.normal)
-    height = frame.points(sample)[:, 2]
-    near = np.abs(height) < THICK
+    x, y, height = frame.points(sample.points).T
+    thick, distance = sample.thickness(), sample.distance()
+    near = np.abs(height) < thick
     # If the cloud was cut off above the plane, only objects on it are near.
     if near.sum() < FEWEST or (height[near] < 1e-4).mean() < 0.2:
         return Support(plane, frame, least)
-    return Support(plane, frame, least, float(np.median(np.abs(height[near]))), float(near.mean()))
+    terms, bow = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y]), np.zeros(6)
+    for _ in range(REFINEMENTS):
+        near = np.abs(height - bow @ terms) < thick
+        held = near * terms
+        bow = np.asarray(np.linalg.solve(held @ terms.T + STIFF, held @ height))
+    off = np.abs(height - bow @ terms)[near]
+    growth = 1.4826 * float(np.median(off / np.square(distance[near])))
+    return Support(plane, frame, least, float(np.median(off)), float(near.mean()), growth, bow)
+
+
+@compiled("contract")
+def _heights(
+    points: Float32,
+    T_plane_cloud: Float64,
+    bow: Float64,
+    eye: Float64,
+    height: Float32,
+    squared: Float32,
+) -> None:
+    """Fill in heights (N,) over a bowed plane, and squared distances (N,) from the camera."""
+    T = T_plane_cloud
+    for i in range(len(points)):
+        a, b, c = points[i, 0], points[i, 1], points[i, 2]
+        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
+        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
+        rise = bow[0] + bow[1] * x + bow[2] * y + bow[3] * x * x + bow[4] * x * y + bow[5] * y * y
+        rise = min(max(rise, -BOW), BOW)
+        height[i] = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3] - rise
+        squared[i] = (a - eye[0]) ** 2 + (b - eye[1]) ** 2 + (c - eye[2]) ** 2
 
 
 def correct_depth_scale(
