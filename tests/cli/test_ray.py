@@ -101,6 +101,8 @@ class Cluster:
             text=True,
             env=self._environment,
             cwd=self._folder,
+            # Shells start jobs in the background with this signal ignored.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
         self.processes.append(process)
         return process
@@ -142,8 +144,10 @@ def cluster() -> Iterator[Cluster]:
 
 def until(condition: Callable[[], Any], process: psutil.Popen) -> Any:
     """What a condition gives when it holds; the process must not have failed before."""
+    end = time.monotonic() + PATIENCE
     while not (found := condition()):
         assert process.poll() in (None, 0)
+        assert time.monotonic() < end
         time.sleep(0.05)
     return found
 
