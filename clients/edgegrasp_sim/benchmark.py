@@ -84,10 +84,7 @@ def run_benchmark(
 ) -> list[Round]:
     """Run all rounds that `folder` does not hold yet, and return all, by seed and index.
 
-    Raises:
-        ValueError: `workers` below 1, or the planner's pose is not a rigid transform.
-        FileNotFoundError: the object folder does not hold the scene.
-        RuntimeError: worker processes keep dying, or there is no such Ray cluster.
+    RuntimeError: worker processes keep dying, or there is no such Ray cluster.
     """
     digest = config.object_set().digest  # fails here on a wrong folder, not in every worker
     tasks = config.tasks()
@@ -161,11 +158,7 @@ def constants(engine: str) -> dict[str, float]:
 
 
 class RoundRunner:
-    """A simulation with a planner, for one process.
-
-    Raises:
-        ValueError: the objects, read on another machine maybe, have another digest.
-    """
+    """A simulation with a planner, for one process."""
 
     def __init__(self, config: BenchmarkConfig, make_planner: PlannerFactory, digest: str) -> None:
         objects = config.object_set()

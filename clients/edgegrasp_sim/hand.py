@@ -175,11 +175,7 @@ class Gripper:
         self.body.set_pose(T_world_com[:3, 3], quaternion_xyzw(T_world_com))
 
     def steps_to(self, T_world_hand: Matrix, *, step_length: float) -> Iterator[None]:
-        """Drag the hand in a straight line, `step_length` metres in each time step.
-
-        Yields:
-            After every time step; a caller that stops iterating leaves the hand where it is.
-        """
+        """Drag the hand straight there, `step_length` metres a time step; yields after each."""
         T_world_com = T_world_hand @ self._T_hand_com
         quaternion = quaternion_xyzw(T_world_com)
         position = self.body.position

@@ -134,12 +134,7 @@ class ObjectSet:
         These are the URDF files in `<root>/<scene>/<split>` (VGN's layout), for bins, tables and
         shelves those of piles and packed scenes where they have no such folder, or in `root` itself
         where there is none at all. Where there are none, they are the meshes there, `.obj` or
-        `.stl`: see `prepare_mesh`.
-
-        Raises:
-            FileNotFoundError: there is no such folder, or nothing of the kind in it.
-            ValueError: two meshes have one name, or one cannot be used.
-            RuntimeError: there are meshes, and what prepares them is not installed.
+        `.stl`: see `prepare_mesh`. FileNotFoundError: there is nothing of the kind.
         """
         folder, name = root, root.name
         for kind in (scene.objects, scene):
@@ -191,11 +186,8 @@ def prepare_mesh(mesh: Path, cache: Path | None = None) -> Path:
     The mesh is scaled so that the box around it has a shortest side of `SHORTEST_SIDE`, and no side
     over `LONGEST_SIDE`. Its own unit does not matter; its z axis points up in packed scenes. The
     camera sees the mesh itself; contacts use its convex parts. `cache`, by default in the user's,
-    keeps objects by the digest of their file and of how they are prepared.
-
-    Raises:
-        ValueError: the file contains no solid mesh.
-        RuntimeError: coacd or trimesh is not installed.
+    keeps objects by the digest of their file and of how they are prepared. ValueError: it is no
+    solid mesh; RuntimeError: coacd or trimesh is not installed.
     """
     _require_packages()
 

@@ -119,12 +119,7 @@ class Protocol:
 
 
 def load_protocol(name: str) -> Protocol:
-    """Read a protocol that ships, by name, or a `.toml` file in the same format.
-
-    Raises:
-        FileNotFoundError: there is neither.
-        ValueError: the file lacks a constant, has an unknown one, or one that makes no sense.
-    """
+    """A protocol that ships, by name, or of a `.toml` file; FileNotFoundError, ValueError."""
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if not path.is_file():
         raise FileNotFoundError(

@@ -32,12 +32,7 @@ Row = Sequence[object]
 
 
 class Replay:
-    """The recorded rounds of a result folder, to be repeated.
-
-    Raises:
-        FileNotFoundError: the folder contains no benchmark, or its objects are not there.
-        ValueError: the objects are not those of the benchmark.
-    """
+    """The recorded rounds of a result folder, to be repeated; FileNotFoundError, ValueError."""
 
     def __init__(self, folder: ResultFolder, objects: Path | None = None) -> None:
         facts = folder.manifest()
@@ -97,13 +92,7 @@ class Replay:
 
 
 def write_report(folder: ResultFolder, objects: Path | None = None) -> Path:
-    """Write `report.html` into a result folder.
-
-    `objects` is where its object folder is now; None: where it was.
-
-    Raises:
-        FileNotFoundError: the folder contains no benchmark, or its objects are not there.
-    """
+    """Write `report.html` into a result folder; `objects`: where its objects are now."""
     rounds = folder.rounds()
     facts = folder.manifest()
     summary = folder.finish(rounds)

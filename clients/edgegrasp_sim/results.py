@@ -45,11 +45,7 @@ class ResultFolder:
         self.path = path
 
     def open(self, manifest: dict[str, Any]) -> None:
-        """Start a benchmark in this folder, or resume an interrupted one, whose `run` is equal.
-
-        Raises:
-            ValueError: the folder holds another benchmark.
-        """
+        """Start a benchmark in this folder, or resume an interrupted one; ValueError: another's."""
         known = self.path / "manifest.json"
         manifest = json.loads(json.dumps(manifest))  # tuples become lists, as in the file
         if known.is_file():
@@ -213,15 +209,10 @@ def planner_title(planner: dict[str, Any]) -> str:
 
 
 def compare(first: ResultFolder, second: ResultFolder) -> dict[str, Any]:
-    """Differences of GSR and DR over the scenes that two benchmarks share.
+    """Differences of GSR and DR over the scenes that two benchmarks share, ready for JSON.
 
-    Returns:
-        Figures ready for JSON: for `grasp_success_rate` and `declutter_rate` the value and
-        interval of each and the difference, second minus first, with its paired 95 % interval.
-
-    Raises:
-        FileNotFoundError: a folder contains no benchmark.
-        ValueError: they were run under different conditions or share no scene.
+    The value and interval of each and the difference, second minus first, with its paired 95 %
+    interval. ValueError: they were run under different conditions or share no scene.
     """
     runs = [folder.manifest()["run"] for folder in (first, second)]
     if different := [name for name in PAIRED if runs[0][name] != runs[1][name]]:
@@ -258,11 +249,7 @@ def below_gate(summary: dict[str, Any], gate: Path) -> list[str]:
     """Which rates of a result fall below a committed one, in words; empty if none does.
 
     `gate` is the committed `summary.json`; each rate may be as low as the lower end of its
-    interval.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is no summary, or one of another scene or protocol.
+    interval. ValueError: it is no summary, or one of another scene or protocol.
     """
     try:
         committed = json.loads(gate.read_text())

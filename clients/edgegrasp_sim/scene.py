@@ -91,12 +91,7 @@ def load_object(
     quaternion_xyzw: Sequence[float],
     scale: float,
 ) -> SceneObject:
-    """Load an object with its link frame there; `scale` comes on top of the model's own.
-
-    Raises:
-        FileNotFoundError: the model's file is missing.
-        ValueError: the engine cannot read it.
-    """
+    """Load an object with its link frame there; `scale` comes on top of the model's own."""
     body = world.load_urdf(
         model.urdf,
         position,
@@ -192,11 +187,7 @@ def wait_for_rest(world: World, objects: Sequence[SceneObject], seconds: float) 
 def settle(
     world: World, objects: Sequence[SceneObject], surroundings: Surroundings
 ) -> list[SceneObject]:
-    """Wait for rest and remove objects outside the workspace, until none leaves it.
-
-    Returns:
-        The objects that remain.
-    """
+    """Wait for rest and remove objects outside the workspace, until none leaves it."""
     remaining = list(objects)
     while True:
         wait_for_rest(world, remaining, REST.seconds)

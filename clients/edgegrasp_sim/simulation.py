@@ -94,15 +94,9 @@ class ObjectPlacement:
 
 
 class ClutterSimulation:
-    """Objects in their surroundings, a depth camera and a floating hand.
+    """Objects in their surroundings, a depth camera and a floating hand, or one on an arm.
 
     Equal calls after equal seeds give equal results, whatever was simulated before.
-
-    Args:
-        objects: what to make scenes from, for each kind; the built-in sets by default.
-        engine: see `choose_engine`.
-        gripper: the fields of a gripper file; by default the Panda's hand with the vendor's shapes.
-        arm: what carries the hand, on MuJoCo; None: it floats.
     """
 
     def __init__(
@@ -185,11 +179,7 @@ class ClutterSimulation:
         scales: tuple[float, float] | None = None,
         table_thickness: float = OPEN_THICKNESS,  # of packed and pile scenes, metres
     ) -> int:
-        """Make a new scene at rest; returns how many objects are there.
-
-        Raises:
-            ValueError: unknown scene, no object set for it, or `num_objects` below 1.
-        """
+        """Make a new scene at rest; returns how many objects are there."""
         kind = SceneKind(scene)
         if num_objects < 1:
             raise ValueError(f"num_objects is {num_objects}; ask for at least 1")
@@ -208,12 +198,7 @@ class ClutterSimulation:
         placements: Sequence[ObjectPlacement],
         surroundings: Surroundings = OPEN_TABLE,
     ) -> None:
-        """Put objects exactly at the given poses, at rest, without simulating.
-
-        Raises:
-            FileNotFoundError: an object's file is missing.
-            ValueError: the engine cannot read it.
-        """
+        """Put objects exactly at the given poses, at rest, without simulating."""
         self._clear(surroundings)
         for placement in placements:
             model = ObjectModel(placement.urdf.stem, placement.urdf)
@@ -319,10 +304,7 @@ class ClutterSimulation:
         """Grasp for real: a held object leaves the scene, and the others come to rest.
 
         The outcome is that of `try_grasp(..., to_the_end=True)`; an arm needs the motion that leads
-        there.
-
-        Raises:
-            ValueError: `T_world_hand` is not a rigid transform, or an arm has no motion.
+        there. ValueError: the pose is not rigid, or an arm has no motion.
         """
         if isinstance(self._hand, ArmGripper):
             self._hand.motion = motion

@@ -128,10 +128,7 @@ def run_round(
 class RoundDriver:
     """A round, step by step: `look`, `plan`, `execute`, as long as `end` is None.
 
-    Scene and views depend on `seed` and `index` alone; neither is negative.
-
-    Raises:
-        ValueError: unknown scene, or a negative seed or index.
+    Scene and views depend on `seed` and `index` alone.
     """
 
     def __init__(

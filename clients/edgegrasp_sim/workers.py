@@ -26,31 +26,22 @@ LOCAL_RAY = "local"  # address of a cluster that is started on this machine for 
 
 
 def run_tasks(
+    # called once in every process; its result is closed, if it can be, when it was made in this
+    # process
     make_runner: MakeRunner[Task, Result],
     tasks: Sequence[Task],
     *,
+    # how many at a time; with 1 all in this process; None: as many as there are cores here, or
+    # processors in the cluster
     workers: int | None = None,
+    # address of a Ray cluster, as `ray.init` takes it; `local` starts one on this machine. Each of
+    # its machines needs this package and the files that runners read, at the same paths.
     ray: str | None = None,
 ) -> Iterator[tuple[Task, Result]]:
-    """Do tasks whose results depend only on the task.
+    """Do tasks whose results depend only on the task; yields them and their results as they finish.
 
-    Args:
-        make_runner: called once in every process; its result is closed, if it can be, when it was
-            made in this process.
-        tasks: what to do.
-        workers: how many at a time; with 1 all in this process. By default as many as there are
-            cores here, or processors in the cluster. If a worker dies, another does its task
-            again.
-        ray: address of a Ray cluster, as `ray.init` takes it; `local` starts one on this machine.
-            Each of its machines needs this package and the files that runners read, at the same
-            paths.
-
-    Yields:
-        Tasks and their results, as they finish.
-
-    Raises:
-        ValueError: `workers` below 1.
-        RuntimeError: workers keep dying, or there is no such Ray cluster.
+    If a worker dies, another does its task again. RuntimeError: workers keep dying, or there is no
+    such Ray cluster.
     """
     if workers is not None and workers < 1:
         raise ValueError(f"workers is {workers}; use at least 1")

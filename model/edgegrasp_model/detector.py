@@ -149,26 +149,16 @@ class GraspDetector:
         grippers: Mapping[str, Gripper] | None = None,
         max_voxels: int = MAX_VOXELS,
     ) -> "GraspDetector":
-        """Load a checkpoint and the gripper it was trained for; arguments as of the constructor.
-
-        Raises:
-            InvalidCheckpoint: The file cannot be used.
-            InvalidGripper: Its gripper is not known here.
-        """
+        """Load a checkpoint and its gripper; raises InvalidCheckpoint or InvalidGripper."""
         network, metadata = load_checkpoint(path)
         return cls(network, metadata, load_gripper(metadata.gripper), device, grippers, max_voxels)
 
     def detect(self, cloud: object, options: DetectOptions | None = None) -> Detection:
-        """Detect grasps in a cloud.
+        """Detect grasps in a cloud; an empty list is an answer whose counts and warnings say why.
 
         The cloud is an (N, 3) float32 or float64 array, or (H, W, 3) with NaN holes, metres; or a
-        CloudInput. Its frame is the frame of the options and of the result.
-
-        Returns:
-            Ranked grasps. An empty list is a valid answer; its counts and warnings say why.
-
-        Raises:
-            InvalidRequest: The cloud or an option cannot be used; names field, value and fix.
+        CloudInput. Its frame is the frame of the options and of the result. InvalidRequest names a
+        field, its value and the fix.
         """
         prepared = self.prepare(cloud, options or DetectOptions())
         return self.finish(prepared, self.evaluate(prepared))
@@ -267,31 +257,18 @@ class GraspDetector:
 
     def score(
         self,
-        cloud: object,
+        cloud: object,  # as for `detect`, like the options
         options: DetectOptions | None = None,
         *,
-        edges: object | None = None,
-        hand_poses: object | None = None,
+        edges: object | None = None,  # (M, 2) rows of the cloud as sent: approach and contact point
+        hand_poses: object | None = None,  # (M, 4, 4) T_cloud_hand; exactly one of the two is given
     ) -> Scoring:
-        """Score the caller's edges or hand poses (the paper's grasp evaluation function).
+        """Score the caller's edges or hand poses, in order (the paper's grasp evaluation function).
 
         Options describe the scene, the hand and the obstacles. Regions, approach directions, and
-        options on sampling and selection have no effect. The hand of an edge
-        that would cut into the support plane is retracted where that helps, as in `detect`; given
-        hand poses stay as they are.
-
-        Args:
-            cloud: As for `detect`.
-            options: As for `detect`.
-            edges: (M, 2) integers: rows of the cloud as sent, approach and contact point. Each
-                stands for the voxel that it belongs to.
-            hand_poses: (M, 4, 4) T_cloud_hand. Exactly one of the two is given.
-
-        Returns:
-            One evaluation for each edge or pose, in order.
-
-        Raises:
-            InvalidRequest: The cloud, an option, the edges or the poses cannot be used.
+        options on sampling and selection have no effect. The hand of an edge that would cut into
+        the support plane is retracted where that helps, as in `detect`; given hand poses stay as
+        they are.
         """
         if (edges is None) == (hand_poses is None):
             value = "neither edges nor hand_poses" if edges is None else "edges and hand_poses"
@@ -466,12 +443,7 @@ class ModelCatalogue:
     pace = Pace()  # the default detector's, on this machine, once warm
 
     def __init__(self, detectors: Mapping[str, GraspDetector], default: str = "") -> None:
-        """Collect detectors by name, at least one; `default` as for `load`.
-
-        Raises:
-            UnknownModel: No detector has the default's name.
-            InvalidCheckpoint: There is no detector at all.
-        """
+        """Collect detectors by name, at least one; `default` as for `load`."""
         if not detectors:
             raise InvalidCheckpoint("weights: found none. Give a folder with .safetensors files.")
         self._detectors = dict(detectors)
@@ -490,12 +462,7 @@ class ModelCatalogue:
     ) -> Self:
         """Load the shipped weights, then the user's own, which replace those of the same name.
 
-        A model is named as its file.
-
-        Raises:
-            InvalidCheckpoint: A file cannot be used, or there is none.
-            UnknownModel: There are no weights of the default's name.
-            InvalidGripper: A gripper file cannot be used.
+        A model is named as its file. Raises InvalidCheckpoint, UnknownModel or InvalidGripper.
         """
         own = {file.stem: load_gripper(file) for file in grippers}
         files: dict[str, Path] = {}
@@ -541,10 +508,8 @@ class ModelCatalogue:
     def warm_up(self) -> None:
         """Run every model once on a small synthetic cloud, so that the first request is not slow.
 
-        Few candidates: they exercise every code path in a tenth of the time.
-
-        Raises:
-            InvalidCheckpoint: A network does not give the logits that it was written with.
+        Few candidates: they exercise every code path in a tenth of the time. InvalidCheckpoint: a
+        network does not give the logits that it was written with.
         """
         rng = np.random.default_rng(0)
         box = rng.uniform(-1.0, 1.0, (2000, 3)) * (0.02, 0.03, 0.04)
@@ -576,14 +541,7 @@ class ModelCatalogue:
 
 
 def choose_device(name: str = "auto") -> torch.device:
-    """The device of that name, if it exists.
-
-    `cuda` is the first GPU, `cuda:1` the second; `auto` is the first GPU where there is one, else
-    the processor.
-
-    Raises:
-        InvalidDevice: It is no device's name, or there is no such device here.
-    """
+    """The device of that name: `cpu`, `cuda`, `cuda:1`, or `auto`, a GPU if any; InvalidDevice."""
     if not DEVICE_NAMES.fullmatch(name):
         raise InvalidDevice(name, "Use auto, cpu, cuda, or cuda:N for one GPU of several.")
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0

@@ -153,17 +153,13 @@ def _check_number(field: str, number: int) -> None:
 
 
 def from_edges(
-    scene: Scene, edges: Int64, gripper: Gripper, crop_radius: float, margin: float
+    scene: Scene,
+    edges: Int64,  # (M, 2) rows of the cloud as sent: approach and contact point
+    gripper: Gripper,
+    crop_radius: float,  # metres from the approach point to the contact, at most
+    margin: float,  # metres above the support plane to which hands are retracted
 ) -> Given:
-    """Candidates of given edges, between the voxels that their rows belong to.
-
-    Args:
-        scene: The scene.
-        edges: (M, 2) rows of the cloud as sent: approach and contact point.
-        gripper: What has to fit.
-        crop_radius: Metres around the approach point within which the contact has to be.
-        margin: Metres above the support plane to which hands are retracted.
-    """
+    """Candidates of given edges, between the voxels that their rows belong to."""
     point = scene.point_of_row[edges]
     reason: list[NoGrasp | None] = [NoGrasp.NO_POINT] * len(edges)
     there = np.flatnonzero((point >= 0).all(axis=1))
@@ -187,18 +183,12 @@ def from_edges(
 def from_hand_poses(
     scene: Scene, T_cloud_hand: Float32, gripper: Gripper, crop_radius: float
 ) -> Given:
-    """The edge grasps nearest to hand poses.
+    """The edge grasps nearest to hand poses (M, 4, 4), canonical frame; the poses stay as given.
 
-    The contact point is the first that a closing finger touches, on the side whose normal is
-    closer to the closing direction: of the points within FIRST_TOUCH of the outermost one between
-    the fingers, the one nearest to where the gripper puts its contacts. The approach point is the
-    point around it that is nearest to the hand's approach axis. The pose stays as given.
-
-    Args:
-        scene: The scene.
-        T_cloud_hand: (M, 4, 4), canonical frame.
-        gripper: What is between its fingers.
-        crop_radius: Metres around the approach point within which the contact has to be.
+    The contact point is the first that a closing finger touches, on the side whose normal is closer
+    to the closing direction: of the points within FIRST_TOUCH of the outermost one between the
+    fingers, the one nearest to where the gripper puts its contacts. The approach point is the point
+    within `crop_radius` metres of it that is nearest to the hand's approach axis.
     """
     view = hand_views(scene.cloud, T_cloud_hand, reach_of(gripper))
     x, y, z = view.position.T

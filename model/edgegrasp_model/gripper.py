@@ -152,11 +152,7 @@ def load_gripper(name_or_path: str | Path = "panda") -> Gripper:
 
 
 def gripper_fields(name_or_path: str | Path) -> dict[str, Any]:
-    """The fields of a gripper file, ready for JSON and for the option `gripper` of a request.
-
-    Raises:
-        InvalidGripper: The file does not exist or does not describe a gripper.
-    """
+    """The fields of a gripper file, ready for JSON and for a request; raises InvalidGripper."""
     path = Path(name_or_path)
     if path.suffix != ".toml":
         path = GRIPPER_FOLDER / f"{name_or_path}.toml"
@@ -189,10 +185,8 @@ def _first_fault(error: ValidationError) -> str:
 def choose_gripper(options: DetectOptions, default: Gripper, own: Mapping[str, Gripper]) -> Gripper:
     """The gripper of a request, at the opening it asks for; `default` if it names none.
 
-    The user's `own`, by name, replace shipped ones of the same name.
-
-    Raises:
-        InvalidRequest: No gripper has that name, or it does not open that far.
+    The user's `own`, by name, replace shipped ones of the same name. InvalidRequest: no gripper has
+    that name, or it does not open that far.
     """
     asked = options.gripper
     if asked is None:

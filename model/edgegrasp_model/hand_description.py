@@ -122,11 +122,9 @@ def points_around_fingers(
     """The points around the fingers of hands (E, 4, 4); with one camera, x points to its side.
 
     `view` are the `hand_views` of the same hands, within `reach_of` the open gripper. At most
-    `limit` points are kept of each, spread evenly over the cloud's order.
-
-    Returns:
-        (E, limit, 6) positions from between the fingertips in metres and normals, in hand frames,
-        zeros behind the last; and their number (E,).
+    `limit` points are kept of each, spread evenly over the cloud's order. Returns (E, limit, 6)
+    positions from between the fingertips in metres and normals, in hand frames, zeros behind the
+    last; and their number (E,).
     """
     x, y = gripper.pad_half_width + BESIDE, gripper.max_opening / 2 + OUTSIDE
     palm_z = seen_part(gripper).palm_z

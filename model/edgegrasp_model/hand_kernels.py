@@ -90,11 +90,7 @@ def distance_behind(
     places: Float32,  # (S, 3) hand frame
     cell: float,  # tangent of the angle of a cell
 ) -> Float32:
-    """How far some places of hands lie behind the first surface that a camera saw.
-
-    Returns:
-        (E, S) metres; 0 in front of the surface, and where nothing was seen.
-    """
+    """Metres (E, S) that places of hands lie behind the first surface a camera saw, or 0."""
     behind = np.zeros((len(turn), len(places)), dtype=np.float32)
     turn = np.ascontiguousarray(turn, dtype=np.float32)
     _behind(surface, turn, shift.astype(np.float32), places, np.float32(1.0 / cell), behind)

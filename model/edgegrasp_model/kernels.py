@@ -39,44 +39,35 @@ def nearest_in_groups(points: Float32, bounds: Int64, k: int) -> Int64:
 
 
 def extents_across(
-    points: Float32, rows: Int64, first: Int64, last: Int64, frame: Float32, strip: Float32
+    points: Float32,  # (N, 3) of the cloud
+    rows: Int64,  # (P,) of points to look at, group after group
+    first: Int64,  # (M,) places in `rows` where the group of each edge begins
+    last: Int64,  # (M,) and where they end
+    # (M, 4, 3) of each edge the point it is at; across the strip, out of the object along it, and
+    # ahead of the hand, unit vectors
+    frame: Float32,
+    # (4,) its half width and its length, how far ahead of the edge its points may be, and the gap
+    # length that ends it, metres
+    strip: Float32,
 ) -> Float32:
-    """How far the surface extends to both sides of an edge, along a strip across it.
-
-    Args:
-        points: (N, 3) of the cloud.
-        rows: (P,) of points to look at, group after group.
-        first: (M,) places in `rows` where the group of each edge begins.
-        last: (M,) and where they end.
-        frame: (M, 4, 3) of each edge the point it is at; across the strip, out of the object
-            along it, and ahead of the hand, unit vectors.
-        strip: (4,) its half width and its length, how far ahead of the edge its points may be, and
-            the gap length that ends it, metres.
-
-    Returns:
-        (M, 2) least and greatest distance from the edge into the object.
-    """
+    """Least and greatest metres (M, 2) that the surface extends into the object, across an edge."""
     extent = np.zeros((len(frame), 2), dtype=np.float32)
     _along_strips(columns_of(points[rows]), first, last, frame, strip, extent)
     return extent
 
 
 def level_spread(
-    points: Float32, rows: Int64, toward: Float32, radius: float, drop: float
+    points: Float32,  # (N, 3) of the cloud
+    rows: Int64,  # (M,) of the points to look at
+    toward: Float32,  # (T, M, 3) unit, toward each viewpoint
+    radius: float,  # metres around each point in which others count,
+    drop: float,  # and how much lower they may lie, metres
 ) -> Iterator[tuple[Float32, Float32, Float32]]:
-    """How the neighbourhood of each point is distributed, seen from some directions.
+    """How the neighbourhood of each point is distributed, from one viewpoint after another.
 
-    Args:
-        points: (N, 3) of the cloud.
-        rows: (M,) of the points to look at.
-        toward: (T, M, 3) unit, toward each viewpoint.
-        radius: Metres around each point in which others count,
-        drop: and how much lower they may lie, metres.
-
-    Yields:
-        For each viewpoint the direction orthogonal to `toward` in which they spread least, (M, 3)
-        unit; how far (M,) the point lies from their mean along it, not negative; their standard
-        deviation (M,) along it. Metres.
+    Yields the direction orthogonal to `toward` in which they spread least, (M, 3) unit; how far
+    (M,) the point lies from their mean along it, not negative; their standard deviation (M,) along
+    it, metres.
     """
     cells = np.floor((points - points.min(axis=0)) / np.float32(radius)).astype(np.int64) + 1
     sizes = cells.max(axis=0) + 2

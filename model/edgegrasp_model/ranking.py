@@ -35,28 +35,17 @@ OUTCOMES = list(Outcome)
 
 def select(
     scene: Scene,
-    sample: Sample,
-    score: Floats,
-    rating: Floats,
+    sample: Sample,  # E scored candidates
+    score: Floats,  # (E,) probabilities
+    rating: Floats,  # (E,) the same before rescaling by a robot's outcomes; the order
     gripper: Gripper,
     options: DetectOptions,
-    counts: dict[str, int],
+    counts: dict[str, int],  # gets the number of candidates left after each step
 ) -> tuple[Int64, NDArray[np.int8]]:
     """Order the scored candidates, drop low scores and near duplicates, keep the first top_k.
 
-    By score; but the best good grasp of each object comes before the second grasp of any.
-
-    Args:
-        scene: The scene.
-        sample: E scored candidates.
-        score: (E,) probabilities.
-        rating: (E,) the same before rescaling by a robot's outcomes; these decide the order.
-        gripper: The hand.
-        options: min_score, order, suppression and top_k.
-        counts: Gets the number of candidates left after each step.
-
-    Returns:
-        The rows to return, best first, and the outcome of each candidate: (E,) codes.
+    By score; but the best good grasp of each object comes before the second grasp of any. Returns
+    the rows to return, best first, and the outcome of each candidate: (E,) codes.
     """
     hands = sample.candidates.T_cloud_hand
     T_cloud_tcp = hands @ gripper.T_hand_tcp
@@ -82,35 +71,22 @@ def select(
 
 
 def objects_first(order: Int64, score: Floats, number: Int64) -> Int64:
-    """The rows `order`, the first good one of each object brought to the front.
-
-    Args:
-        order: (M,) rows, best first.
-        score: (E,) probabilities.
-        number: (E,) the object that each is on.
-    """
+    """The rows `order`, the first good one of each object (E,) brought to the front; score (E,)."""
     _, first = np.unique(number[order], return_index=True)
     first = np.sort(first[score[order[first]] >= GOOD_SCORE])
     return np.concatenate([order[first], np.delete(order, first)])
 
 
 def ranked(
-    score: Floats,
-    collision_free: Bools,
+    score: Floats,  # (E,) probabilities
+    collision_free: Bools,  # (E,) the scores of the others are multiplied by COLLIDING
+    # `highest`: by height where the score is SURE_SCORE or more; `clearance`: collision-free ones
+    # first, by clearance
     order: Literal["score", "highest", "clearance"] = "score",
-    height: Floats | None = None,
-    clearance: Floats | None = None,
+    height: Floats | None = None,  # (E,) of the TCP along up, for `highest`
+    clearance: Floats | None = None,  # (E,) for `clearance`
 ) -> Int64:
-    """Rows best first.
-
-    Args:
-        score: (E,) probabilities.
-        collision_free: (E,) the scores of the others are multiplied by COLLIDING.
-        order: By score; by height where the score is SURE_SCORE or more, then the others by
-            score; or collision-free ones first, by clearance, then by score.
-        height: (E,) of the TCP along up, for `highest`.
-        clearance: (E,) for `clearance`.
-    """
+    """Rows best first: by `order`, and then by score."""
     worth = np.where(collision_free, score, COLLIDING * score)
     keys: tuple[Array, ...] = (-worth,)
     if order == "highest" and height is not None:
@@ -181,20 +157,12 @@ def found_support(support: Support | None) -> FoundSupport | None:
 
 def detected_objects(
     scene: Scene,
-    grasps: Sequence[Grasp],
-    sample: Sample | None,
-    score: Floats,
+    grasps: Sequence[Grasp],  # those that are returned
+    sample: Sample | None,  # E scored candidates; None: there are none
+    score: Floats,  # (E,) probabilities
     gripper: Gripper,
 ) -> list[DetectedObject]:
-    """The scene's objects, largest first, with their best grasp or why they have no good one.
-
-    Args:
-        scene: The scene.
-        grasps: Those that are returned.
-        sample: E scored candidates; None: there are none.
-        score: (E,) probabilities.
-        gripper: The hand.
-    """
+    """The scene's objects, largest first, with their best grasp or why they have no good one."""
     number, count = np.unique(scene.object_of_point[scene.object_of_point >= 0], return_counts=True)
     best = {grasp.object: grasp.score for grasp in sorted(grasps, key=lambda grasp: grasp.score)}
     objects = []
@@ -277,20 +245,12 @@ def _smallest_rectangle(plan: Float64) -> tuple[Float64, ...]:
 
 def debug_info(
     scene: Scene,
-    sample: Sample | None,
-    score: Floats,
-    outcome: NDArray[np.int8],
-    labels: Int64,
+    sample: Sample | None,  # all candidates and which of them (E) were scored; None: none
+    score: Floats,  # (E,) probabilities
+    outcome: NDArray[np.int8],  # (E,) codes of what became of them
+    labels: Int64,  # (R,) of the rows of the cloud as sent
 ) -> DebugInfo:
-    """The processed cloud and every candidate of a request.
-
-    Args:
-        scene: The scene.
-        sample: All candidates and which of them (E) were scored; None: there are none.
-        score: (E,) probabilities.
-        outcome: (E,) codes of what became of them.
-        labels: (R,) of the rows of the cloud as sent.
-    """
+    """The processed cloud and every candidate of a request."""
     candidates = Candidates.none() if sample is None else sample.drawn
     codes = outcome[:0] if sample is None else sample.outcome.copy()
     scores = np.full(len(candidates), np.nan, dtype=np.float32)

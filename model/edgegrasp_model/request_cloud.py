@@ -58,17 +58,10 @@ class File(NamedTuple):
 def decode_cloud(
     fields: Mapping[str, Any], options: DetectOptions, max_points: int
 ) -> tuple[CloudInput, DetectOptions]:
-    """Decode the cloud of a request and its per-point arrays.
+    """Decode the cloud of a request, one of SOURCES, and its per-point arrays, any of PER_POINT.
 
-    `fields` has one of SOURCES, and any of PER_POINT.
-
-    Returns:
-        The cloud; and the options, in which the cameras of depth images are the viewpoints.
-
-    Raises:
-        InvalidRequest: It cannot be decoded, or an array is sent twice.
-        PayloadTooLarge: More than `max_points` points.
-        UnsupportedMediaType: There is no reader for the file's format.
+    Also returns the options, in which the cameras of depth images are the viewpoints. Raises
+    InvalidRequest, PayloadTooLarge or UnsupportedMediaType.
     """
     source = _source(fields)
     if source == "depth_images":
@@ -116,13 +109,7 @@ def _source(fields: Mapping[str, Any]) -> str:
 def decode_points(points: object, max_points: int) -> Array:
     """Read points like `decode_array`; [null, null, null] in an organised list is a hole.
 
-    Returns:
-        (N, 3) float32 of bytes; float64 of lists, in the shape that they have.
-
-    Raises:
-        InvalidRequest: Not a whole number of points, not a list, or lists that are not an array of
-            numbers.
-        PayloadTooLarge: More than `max_points` points.
+    Returns (N, 3) float32 of bytes; float64 of lists, in the shape that they have.
     """
     array = decode_array("points", points, max_points)
     if array.size // 3 > max_points:
@@ -135,13 +122,9 @@ def decode_points(points: object, max_points: int) -> Array:
 def decode_array(field: str, value: object, max_points: int) -> Array:
     """Read an array: packed numbers, an .npy or .png file, or lists.
 
-    Returns:
-        From bytes (N, 3) float32 or (N,) int32, as PACKED says; from lists int64 if all numbers are
-        whole, else float64; from a file whatever it contains.
-
-    Raises:
-        InvalidRequest: A broken number, an invalid file, or lists that are not an array of numbers.
-        PayloadTooLarge: More than `max_points` rows in a file.
+    Returns from bytes (N, 3) float32 or (N,) int32, as PACKED says; from lists int64 if all numbers
+    are whole, else float64; from a file whatever it contains. Raises InvalidRequest or
+    PayloadTooLarge.
     """
     if isinstance(value, File):
         read = read_png if value.format == "png" else read_npy
@@ -286,13 +269,9 @@ DEPTH_ENCODINGS = {"32FC1": "<f4", "64FC1": "<f8", "16UC1": "<u2"}
 
 
 def read_depth_images(images: object, max_points: int) -> tuple[CloudInput, list[Position]]:
-    """Read views, and fuse them; as `edgegrasp_camera.depth` says.
+    """Read DepthImages, given as plain values, and fuse them; InvalidRequest, PayloadTooLarge.
 
-    `images` is a list of DepthImage, as plain values; their `depth` may also be a File.
-
-    Raises:
-        InvalidRequest: A field is missing, unknown or wrong.
-        PayloadTooLarge: More than `max_points` pixels.
+    Their `depth` may also be a File.
     """
     if not isinstance(images, list) or not 1 <= len(images) <= MAX_VIEWS:
         count = f"{len(images)} images" if isinstance(images, list) else brief(images)

@@ -59,13 +59,8 @@ class Followed:
 def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOptions:
     """The options for building the scene: without a search, only around followed objects.
 
-    Args:
-        options: Of the request, with `previous`.
-        gripper: Name of the hand.
-        points: (N, 3) the cloud.
-
-    Raises:
-        InvalidRequest: `previous` is for another gripper, or in another frame.
+    `points` (N, 3) are the cloud. InvalidRequest: `previous` is for another gripper than that of
+    this name, or in another frame.
     """
     previous = options.previous
     assert previous is not None
@@ -97,10 +92,8 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
 def follow(scene: Scene, previous: Previous, given: bool) -> tuple[Scene, Followed]:
     """Find the objects of an earlier answer again, and give their points their numbers.
 
-    Args:
-        scene: The new scene; without a search, all its points belong to one object.
-        previous: The earlier answer.
-        given: Whether the caller gave the objects' numbers.
+    Without a search, all points of the scene belong to one object. `given`: the caller gave the
+    objects' numbers.
     """
     points, number = scene.points_in_cloud, scene.object_of_point
     seen = np.flatnonzero(number >= 0)
@@ -143,21 +136,14 @@ def follow(scene: Scene, previous: Previous, given: bool) -> tuple[Scene, Follow
 
 
 def merged(
-    found: list[Grasp],
+    found: list[Grasp],  # of this cloud alone, best first
     followed: Followed,
     options: DetectOptions,
-    up: Float64,
+    up: Float64,  # (3,) unit, cloud frame
+    # evaluates poses (M, 4, 4) T_cloud_hand with a collision check
     score: Callable[[Float32, Collision, CollisionCheck], list[Evaluation]],
 ) -> tuple[list[Grasp], Tracking]:
-    """The earlier answer's grasps at their new poses, then others; the kept grasp comes first.
-
-    Args:
-        found: Grasps of this cloud alone, best first.
-        followed: The objects' motion.
-        options: Of the request, with `previous`.
-        up: (3,) unit, cloud frame.
-        score: Evaluates poses (M, 4, 4) T_cloud_hand with a given collision check.
-    """
+    """The earlier answer's grasps at their new poses, then others; the kept grasp comes first."""
     previous = options.previous
     assert previous is not None
     old = [one for one in previous.grasps if one.object is None or one.object in followed.moved]
@@ -238,11 +224,8 @@ def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
     """An object's motion (4, 4) T_now_before, and the share of its points found at the new pose.
 
     Iterative closest points (ICP), mostly across the surface; distances along it count only where
-    an object ends. Motions between two images are small, so it starts at the old pose.
-
-    Args:
-        before: (K, 3) points on its surface.
-        cloud: What is seen now.
+    an object ends. Motions between two images are small, so it starts at the old pose. `before` (K,
+    3) are points on its surface.
     """
     T = np.eye(4)
     if len(before) < FEWEST or len(cloud.points) < FEWEST:

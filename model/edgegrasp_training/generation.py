@@ -122,11 +122,8 @@ def generate(
 ) -> Iterator[tuple[int, int, int]]:
     """Generate the scenes that are missing, in any order; workers do not change the result.
 
-    Yields the index of each finished scene, the grasps tried in it and those that held.
-
-    Raises:
-        ValueError: The folder holds views of another engine.
-        RuntimeError: Workers keep dying, or there is no such Ray cluster.
+    Yields the index of each finished scene, the grasps tried in it and those that held. ValueError:
+    the folder holds views of another engine.
     """
     folder.mkdir(parents=True, exist_ok=True)
     found: dict[str, Any] = {"engine": choose_engine(options.engine)}

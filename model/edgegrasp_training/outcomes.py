@@ -39,11 +39,8 @@ class Outcomes:
 def read_outcomes(path: Path, digest: str = "") -> Outcomes:
     """The outcomes in a file that a server wrote, an object of JSON on each line.
 
-    `digest`: of the weights whose scores count; empty: all.
-
-    Raises:
-        OSError: It cannot be read.
-        ValueError: A line is no outcome, or none is of these weights.
+    `digest`: of the weights whose scores count; empty: all. ValueError: a line is no outcome, or
+    none is of these weights.
     """
     scores, held = [], []
     for number, line in enumerate(path.read_text().splitlines(), start=1):
@@ -75,13 +72,9 @@ def fit(outcomes: Outcomes) -> tuple[float, float]:
 
 
 def recalibrate(weights: Path, outcomes_file: Path, folder: Path) -> str:
-    """Write weights whose scores are calibrated on the outcomes of the old ones.
+    """Write NAME-robot.safetensors, calibrated on the outcomes of the old weights.
 
-    Into NAME-robot.safetensors; returns what was done, in a sentence.
-
-    Raises:
-        InvalidCheckpoint: The weights cannot be read.
-        ValueError: As of `read_outcomes`.
+    Returns what was done, in a sentence.
     """
     network, metadata = load_checkpoint(weights)
     outcomes = read_outcomes(outcomes_file, metadata.digest)

@@ -54,9 +54,7 @@ def start_from(network: nn.Module, start: nn.Module) -> int:
 
     Additional numbers start with weight 0, so both networks score alike. Returns how many numbers
     of the hand description `start`, which takes lengths in metres, reads; 0 for networks of balls.
-
-    Raises:
-        ValueError: The networks differ in more than that.
+    ValueError: the networks differ in more than that.
     """
     weights, known = in_units(start).state_dict(), 0
     if isinstance(network, HandNet) and isinstance(start, HandNet):

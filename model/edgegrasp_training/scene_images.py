@@ -53,18 +53,14 @@ class SceneImage(NamedTuple):
 
 
 def generate(
-    folder: Path, objects: Sequence[Path], files: int, seed: int, part: int, parts: int
+    folder: Path,  # gets `scenes-NNNN.npz`
+    objects: Sequence[Path],  # OBJ files of training objects
+    files: int,  # of SCENES_PER_FILE scenes, with VIEWS_PER_SCENE images each
+    seed: int,
+    part: int,  # which share of the files this process writes, from 0
+    parts: int,  # how many shares there are
 ) -> None:
-    """Write numbered files of images, those that are not there yet.
-
-    Args:
-        folder: Gets `scenes-NNNN.npz`.
-        objects: OBJ files of training objects.
-        files: How many files of SCENES_PER_FILE scenes, with VIEWS_PER_SCENE images each.
-        seed: Of all that is random.
-        part: Which share of the files this process writes, from 0.
-        parts: How many shares there are.
-    """
+    """Write numbered files of images, those that are not there yet."""
     folder.mkdir(parents=True, exist_ok=True)
     drawn = -1
     for number in range(part, files, parts):
@@ -92,11 +88,7 @@ def generate(
 
 
 def make_image(rng: np.random.Generator, scene: SceneMeshes, pose: Float64) -> SceneImage | None:
-    """Render a scene as a depth camera at `pose` (T_world_camera) sees it.
-
-    Returns:
-        The image; None where something hides the view or no object of the scene is in it.
-    """
+    """What a depth camera at `pose` (T_world_camera) sees; None: too near, or no object in view."""
     focal = WIDTH / 2 / np.tan(np.radians(rng.uniform(35, 80)) / 2)
     camera = Intrinsics(WIDTH, HEIGHT, focal, WIDTH / 2, HEIGHT / 2, 0.1, 13.0)
     depth, label, steep = _cast(_casting_of(scene), scene.parts, camera, pose)

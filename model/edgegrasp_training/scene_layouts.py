@@ -374,12 +374,7 @@ class HeightMap:
     """How high what lies on a level surface reaches; objects are put down on it."""
 
     def __init__(self, half: tuple[float, float], walls: float = 0.0) -> None:
-        """Free inside of a rectangle.
-
-        Args:
-            half: of its length and width, metres.
-            walls: metres, height outside of it.
-        """
+        """Free inside of a rectangle of half sides `half`, `walls` high outside of it, metres."""
         size = round(2 * REACH / CELL)
         self.height = np.full((size, size), walls)
         self.half = half
@@ -408,27 +403,14 @@ class HeightMap:
 
 def _lay_objects(
     scene: SceneMeshes,
-    heights: HeightMap,
-    count: int,
+    heights: HeightMap,  # what lies there; its origin is `origin` of the scene
+    count: int,  # how many are tried
     how: str,
-    origin: Sequence[float] = (0.0, 0.0, 0.0),
-    around: float = 0.25,
-    ceiling: float = np.inf,
+    origin: Sequence[float] = (0.0, 0.0, 0.0),  # (3,) metres
+    around: float = 0.25,  # metres, standard deviation of their places in a heap
+    ceiling: float = np.inf,  # metres above which nothing reaches
 ) -> int:
-    """Put objects down: `spread` apart, `touching` beside each other, or in a `heap`.
-
-    Args:
-        scene: Gets them.
-        heights: What lies there; its origin is `origin` of the scene.
-        count: How many are tried.
-        how: As above.
-        origin: (3,) metres.
-        around: Metres, standard deviation of their places where they lie in a heap.
-        ceiling: Metres above which nothing reaches.
-
-    Returns:
-        How many were put down.
-    """
+    """Put objects down: `spread` apart, `touching`, or in a `heap`; returns how many."""
     rng, put = scene.rng, 0
     pose = ("any", "lying") if how == "heap" else ("upright", "lying")
     lying = rng.random()

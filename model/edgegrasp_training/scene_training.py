@@ -86,12 +86,9 @@ def image_points(image: SceneImage) -> Float32:
 def make_batch(
     images: Sequence[SceneImage], rng: np.random.Generator, up_known: bool | None = None
 ) -> SceneBatch:
-    """Features and targets; every other image is mirrored.
+    """Features and targets of images of one size.
 
-    Args:
-        images: Of one size.
-        rng: Of what differs each time.
-        up_known: whether the network gets `up`; None: at random, and images are mirrored too.
+    `up_known`: whether the network gets `up`; None: at random, and images are mirrored too.
     """
     size = SIZES[0] if up_known is not None else SIZES[int(rng.choice(len(SIZES), p=SIZE_SHARES))]
     rows = [_example(image, rng, up_known, size) for image in images]
@@ -255,25 +252,15 @@ def batches(data: Path, images: SceneImages, rng: np.random.Generator) -> Iterat
 
 
 def train(
-    data: Path,
-    run: Path,
+    data: Path,  # folder of `scenes-*.npz`
+    run: Path,  # gets checkpoints and `log.txt`
     seconds: float,
-    seed: int = 0,
-    start: Path | None = None,
-    threads: int = 1,
-    rate: float = LEARNING_RATE,
+    seed: int = 0,  # of weights and batches
+    start: Path | None = None,  # a checkpoint to go on from
+    threads: int = 1,  # of the processor
+    rate: float = LEARNING_RATE,  # the highest learning rate
 ) -> None:
-    """Train for a given time; `run/scene.safetensors` gets the mean weights every few minutes.
-
-    Args:
-        data: Folder of `scenes-*.npz`.
-        run: Gets checkpoints and `log.txt`.
-        seconds: How long.
-        seed: Of weights and batches.
-        start: A checkpoint to go on from.
-        threads: Of the processor.
-        rate: The highest learning rate.
-    """
+    """Train for a given time; `run/scene.safetensors` gets the mean weights every few minutes."""
     torch.manual_seed(seed)
     torch.set_num_threads(threads)
     run.mkdir(parents=True, exist_ok=True)

@@ -88,11 +88,7 @@ def _volume_of(part: Part) -> float:
 
 
 def stretched(model: ObjectModel, factors: tuple[float, float, float], folder: Path) -> ObjectModel:
-    """Describe an object anew, with its meshes stretched along x, y and z.
-
-    Raises:
-        ValueError: The object has a shape that is not a mesh, or one with a frame of its own.
-    """
+    """Describe an object of meshes anew, stretched along x, y and z; ValueError: it has others."""
     tree = ElementTree.parse(model.urdf)
     for shape in (*tree.iter("visual"), *tree.iter("collision")):
         mesh = shape.find("geometry/mesh")

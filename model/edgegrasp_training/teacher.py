@@ -28,15 +28,9 @@ class Teacher:
     """A hand network that scores the candidates of views."""
 
     def __init__(self, weights: Path, crop_radius: float) -> None:
-        """Load the teacher.
+        """Load a checkpoint of architecture `hand`; ValueError: it is of another.
 
-        Args:
-            weights: A checkpoint of architecture `hand`.
-            crop_radius: Radius of the balls that candidates are drawn from, metres.
-
-        Raises:
-            InvalidCheckpoint: The weights cannot be read.
-            ValueError: They are of another architecture.
+        Candidates are drawn from balls of `crop_radius` metres.
         """
         self.network, self.metadata = load_checkpoint(weights)
         if self.metadata.network.architecture != "hand":

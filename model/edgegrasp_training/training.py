@@ -64,9 +64,7 @@ class Trainer:
     ) -> None:
         """Set up, and resume from the folder's last state if there is one.
 
-        Raises:
-            InvalidCheckpoint: The weights to start from cannot be read.
-            ValueError: They do not fit, or the network is one of hands, which no teacher can teach.
+        ValueError: the weights to start from do not fit, or no teacher can teach this network.
         """
         if teacher is not None and metadata.network.architecture == "hand":
             raise ValueError(f"teacher: {metadata.name} learns from labels alone. Name none.")

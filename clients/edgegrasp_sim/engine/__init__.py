@@ -26,9 +26,7 @@ ENGINES = ("pybullet", "mujoco")  # the first that is installed is the default
 def choose_engine(asked: str | None = None, protocol: str = "") -> str:
     """The engine asked for, else the protocol's where it is installed, else the first there is.
 
-    Raises:
-        ValueError: there is no such engine.
-        RuntimeError: the engine asked for is not installed, or none is.
+    ValueError: there is no such engine; RuntimeError: it is not installed, or none is.
     """
     for name in filter(None, (asked, protocol)):
         if name not in ENGINES:
@@ -192,13 +190,9 @@ class World(ABC):
         mass: float,
         friction: float,
     ) -> "Body":
-        """Load a body from a URDF file, with its link frame there.
+        """Load a body from a URDF file, with its link frame there; FileNotFoundError, ValueError.
 
         Its mass and friction are those given, its inertia that of its collision shape.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: the engine cannot read it.
         """
 
     @abstractmethod
@@ -210,11 +204,7 @@ class World(ABC):
         """Add an open hand with its centre of mass there; a world may have one."""
 
     def add_arm(self, arm: ArmModel, model: HandModel) -> "Arm":
-        """Add an arm at its home with an open hand on it, in place of a hand.
-
-        Raises:
-            ValueError: this engine has no arms.
-        """
+        """Add an arm at its home with an open hand on it; ValueError: this engine has no arms."""
         raise ValueError(f"engine is {self.name}; an arm takes mujoco")
 
     @abstractmethod

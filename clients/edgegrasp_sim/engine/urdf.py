@@ -36,11 +36,8 @@ class Shape(NamedTuple):
 def read_urdf(path: Path, scale: float) -> Shape:
     """The shape of the first link of a URDF file, `scale` times as large.
 
-    Each object of an OBJ file is one convex part.
-
-    Raises:
-        FileNotFoundError: the file or a mesh is missing.
-        ValueError: it cannot be read, or contains no solid shape.
+    Each object of an OBJ file is one convex part. ValueError: it cannot be read, or contains no
+    solid shape.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no object file at {path}; check the object folder")
@@ -73,10 +70,6 @@ def read_obj(path: Path) -> list[tuple[str, Surface]]:
     """The objects of an OBJ file and their names, each with the points that its triangles use.
 
     In a file without triangles an object has all the points that follow its name.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it cannot be read.
     """
     return _read_obj(path, path.stat().st_mtime_ns)
 

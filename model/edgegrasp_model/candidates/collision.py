@@ -26,22 +26,16 @@ MIN_FIXED = 8  # voxels of background between the fingers that keep them from cl
 TOUCH = 1e-6  # metres between the support plane and a hand that was retracted from it
 
 
-def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
-    """Which open hands collide with cloud, support plane or obstacles, or close on background.
+def collides(
+    scene: Scene,
+    T_cloud_hand: Float32,  # (E, 4, 4), canonical frame
+    gripper: Gripper,  # fingers open to the maximum
+    request: Collision,
+) -> Bools:
+    """Which open hands (E,) collide at the grasp, on the approach or the retreat.
 
-    A hand that enters space which no camera saw counts as colliding too.
-
-    Checked at the grasp, along the straight approach and along the retreat. Each box of the hand is
-    grown by the margin on every side.
-
-    Args:
-        scene: Cloud, support plane and obstacles, canonical frame.
-        T_cloud_hand: (E, 4, 4), canonical frame.
-        gripper: Its boxes, fingers open to the maximum.
-        request: Margin and ways.
-
-    Returns:
-        (E,)
+    With the cloud, the support plane, an obstacle or space that no camera saw, or that close on
+    background. The margin is added on every side of each box of the hand.
     """
     hit = hits(scene, T_cloud_hand, gripper, request)
     free = np.flatnonzero(~hit)
@@ -112,16 +106,9 @@ def hits_obstacles(
 
 
 def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
-    """Distance from each open hand, at the grasp, to the nearest point, support or obstacle.
+    """Metres (E,) from open hands (E, 4, 4) at the grasp to the nearest point, support or obstacle.
 
-    Args:
-        scene: Canonical frame.
-        T_cloud_hand: (E, 4, 4), canonical frame.
-        gripper: Its boxes, fingers open to the maximum.
-
-    Returns:
-        (E,) metres. Negative where something lies inside a box of the hand: minus the greatest
-        depth below the box's surface.
+    Canonical frame. Negative: the greatest depth at which something lies inside a box of the hand.
     """
     boxes = gripper.open_boxes
     nearest = signed_distance_to_boxes(scene.cloud.points, T_cloud_hand, boxes)
@@ -182,15 +169,7 @@ def _hits_any(boxes: SolidBoxes, obstacles: SolidBoxes, sweep: Float64 | None) -
 
 
 def required_openings(met: Float32, gripper: Gripper) -> Float32:
-    """Opening that leaves FINGER_CLEARANCE between each finger and what lies between them.
-
-    Args:
-        met: (E, 2) as `met_first` returns it.
-        gripper: The hand.
-
-    Returns:
-        (E,) metres, at most the gripper's maximum.
-    """
+    """Opening (E,), metres, that leaves FINGER_CLEARANCE on both sides of `met_first`, (E, 2)."""
     widest = 2 * (np.abs(met).max(axis=1) + np.float32(FINGER_CLEARANCE))
     width: Float32 = np.minimum(widest, np.float32(gripper.max_opening))
     return width

@@ -23,24 +23,13 @@ BESIDE_PADS = 0.004  # metres beside the finger pads in which points count
 
 
 def sample_approach_points(
-    points: Float32,
+    points: Float32,  # (N, 3)
     count: int,
-    method: Literal["farthest", "uniform"],
+    method: Literal["farthest", "uniform"],  # `farthest` spreads them from a random start
     rng: np.random.Generator,
-    before: Sequence[int] | Int64 = (),
+    before: Sequence[int] | Int64 = (),  # (B,) rows chosen earlier, which are excluded
 ) -> Int64:
-    """Choose `count` different points, or all of them if there are fewer.
-
-    Args:
-        points: (N, 3).
-        count: How many to choose.
-        method: `farthest` spreads them over the cloud from a random start; `uniform` takes any.
-        rng: Source of the random choice.
-        before: (B,) rows chosen earlier, which are excluded.
-
-    Returns:
-        (min(count, N - B),) rows of `points`.
-    """
+    """Choose `count` different rows of the points, or all of them if there are fewer."""
     count = min(count, len(points) - len(before))
     if method == "uniform":
         left = np.delete(np.arange(len(points)), before)
@@ -72,21 +61,11 @@ class BallCrop(NamedTuple):
 
 
 def crop_balls(
-    points: Float32,  # (N, 3)
-    approach_index: NDArray[np.integer],  # (A,)
-    radius: float,
+    points: Float32,  # (N, 3) metres
+    approach_index: NDArray[np.integer],  # (A,) rows of `points`; one ball each
+    radius: float,  # metres
 ) -> BallCrop:
-    """Crops a ball around each approach point.
-
-    A cloud point within two balls counts twice, once for each.
-
-    Args:
-        points: The cloud (N, 3), metres, any frame.
-        approach_index: Rows (A,) of `points`; one ball each, in this order.
-        radius: Ball radius, metres.
-
-    Source: paper section (the ball of radius G_w / 2).
-    """
+    """Crop a ball (paper: of radius G_w / 2) around each approach point; balls may overlap."""
     approach_index = np.asarray(approach_index, dtype=np.int64)
     members = cKDTree(points).query_ball_point(points[approach_index], radius, return_sorted=True)
     ball_of_point = np.repeat(np.arange(len(members)), [len(rows) for rows in members])
@@ -138,20 +117,11 @@ class Candidates:
 def edge_grasps(
     cloud: Cloud, approach_index: Int64, contact_index: Int64, gripper: Gripper
 ) -> Candidates:
-    """The candidates among pairs of approach and contact points.
+    """The pairs of approach and contact points that define an edge grasp which fits the gripper.
 
     r = p_c - p_a; its part orthogonal to n_c points from the hand to the object (paper section
-    III-A). The hand is placed so that the contact lies at the gripper's contact_z and the approach
-    point on the hand's axis.
-
-    Args:
-        cloud: The cloud with its normals.
-        approach_index: (M,) rows of the cloud.
-        contact_index: (M,) rows of the cloud.
-        gripper: Gives the opening, the fingers' depth and where the contact lies in the hand.
-
-    Returns:
-        The pairs that define an edge grasp within the gripper's opening and depth.
+    III-A). The contact lies at the gripper's contact_z and the approach point on the hand's axis.
+    The pairs are rows (M,) of the cloud.
     """
     edge = measure_edges(cloud, approach_index, contact_index)
     pair = np.flatnonzero(
@@ -188,21 +158,13 @@ def measure_edges(cloud: Cloud, approach_index: Int64, contact_index: Int64) -> 
 
 
 def edge_grasp_poses(
-    approach_point: Float32, ahead: Float32, normal: Float32, depth: Float32, contact_z: Float32
+    approach_point: Float32,  # (E, 3) p_a
+    ahead: Float32,  # (E, 3) r_perp, the part of p_c - p_a orthogonal to n_c
+    normal: Float32,  # (E, 3) unit n_c
+    depth: Float32,  # (E,) d = |r_perp|
+    contact_z: Float32,  # (E,) where the contact lies along the hand's z
 ) -> Float32:
-    """Hand poses of edge grasps.
-
-    Args:
-        approach_point: (E, 3) p_a.
-        ahead: (E, 3) r_perp, the part of p_c - p_a orthogonal to n_c.
-        normal: (E, 3) unit n_c.
-        depth: (E,) |r_perp|.
-        contact_z: (E,) where the contact lies along the hand's z.
-
-    Returns:
-        (E, 4, 4) T_cloud_hand: z = r_perp / d, y = n_c, x = y x z; the contact point lies at
-        z = contact_z.
-    """
+    """T_cloud_hand (E, 4, 4) of edge grasps: z = r_perp / d, y = n_c, x = y x z."""
     z = ahead / depth[:, None]
     y = normal - np.einsum("ed,ed->e", normal, z)[:, None] * z
     y = y / np.linalg.norm(y, axis=1, keepdims=True)
@@ -221,17 +183,8 @@ def retract(
     """Move hands that cut into the support plane back along their approach, if that frees them.
 
     The contact may move from contact_z to at most TIP_MARGIN inside the fingertips, so flat objects
-    on a table are held by the tips.
-
-    Args:
-        candidates: E of them.
-        support: The plane.
-        gripper: Its boxes.
-        margin: Metres that the hand stays above the plane.
-
-    Returns:
-        The candidates, and a mask (E,) of those whose hand is above the plane now; the other hands
-        are unchanged.
+    on a table are held by the tips. Returns the candidates, and a mask (E,) of those whose hand is
+    `margin` metres above the plane now; the other hands are unchanged.
     """
     clearance = support_clearance(candidates.T_cloud_hand, support, gripper) - margin
     rise = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
@@ -244,17 +197,9 @@ def retract(
 
 
 def support_clearance(T_cloud_hand: Float32, support: SupportPlane, gripper: Gripper) -> Float32:
-    """Height of the lowest corner of each hand, fingers open, over the support plane.
+    """Height (E,), metres, of the lowest corner of each open hand (E, 4, 4) over the support plane.
 
     Fingers on a linkage are taken at their most forward position while closing.
-
-    Args:
-        T_cloud_hand: (E, 4, 4).
-        support: The plane.
-        gripper: Its boxes.
-
-    Returns:
-        (E,) metres; negative below the plane.
     """
     boxes = gripper.boxes(gripper.max_opening, gripper.max_tip_z - gripper.tip_z)
     middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2  # (B, 3) each
@@ -271,22 +216,16 @@ MIN_SHIFT, MAX_SHIFT = 0.001, 0.008  # metres; for larger shifts another approac
 
 
 def centred_grasps(
-    points: Float32, crop: BallCrop, candidates: Candidates, gripper: Gripper
+    points: Float32,  # (N, 3) the cloud
+    crop: BallCrop,
+    candidates: Candidates,  # E; `pair` is their contact's row in `crop`
+    gripper: Gripper,
 ) -> Candidates:
     """Extra candidates for wide objects: hands shifted along their closing direction.
 
     The hand of an edge grasp is centred on its approach point, and few sampled points lie in the
-    middle of an object almost as wide as the hand opens. Its extent is taken from the points of
-    the ball between the fingers; whether the hand fits is left to the collision check.
-
-    Args:
-        points: (N, 3) the cloud.
-        crop: Balls around the approach points.
-        candidates: E of them; `pair` is their contact's row in `crop`.
-        gripper: Gives the opening and the pads.
-
-    Returns:
-        One for each candidate with a wide object off centre between its fingers.
+    middle of an object almost as wide as the hand opens. Its extent is taken from the points of the
+    ball between the fingers; whether the hand fits is left to the collision check.
     """
     axes, origin = candidates.T_cloud_hand[:, :3, :3], candidates.T_cloud_hand[:, :3, 3]
     outward = np.einsum("ed,ed->e", points[candidates.contact_index] - origin, axes[:, :, 1])

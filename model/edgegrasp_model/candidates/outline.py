@@ -47,16 +47,13 @@ class Outline:
 
 
 def outlines(
-    points: Float32, viewpoints: Float32 | None, rows: Int64, *, leaning: bool = False
+    points: Float32,  # (N, 3) canonical frame, metres
+    viewpoints: Float32 | None,  # (W, 3); None where they are unknown
+    rows: Int64,  # (M,) of the points to look at
+    *,
+    leaning: bool = False,  # also from all around, LEAN off above
 ) -> list[Outline]:
-    """The outlines of a cloud from above and, if that is another direction, from each camera.
-
-    Args:
-        points: (N, 3) canonical frame, metres.
-        viewpoints: (W, 3) the cameras; None where they are unknown.
-        rows: (M,) of the points to look at.
-        leaning: Also from all around, LEAN off above.
-    """
+    """The outlines of a cloud from above and, if that is another direction, from each camera."""
     toward = [np.broadcast_to(UP, points.shape)]
     toward += [unit(eye - points) for eye in ([] if viewpoints is None else viewpoints)]
     if leaning:
@@ -79,33 +76,20 @@ def outlines(
 
 
 def outline_grasps(
-    points: Float32,
-    crop: BallCrop,
-    approach_index: Int64,
-    pair: Int64,
-    outline: Outline,
-    support: SupportPlane | None,
+    points: Float32,  # (N, 3) the cloud
+    crop: BallCrop,  # balls around the approach points
+    approach_index: Int64,  # (A,) rows of the approach points
+    pair: Int64,  # (M,) rows of `crop`: the contact points that are allowed
+    outline: Outline,  # of the same cloud
+    support: SupportPlane | None,  # plane that the hand stays above
     gripper: Gripper,
-    margin: float = 0.0,
+    margin: float = 0.0,  # metres kept free around the hand
 ) -> Candidates:
-    """Hands that approach from the outline's viewpoint and close across it.
+    """Hands that approach from the outline's viewpoint and close across it; at most one a contact.
 
     The contact point lies on the outline, the hand in the middle between it and the opposite edge
-    of the same surface, and the approach point between the fingers. The hand moves in until
+    of the same surface, and the approach point nearest to the hand's axis. The hand moves in until
     something is right ahead of it, at most MAX_INSERTION deeper than an edge grasp.
-
-    Args:
-        points: (N, 3) the cloud.
-        crop: Balls around the approach points.
-        approach_index: (A,) rows of the approach points.
-        pair: (M,) rows of `crop`: the contact points that are allowed.
-        outline: Of the same cloud.
-        support: Plane that the hand stays above, where it is known.
-        gripper: Its boxes, open to the maximum.
-        margin: Metres kept free around the hand.
-
-    Returns:
-        At most one for each contact point, with the approach point nearest to the hand's axis.
     """
     y, z = outline.heading, -outline.toward
     frame = np.stack([points, np.cross(y, z), y, z], axis=1)  # (N, 4, 3)

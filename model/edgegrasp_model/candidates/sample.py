@@ -87,24 +87,15 @@ class Sampler:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene,  # with at least one point in the approach region
         options: DetectOptions,
         gripper: Gripper,
-        crop_radius: float,
-        counts: dict[str, int],
+        crop_radius: float,  # of the balls, metres
+        counts: dict[str, int],  # gets the candidates left after each constraint, over all rounds
+        # add centred hands: for networks whose input depends on the hand's position
         centre: bool = False,
     ) -> None:
-        """Share the approach points among the objects.
-
-        Args:
-            scene: With at least one point in the approach region.
-            options: Sampling, constraints and seed.
-            gripper: What has to fit.
-            crop_radius: Radius of the balls, metres.
-            counts: Gets the number of candidates left after each constraint, over all rounds.
-            centre: Whether to add centred hands: for networks whose input depends on the hand's
-                position.
-        """
+        """Share the approach points among the objects."""
         self.scene, self.options, self.gripper = scene, options, gripper
         self.crop_radius, self.counts, self.centre = crop_radius, counts, centre
         self._rng_approach = np.random.default_rng([options.seed, APPROACH_STREAM])
@@ -115,15 +106,16 @@ class Sampler:
         self._first = (self._wanted + 1) // 2 if half else self._wanted
         self._used, self._round = self._rows[:0], 0
 
-    def sample(self, done: Int64 = NOTHING, *, leaning: bool = False) -> Sample | None:
+    def sample(
+        self,
+        done: Int64 = NOTHING,  # (D,) numbers of objects that need no more
+        *,
+        leaning: bool = False,  # try tilted hands too
+    ) -> Sample | None:
         """Candidates around further approach points; None if there is no point to add.
 
         Half of the points in the first round, all if their number is given; in the second as many
         as are left; in each further one as many as an object gets in the first two together.
-
-        Args:
-            done: (D,) numbers of objects that need no more.
-            leaning: Whether tilted hands are tried too.
         """
         open_ = np.where(np.isin(self._objects, done), 0, self._wanted)
         left = (self._wanted - self._first).sum()
@@ -190,16 +182,7 @@ def _checked(
 
 
 def share_approach_points(scene: Scene, rows: Int64, options: DetectOptions) -> tuple[Int64, Int64]:
-    """How many approach points each object gets: a minimum, and more for large objects.
-
-    Args:
-        scene: Its cloud, and the object of each point.
-        rows: (R,) points that may be chosen.
-        options: The total number.
-
-    Returns:
-        The numbers (O,) of the objects, and approach points (O,) of each.
-    """
+    """Numbers (O,) of the objects of rows (R,), and how many approach points (O,) each gets."""
     objects, size = np.unique(scene.object_of_point[rows], return_counts=True)
     most = options.num_approach_points
     if most is None and len(objects) <= MAX_APPROACH_POINTS:
@@ -300,22 +283,13 @@ def add_count(counts: dict[str, int], name: str, number: int) -> None:
 
 
 def allowed_directions(
-    direction: Floats,
+    direction: Floats,  # (E, 3) unit, the hands' +z
     constraint: ApproachDirection | None,
-    up: ArrayLike,
+    up: ArrayLike,  # (3,) unit, in the frame of `direction`
+    # maps the constraint's directions to the frame of `direction`
     in_frame: Callable[[ArrayLike], Floats] = np.asarray,
 ) -> Bools:
-    """Which directions the hand may move in.
-
-    Args:
-        direction: (E, 3) unit, the directions in which hands move; their +z.
-        constraint: What was asked for.
-        up: (3,) unit, in the frame of `direction`.
-        in_frame: Maps the constraint's directions to the frame of `direction`.
-
-    Returns:
-        (E,)
-    """
+    """Which directions (E,) the hand may move in."""
     rise = direction @ np.asarray(up)
     if constraint is None:
         return np.asarray(-rise > MIN_APPROACH_UP)

@@ -53,12 +53,7 @@ def save_checkpoint(path: Path, network: nn.Module, metadata: CheckpointMetadata
 def load_checkpoint(
     path: Path, device: torch.device | str = "cpu"
 ) -> tuple[nn.Module, CheckpointMetadata]:
-    """Loads a checkpoint; the network is in evaluation mode.
-
-    Raises:
-        InvalidCheckpoint: The file is missing, truncated, damaged or foreign, a weight is not
-            finite, or the weights do not fit the network that its metadata describes.
-    """
+    """Load a checkpoint, the network in evaluation mode; InvalidCheckpoint: it cannot be used."""
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
             text = (file.metadata() or {}).get(_METADATA_KEY)

@@ -21,9 +21,6 @@ class NetworkConfig:
 
     Widths count channels; in `vn-edgegrasp` a channel is a 3-vector. The paper's networks read
     balls of points, `hand` the points around the fingers of each hand.
-
-    Raises:
-        ValueError: A field is out of range, missing or unknown.
     """
 
     architecture: Architecture
@@ -100,9 +97,6 @@ class CheckpointMetadata:
 
     `save_checkpoint` fills in `tensors_digest` and `reference_logits`, which `load_checkpoint`
     checks; it fills in the file's `digest`. Digests are SHA-256, in hex.
-
-    Raises:
-        ValueError: A field is out of range, missing or unknown.
     """
 
     name: str  # the model's name, such as `edgegrasp-plus`

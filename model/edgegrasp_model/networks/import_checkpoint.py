@@ -69,16 +69,11 @@ def import_checkpoint(
     crop_radius: float = 0.05,
     gripper: str = "panda",
 ) -> tuple[nn.Module, CheckpointMetadata]:
-    """Reads a checkpoint in the authors' layout; with a `std` file it is a VN network.
+    """Read a checkpoint in the authors' layout; with a `std` file it is a VN network.
 
     The folder holds the files of one checkpoint number N. Voxel size and crop radius, metres, are
-    by default those of the authors' evaluation.
-
-    Returns:
-        The network in evaluation mode and its metadata, ready for `save_checkpoint`.
-
-    Raises:
-        InvalidCheckpoint: A file is missing, is more than tensors, or does not fit the network.
+    by default those of the authors' evaluation. Returns what `save_checkpoint` takes;
+    InvalidCheckpoint: a file is missing, is more than tensors, or does not fit.
     """
     number = _checkpoint_number(directory)
     is_vn = (directory / f"std-ckpt-{number}.pt").exists()

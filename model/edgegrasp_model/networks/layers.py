@@ -32,13 +32,7 @@ class SharedProduct:
     """
 
     def __init__(self, weight: Tensor, bias: Tensor | None, shared: Tensor) -> None:
-        """Multiplies the shared parts (B, ..., C2).
-
-        Args:
-            weight: (outputs, C1 + C2).
-            bias: (outputs,), or none.
-            shared: The shared parts.
-        """
+        """Multiply the shared parts (B, ..., C2) by their part of the weight (outputs, C1 + C2)."""
         widths = [weight.shape[1] - shared.shape[-1], shared.shape[-1]]
         own_weight, shared_weight = torch.split(weight, widths, dim=1)
         self._own = PackedLinear(own_weight, bias)
@@ -88,13 +82,7 @@ class PackedLinear:
     def __init__(
         self, weight: Tensor, bias: Tensor | None = None, *, rectified: bool = False
     ) -> None:
-        """Prepare the weights.
-
-        Args:
-            weight: (outputs, C), any part of a matrix.
-            bias: (outputs,), or none.
-            rectified: Whether a ReLU follows.
-        """
+        """Prepare a weight (outputs, C), any part of a matrix; `rectified`: a ReLU follows."""
         self._weight, self._bias, self._rectified = weight, bias, rectified
         self._packed = _packed(weight)
 

@@ -58,15 +58,9 @@ class CheckedCloud:
 
 
 def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
-    """Check a caller's cloud, and drop the holes of an organised one.
+    """Check a caller's CloudInput or array of points, and drop the holes of an organised one.
 
-    Args:
-        cloud: A CloudInput, or an array of points alone.
-        num_approach_points: How many approach points the caller wants.
-
-    Raises:
-        InvalidRequest: An array is of the wrong type, dtype or shape, or has an invalid value;
-            names `cloud`, `normals`, `colors`, `segment_ids` or `view_ids`.
+    Raises InvalidRequest, which names `cloud`, `normals`, `colors`, `segment_ids` or `view_ids`.
     """
     sent = cloud if isinstance(cloud, CloudInput) else CloudInput(cloud)
     points = sent.points
@@ -164,11 +158,7 @@ class Cloud:
 def _valid_points(
     cloud: object,
 ) -> tuple[Floats, Floats, Floats]:
-    """A caller's array (N, 3) float32 or float64, metres, and its low and high corner (3,).
-
-    Raises:
-        InvalidRequest: Wrong type, dtype or shape, no points, NaN or infinity.
-    """
+    """A caller's array (N, 3), metres, and its low and high corner (3,)."""
     if not isinstance(cloud, np.ndarray):
         kind = type(cloud).__name__
         raise InvalidRequest("cloud", f"a {kind}", "Send an array of shape (N, 3) in metres.")
@@ -192,11 +182,7 @@ def _valid_points(
 
 
 def _near_points(points: Floats) -> Int64:
-    """Indices of the points (N, 3) without stray readings far away.
-
-    Raises:
-        InvalidRequest: Most of the cloud has an extent that suggests millimetres.
-    """
+    """Rows of the points (N, 3) without stray readings far away."""
     distance = np.abs(points.astype(np.float64) - np.median(points, axis=0)).max(axis=1)
     bulk = 2 * float(np.median(distance))
     if bulk > MAX_EXTENT:
@@ -317,15 +303,14 @@ class CanonicalFrame:
     T_canonical_cloud: Float64  # (4, 4)
 
     @classmethod
-    def of_scene(cls, points: Float32, up: ArrayLike, viewpoint: ArrayLike | None) -> Self:
-        """The frame of a scene; it rotates and moves with the scene.
-
-        Args:
-            points: (N, 3) metres; without any, the origin stays.
-            up: (3,) of any length but zero.
-            viewpoint: (3,) the camera. If unknown or straight above, x points to the farthest point
-                instead.
-        """
+    def of_scene(
+        cls,
+        points: Float32,  # (N, 3) metres; without any, the origin stays
+        up: ArrayLike,  # (3,) of any length but zero
+        # (3,); if unknown or straight above, x points to the farthest point
+        viewpoint: ArrayLike | None,
+    ) -> Self:
+        """The frame of a scene; it rotates and moves with the scene."""
         points = points if len(points) else np.zeros((1, 3), dtype=np.float32)
         origin = points.mean(axis=0, dtype=np.float64)
         z = np.asarray(up, dtype=np.float64)

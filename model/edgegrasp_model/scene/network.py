@@ -104,17 +104,12 @@ def _layer(
     )
 
 
-def scene_features(points: Float32, up: Float64 | None, footprint: float) -> Float32:
-    """The network's input for a range image.
-
-    Args:
-        points: (H, W, 3) camera frame, metres; NaN without a reading.
-        up: (3,) unit, away from gravity, camera frame; None where it is unknown.
-        footprint: Width of a pixel at a depth of one metre, metres.
-
-    Returns:
-        (CHANNELS, H, W); zero where there is no reading.
-    """
+def scene_features(
+    points: Float32,  # (H, W, 3) camera frame, metres; NaN without a reading
+    up: Float64 | None,  # (3,) unit, away from gravity, camera frame; None: unknown
+    footprint: float,  # width of a pixel at a depth of one metre, metres
+) -> Float32:
+    """The network's input (CHANNELS, H, W) for a range image; zero where there is no reading."""
     known = np.zeros(3) if up is None else np.asarray(up, dtype=np.float64)
     features = np.zeros((CHANNELS, *points.shape[:2]), dtype=np.float32)
     _fill_features(

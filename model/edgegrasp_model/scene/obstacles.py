@@ -76,18 +76,10 @@ def box_pose(box: Box | OrientedBox) -> tuple[Float64, Float64]:
 
 
 def separation(ours: SolidBoxes, theirs: SolidBoxes, sweep: Float64 | None = None) -> Float64:
-    """Widest gap between boxes along any separating axis; its sign is exact.
+    """Widest gap (M,) between boxes along any separating axis, row by row, metres.
 
     Negative: they overlap, by the distance they would have to move apart. Positive: a lower bound
-    of their distance.
-
-    Args:
-        ours: M boxes.
-        theirs: M boxes, compared row by row.
-        sweep: (M, 3) motion over which ours are swept; None: at rest.
-
-    Returns:
-        (M,) metres.
+    of their distance. `sweep` (M, 3) is the motion over which ours are swept.
     """
     edges = ours.half  # (M, 3 or 4, 3) generators: a swept box is a sum of four segments
     center = ours.center
@@ -109,15 +101,7 @@ def separation(ours: SolidBoxes, theirs: SolidBoxes, sweep: Float64 | None = Non
 
 
 def signed_distance(ours: SolidBoxes, theirs: SolidBoxes) -> Float64:
-    """Distance between boxes; if they overlap, minus the distance they would have to move apart.
-
-    Args:
-        ours: M boxes.
-        theirs: M boxes, compared row by row.
-
-    Returns:
-        (M,) metres.
-    """
+    """Metres (M,) between boxes, row by row; negative: what they would have to move apart."""
     distance = separation(ours, theirs)
     apart = np.flatnonzero(distance > 0)
     for start in range(0, len(apart), CHUNK):

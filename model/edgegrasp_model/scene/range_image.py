@@ -27,17 +27,13 @@ class RangeImage(NamedTuple):
 
 
 def range_image(
-    points: Float32, viewpoint: Float64, up: Float64 | None, down: Float64 | None = None
+    points: Float32,  # (N, 3) cloud frame, metres; at least one
+    viewpoint: Float64,  # (3,) of the camera
+    up: Float64 | None,  # (3,) away from gravity, drawn upward; None: unknown
+    # (3,) downward in the image if `up` is unknown or along the sight; None: by the usual frames
+    down: Float64 | None = None,
 ) -> RangeImage:
-    """Render points as seen from a viewpoint.
-
-    Args:
-        points: (N, 3) cloud frame, metres; at least one.
-        viewpoint: (3,) of the camera.
-        up: (3,) away from gravity, which is drawn upward in the image; None: unknown.
-        down: (3,) downward in the image if `up` is unknown or along the sight; None: by the usual
-            frames.
-    """
+    """Render points as seen from a viewpoint."""
     downward = [way for way in (None if up is None else -up, down) if way is not None]
     apart = points[thinned(len(points))].astype(np.float64) - viewpoint
     sight = unit(apart)

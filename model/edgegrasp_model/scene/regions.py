@@ -37,16 +37,7 @@ def check_regions(cloud: CheckedCloud, options: DetectOptions) -> None:
 
 
 def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
-    """Check that the rows of a region exist.
-
-    Args:
-        region: A region, whose shapes may name rows.
-        cloud: The cloud as sent.
-        field: Name of the region in the request, for the error.
-
-    Raises:
-        InvalidRequest: An index or a mask does not suit the cloud, or it came without segments.
-    """
+    """Check that the rows and segments of a region exist; InvalidRequest names its `field`."""
     for part in ("include", "exclude"):
         for place, shape in enumerate(getattr(region, part)):
             here, rows = f"options.{field}.{part}.{place}", cloud.rows_sent
@@ -79,11 +70,8 @@ def chosen_objects(
 ) -> Int64:
     """The object (N,) of each point if the request names that object; FIXED otherwise.
 
-    Args:
-        number: (N,) the object of each point; negative: none.
-        cloud: N points.
-        options: objects, at and near.
-        warnings: Gets objects that are named but not there.
+    `number` (N,) is the object of each point, negative: none. `warnings` gets objects that are
+    named but not there.
     """
     found = np.flatnonzero(np.bincount(number[number >= 0]))
     wanted, choice = found, options.objects
@@ -118,18 +106,13 @@ def has_rows(region: Region | None) -> bool:
     return region is not None and any(isinstance(shape, Rows) for shape in region.include)
 
 
-def inside_region(region: Region, points: Float32, voxels: Voxels, cloud: CheckedCloud) -> Bools:
-    """Which voxels of the processed cloud a region holds.
-
-    Args:
-        region: Unions of shapes.
-        points: (V, 3) the voxels' mean points, cloud frame.
-        voxels: Which of the cloud's points are in each.
-        cloud: The points in `voxels`, of the cloud as sent.
-
-    Returns:
-        (V,)
-    """
+def inside_region(
+    region: Region,
+    points: Float32,  # (V, 3) the voxels' mean points, cloud frame
+    voxels: Voxels,
+    cloud: CheckedCloud,  # the points in `voxels`, of the cloud as sent
+) -> Bools:
+    """Which voxels (V,) of the processed cloud a region holds."""
 
     def in_any(shapes: tuple[Shape, ...]) -> Bools:
         found = np.zeros(len(points), dtype=bool)

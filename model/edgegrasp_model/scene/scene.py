@@ -112,12 +112,7 @@ def select_points(
     counts: dict[str, int],
     warnings: list[str],
 ) -> SelectedPoints:
-    """Correct depths, segment, remove the support, and drop what no hand at an object can reach.
-
-    Raises:
-        InvalidRequest: A region names rows or segments that the cloud does not have, the view ids
-            do not match the viewpoints, or the viewpoint needed to correct depths is missing.
-    """
+    """Correct depths, segment, remove the support, and drop what no hand at an object can reach."""
     viewpoints = camera_positions(sent, options)
     check_regions(sent, options)
     counts["points"] = len(sent.points)
@@ -190,23 +185,14 @@ def _heights(seen: Seen, support: Support | None) -> tuple[Float32, Float32]:
 
 
 def _recognised(
-    shown: Segmentation,
+    shown: Segmentation,  # of N points
     support: Support | None,
-    above: Int64,
-    plan: Float64,
-    height: Float32,
-    margin: Float32,
+    above: Int64,  # (M,) which of them rise above the support
+    plan: Float64,  # (M, 2) places along it, metres
+    height: Float32,  # (N,) metres over it
+    margin: Float32,  # (N,) metres over it that belong to it
 ) -> tuple[Int64, dict[int, float]]:
-    """The object (M,) of each point above the support, and the confidence of each object.
-
-    Args:
-        shown: The segmentation of N points.
-        support: The plane.
-        above: (M,) which of them rise above it.
-        plan: (M, 2) places along it, metres.
-        height: (N,) metres over it.
-        margin: (N,) metres over it that belong to it.
-    """
+    """The object (M,) of each point above the support, and the confidence of each object."""
     number, confidence = shown.number[above], dict(enumerate(shown.confidence.tolist()))
     if support is not None:
         likely = (shown.object + shown.support)[above] > LIKELY
@@ -253,26 +239,15 @@ def _down_in_image(sent: CheckedCloud, viewpoints: Float64 | None) -> Float64 | 
 
 
 def build_scene(
-    selected: SelectedPoints,
+    selected: SelectedPoints,  # M points
     options: DetectOptions,
-    voxel_size: float,
-    counts: dict[str, int],
-    max_voxels: int = MAX_VOXELS,
+    voxel_size: float,  # metres
+    counts: dict[str, int],  # gets the number of points left after each step
+    max_voxels: int = MAX_VOXELS,  # most that the cloud may have where grasps are searched
 ) -> Scene | None:
     """Voxelise the selected points, remove outliers, estimate normals, and find the regions.
 
-    Args:
-        selected: M points.
-        options: workspace, regions and obstacles.
-        voxel_size: Metres.
-        counts: Gets the number of points left after each step.
-        max_voxels: Most voxels that the cloud may have where grasps are searched.
-
-    Returns:
-        The scene, or None if too few points are left to make a surface.
-
-    Raises:
-        InvalidRequest: The cloud has too many voxels.
+    None if too few points are left to make a surface; InvalidRequest: there are too many voxels.
     """
     sent, support, viewpoints = selected.sent, selected.support, selected.viewpoints
     obstacles = options.collision.obstacles
@@ -323,21 +298,13 @@ def _point_of_row(sent: CheckedCloud, voxels: Voxels, kept: Bools) -> Int64:
 
 
 def _clean_cloud(
-    sent: CheckedCloud,
-    middles: Float32,
+    sent: CheckedCloud,  # M points
+    middles: Float32,  # (V, 3) the voxels' mean points, canonical frame, metres
     voxels: Voxels,
     frame: CanonicalFrame,
-    viewpoints: Float64 | None,
+    viewpoints: Float64 | None,  # (W, 3) cloud frame
 ) -> tuple[Cloud | None, Bools]:
-    """The voxels without outliers, and a mask (V,) of them; no cloud if too few are left.
-
-    Args:
-        sent: M points.
-        middles: (V, 3) the voxels' mean points, canonical frame, metres.
-        voxels: V of them.
-        frame: The canonical frame.
-        viewpoints: (W, 3) cloud frame.
-    """
+    """The voxels without outliers, and a mask (V,) of them; no cloud if too few are left."""
     near = Neighbors.within(middles)
     kept = statistical_outlier_removal(near)
     if kept.sum() < MIN_POINTS:
@@ -407,13 +374,8 @@ def near_workspace_side(
 ) -> Bools:
     """Which points (V, 3) lie at a side of the workspace beyond which nothing was seen.
 
-    An object there may be cut off and wider than it looks. Floor and ceiling do not count.
-
-    Args:
-        points: Cloud frame, metres.
-        workspace: In the same frame.
-        up: (3,) away from gravity, of any length.
-        seen: (N, 3) the points of the cloud, some of which may lie outside of the workspace.
+    An object there may be cut off and wider than it looks. Floor and ceiling do not count. `seen`
+    (N, 3) are the points of the cloud, some of which may lie outside of the workspace.
     """
     if workspace is None:
         return np.zeros(len(points), dtype=bool)

@@ -84,19 +84,13 @@ class Recogniser(NamedTuple):
 
 
 def segment(
-    points: Float32,
+    points: Float32,  # (N, 3) cloud frame, metres
+    # of each camera: position (3,), rows (M,) of its points; None: all
     views: list[tuple[Float64, Int64 | None]],
-    up: Float64 | None,
-    down: Float64 | None = None,
+    up: Float64 | None,  # (3,) unit, away from gravity; None: unknown
+    down: Float64 | None = None,  # (3,) unit, downward in the image, used if `up` is unknown
 ) -> Segmentation:
-    """Segment points view by view; an object seen in several views gets one number.
-
-    Args:
-        points: (N, 3) cloud frame, metres.
-        views: For each camera its position (3,) and the rows (M,) of the points it saw; None: all.
-        up: (3,) unit, away from gravity; None: unknown.
-        down: (3,) unit, downward in the image, used if `up` is unknown; None: unknown.
-    """
+    """Segment points view by view; an object seen in several views gets one number."""
     number, seen_up = np.full(len(points), UNKNOWN), np.zeros(3)
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
     confidence = np.empty(0)
@@ -136,16 +130,12 @@ def _segment_view(
 
 
 def look(
-    network: SceneNet, points: Float32, up: Float64 | None, footprint: float
+    network: SceneNet,  # in evaluation mode
+    points: Float32,  # (H, W, 3) camera frame, metres; NaN where nothing was seen
+    up: Float64 | None,  # (3,) unit; None: unknown
+    footprint: float,  # width of a pixel at a depth of one metre, metres
 ) -> tuple[Pixels, Float64]:
-    """A network's output for a range image, and its estimate of up (3,); camera frame.
-
-    Args:
-        network: In evaluation mode.
-        points: (H, W, 3) camera frame, metres; NaN where nothing was seen.
-        up: (3,) unit; None: unknown.
-        footprint: Width of a pixel at a depth of one metre, metres.
-    """
+    """A network's output for a range image, and its estimate of up (3,); camera frame."""
     features = scene_features(points, up, footprint)
     with torch.inference_mode(), _one_thread():
         batch = torch.from_numpy(features)[None].contiguous(memory_format=torch.channels_last)
@@ -201,17 +191,16 @@ def group(pixels: Pixels) -> Int64:
 
 
 @compiled()
-def _join(pairs: Int64, component: Int64, centre: Float64, large: int, apart: float) -> None:
-    """Join pairs (P, 2) of pixels in order, but not two large parts with different centres.
+def _join(
+    pairs: Int64,  # (P, 2) the most probable first
+    component: Int64,  # (N,) overwritten with the part of each pixel
+    centre: Float64,  # (N, 3) metres, the vote of each pixel; overwritten by sums
+    large: int,  # pixels of a large part
+    apart: float,  # metres between centres
+) -> None:
+    """Join pairs of pixels in order, but not two large parts with different centres.
 
     So one weak link cannot join two objects (Kruskal's algorithm with that exception).
-
-    Args:
-        pairs: Sorted, the most probable pairs first.
-        component: (N,) overwritten with the part of each pixel.
-        centre: (N, 3) metres, the vote of each pixel; overwritten by sums.
-        large: Pixels of a large part.
-        apart: Metres between centres.
     """
     count = np.ones(len(component), dtype=np.int64)
     for p in range(len(pairs)):
@@ -244,15 +233,10 @@ def _join(pairs: Int64, component: Int64, centre: Float64, large: int, apart: fl
 
 
 def instance_traits(number: Int64, pixels: Pixels) -> Float64:
-    """Features that tell objects from background that the network classified as object.
+    """Features (O, 3) that tell objects from background that the network classified as object.
 
-    Args:
-        number: (H, W) as from `group`, of O objects.
-        pixels: The same.
-
-    Returns:
-        (O, 3) 1, the mean probability of an object, and the share of the border across which the
-        surface continues smoothly into background.
+    1, the mean probability of an object, and the share of the border across which the surface
+    continues smoothly into background. `number` (H, W) is as from `group`, of O objects.
     """
     points, normals, classes, _, _, footprint = pixels
     count = int(number.max(initial=-1)) + 1
@@ -295,18 +279,15 @@ def joined(points: Float32, number: Int64, count: int) -> Int64:
 
 
 def with_risen(
-    number: Int64, plan: Float64, height: Float32, margin: Float32, likely: Bools
+    number: Int64,
+    plan: Float64,  # (N, 2) metres along the support
+    height: Float32,  # (N,) metres over it
+    margin: Float32,  # (N,) metres over it that belong to it
+    likely: Bools,  # (N,) whether they show an object or a support, not background
 ) -> Int64:
     """The numbers (N,), with points that rise above the support added to the object beside them.
 
     The network misses thin parts such as handles and edges.
-
-    Args:
-        number: (N,) as from `segment`.
-        plan: (N, 2) metres along the support.
-        height: (N,) metres over it.
-        margin: (N,) metres over it that belong to it.
-        likely: (N,) whether they show an object or a support rather than background.
     """
     rows = np.flatnonzero((number < 0) & (height > margin + STANDS_OUT) & likely)
     held = np.flatnonzero((number >= 0) & (height > margin))
@@ -324,11 +305,7 @@ def with_clusters(number: Int64, plan: Float64) -> Int64:
     """The numbers (N,), with clusters of points outside of recognised objects as further objects.
 
     For clouds whose support was cut off, in which the network sees objects without what they stand
-    on.
-
-    Args:
-        number: (N,) as from `segment`.
-        plan: (N, 2) metres along the support.
+    on. `plan` (N, 2) are metres along the support.
     """
     rows = np.flatnonzero(number < 0)
     if len(rows) == 0:

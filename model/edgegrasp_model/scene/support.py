@@ -97,23 +97,14 @@ class Seen(NamedTuple):
 
 
 def choose_support(
-    seen: Seen,
-    inside: Bools,
-    shown: Segmentation | None,
-    objects: Bools,
+    seen: Seen,  # N points
+    inside: Bools,  # (N,) which of them lie in the workspace
+    shown: Segmentation | None,  # the network's output, where it was asked
+    objects: Bools,  # (N,) which of them are of an object
     options: DetectOptions,
-    warnings: list[str],
+    warnings: list[str],  # gets what is wrong with it, or that there is none
 ) -> Support | None:
-    """The support plane of a request.
-
-    Args:
-        seen: N points.
-        inside: (N,) which of them lie in the workspace.
-        shown: What the network says of them, where it was asked.
-        objects: (N,) which of them are of an object.
-        options: support, up, workspace and seed.
-        warnings: Gets what is wrong with it, or that there is none.
-    """
+    """The support plane of a request."""
     request = options.support
     if request is None or len(seen.points) == 0:
         return None
@@ -209,23 +200,15 @@ def by_surface(points: Float32) -> Float64:
 
 
 def fit_plane(
-    seen: Seen,
-    weight: Floats,
+    seen: Seen,  # N points that may belong to it
+    weight: Floats,  # (N,) what each counts
     rng: np.random.Generator,
-    up: Float64 | None = None,
-    max_tilt: float = TILT,
+    up: Float64 | None = None,  # (3,) unit; None: any tilt will do
+    max_tilt: float = TILT,  # radians from `up`
 ) -> SupportPlane | None:
     """The plane that holds the most of weighted points, facing the camera (RANSAC).
 
-    Args:
-        seen: N points that may belong to it.
-        weight: (N,) what each counts.
-        rng: Source of the samples.
-        up: (3,) unit; None: any tilt will do.
-        max_tilt: Radians from `up`.
-
-    Returns:
-        The plane; None where there are too few points, or none of it is level enough.
+    None: there are too few points, or none of it is level enough.
     """
     held = np.flatnonzero(weight > 0)
     if len(held) < FEWEST:
@@ -270,13 +253,7 @@ def _toward(seen: Seen, origin: Float64, up: Float64 | None) -> Float64:
 
 
 def measured(seen: Seen, plane: SupportPlane, least: float) -> Support:
-    """The support of a plane, and how well the points agree with it where it is seen.
-
-    Args:
-        seen: N points.
-        plane: Of the cloud's frame.
-        least: Metres over it that belong to it anyway.
-    """
+    """The support of a plane, at least `least` metres thick, as the points show it."""
     sample = Seen(seen.points[thinned(len(seen.points))], seen.viewpoint)
     frame = CanonicalFrame.of_scene(sample.points, plane.normal, seen.viewpoint)
     frame.T_canonical_cloud[2, 3] = -plane.offset / np.linalg.norm(plane.normal)
@@ -322,14 +299,7 @@ def correct_depth_scale(
 ) -> CheckedCloud:
     """Scale every view about its camera so that its support lies in the given plane.
 
-    Args:
-        sent: N points, in which the plane is seen.
-        plane: The support plane, and the greatest depth error (max_depth_error).
-        viewpoints: (W, 3) the cameras, metres; the cloud's `view_ids` are their rows.
-        warnings: Gets the correction made, or why none was.
-
-    Raises:
-        InvalidRequest: There is no viewpoint to scale about.
+    `viewpoints` (W, 3), metres, are the cameras; the cloud's `view_ids` are their rows.
     """
     if viewpoints is None:
         fix = "Send the camera's position: depths are corrected along its rays."
@@ -355,15 +325,8 @@ def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> floa
     """The factor on a view's depths that moves its points of the support into the plane.
 
     If several factors fit (the table, or the flat top of an object), the smallest one is taken, as
-    nothing is seen below the table.
-
-    Args:
-        points: (N, 3) metres.
-        viewpoint: (3,) metres.
-        plane: The plane and the greatest depth error.
-
-    Returns:
-        The factor; None if the camera is not above the plane, is too high, or sees too little.
+    nothing is seen below the table. None if the camera is not above the plane, is too high, or sees
+    too little. Points (N, 3) and viewpoint (3,) in metres.
     """
     height = float(plane.heights(viewpoint))
     falls = height - plane.heights(points.astype(np.float64))
