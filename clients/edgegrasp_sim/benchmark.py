@@ -82,10 +82,7 @@ def run_benchmark(
     # Called with every round as it finishes, in any order.
     on_round: Callable[[Round], None] | None = None,
 ) -> list[Round]:
-    """Run all rounds that `folder` does not hold yet, and return all, by seed and index.
-
-    RuntimeError: worker processes keep dying, or there is no such Ray cluster.
-    """
+    """Run the rounds that `folder` does not hold yet; all, by seed and index. See `run_tasks`."""
     digest = config.object_set().digest  # fails here on a wrong folder, not in every worker
     tasks = config.tasks()
     kept = folder.rounds() if folder is not None else []

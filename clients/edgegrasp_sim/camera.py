@@ -64,10 +64,7 @@ class ViewRange:
     target: tuple[float, float, float] = (0.15, 0.15, 0.25)
 
     def sample(self, rng: np.random.Generator, views: int = 1) -> list[Matrix]:
-        """Draw a pose `T_world_camera` (4, 4), and spread others evenly over a full turn from it.
-
-        The first is uniform in each coordinate.
-        """
+        """Draw a pose `T_world_camera` (4, 4), and others evenly spread over a full turn."""
         radius = rng.uniform(*self.radius)
         polar = rng.uniform(*self.polar_angle)
         first = rng.uniform(*self.azimuth)

@@ -129,12 +129,11 @@ class ObjectSet:
 
     @classmethod
     def from_folder(cls, root: Path, scene: SceneKind, split: str = "test") -> "ObjectSet":
-        """The objects of a folder, sorted by name.
+        """The objects of a folder, sorted by name; raises as `prepare_mesh`, or FileNotFoundError.
 
-        These are the URDF files in `<root>/<scene>/<split>` (VGN's layout), for bins, tables and
-        shelves those of piles and packed scenes where they have no such folder, or in `root` itself
-        where there is none at all. Where there are none, they are the meshes there, `.obj` or
-        `.stl`: see `prepare_mesh`. FileNotFoundError: there is nothing of the kind.
+        URDF files in `<root>/<scene>/<split>` (VGN's layout), for bins, tables and shelves those of
+        piles and packed scenes where they have no such folder, or in `root` itself; else meshes
+        there, `.obj` or `.stl`.
         """
         folder, name = root, root.name
         for kind in (scene.objects, scene):
@@ -183,11 +182,10 @@ def blob(number: int, folder: Path, scale: float = 1.0) -> ObjectModel:
 def prepare_mesh(mesh: Path, cache: Path | None = None) -> Path:
     """Make a simulated object of an `.obj` or `.stl` file, or look it up; returns its URDF file.
 
-    The mesh is scaled so that the box around it has a shortest side of `SHORTEST_SIDE`, and no side
-    over `LONGEST_SIDE`. Its own unit does not matter; its z axis points up in packed scenes. The
-    camera sees the mesh itself; contacts use its convex parts. `cache`, by default in the user's,
-    keeps objects by the digest of their file and of how they are prepared. ValueError: it is no
-    solid mesh; RuntimeError: coacd or trimesh is not installed.
+    The box around it gets a shortest side of `SHORTEST_SIDE`, and no side over `LONGEST_SIDE`; z
+    points up in packed scenes. The camera sees the mesh itself; contacts use its convex parts.
+    `cache` keeps objects by the digest of their file and of how they are prepared. ValueError: it
+    is no solid mesh; RuntimeError: coacd or trimesh is not installed.
     """
     _require_packages()
 
@@ -204,10 +202,7 @@ def cache_folder() -> Path:
 
 
 def write_object(name: str, surface: str, folder: Path) -> Path:
-    """Write a computed object as `<name>.urdf`, and return that; the engine takes its convex hull.
-
-    `surface` is an OBJ file, metres; `folder` is created if missing.
-    """
+    """Write an object, `surface` in OBJ and metres; the engine takes its convex hull."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.obj").write_text(surface)
     mass = f'<mass value="{OBJECT_MASS}"/>'

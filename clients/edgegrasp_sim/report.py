@@ -76,10 +76,7 @@ class Replay:
         return done
 
     def repeat(self, seed: int, index: int, attempt: int) -> tuple[Attempt, Observation]:
-        """Repeat a round up to and including an attempt; ValueError: there is no such attempt.
-
-        Returns the attempt when repeated, and the image before it.
-        """
+        """Repeat a round up to an attempt; returns the attempt and the image before it."""
         done = self.find(seed, index, attempt)
         driver = RoundDriver(self.simulation, self.scene, self.protocol, seed=seed, index=index)
         for recorded in done.attempts[: attempt + 1]:

@@ -35,11 +35,7 @@ ROUND = TypeAdapter(Round)
 
 
 class ResultFolder:
-    """A folder with a benchmark's manifest, rounds and figures.
-
-    `manifest.json`, `rounds/<seed>-<index>.json` written as rounds finish, and at the end
-    `attempts.csv` and `summary.json`.
-    """
+    """A folder with a benchmark's manifest, its rounds, and at the end attempts and summary."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -209,11 +205,7 @@ def planner_title(planner: dict[str, Any]) -> str:
 
 
 def compare(first: ResultFolder, second: ResultFolder) -> dict[str, Any]:
-    """Differences of GSR and DR over the scenes that two benchmarks share, ready for JSON.
-
-    The value and interval of each and the difference, second minus first, with its paired 95 %
-    interval. ValueError: they were run under different conditions or share no scene.
-    """
+    """Values, intervals and paired difference of the rates of two benchmarks of the same scenes."""
     runs = [folder.manifest()["run"] for folder in (first, second)]
     if different := [name for name in PAIRED if runs[0][name] != runs[1][name]]:
         raise ValueError(
@@ -246,11 +238,7 @@ def compare(first: ResultFolder, second: ResultFolder) -> dict[str, Any]:
 
 
 def below_gate(summary: dict[str, Any], gate: Path) -> list[str]:
-    """Which rates of a result fall below a committed one, in words; empty if none does.
-
-    `gate` is the committed `summary.json`; each rate may be as low as the lower end of its
-    interval. ValueError: it is no summary, or one of another scene or protocol.
-    """
+    """The rates of a result that fall below the interval of a committed one, in words."""
     try:
         committed = json.loads(gate.read_text())
         limits = {name: committed[name]["wilson_95"] for name in RATE_LABELS}
@@ -285,11 +273,10 @@ def wilson(successes: int, trials: int) -> tuple[float, float] | None:
 def paired_difference(
     numerators: ArrayLike, denominators: ArrayLike, rng: np.random.Generator
 ) -> tuple[float, tuple[float, float]] | None:
-    """How a ratio of sums differs between two runs over the same scenes, by the bootstrap.
+    """Second ratio of sums minus the first, and its 95 % interval; None: a run has no counts.
 
-    Scenes are resampled, so that differences between scenes cancel out. Counts are (2, S): of each
-    run in each scene. Returns the second run's ratio minus the first's, and its 95 % interval; None
-    if a run has no counts.
+    Scenes are resampled (bootstrap), so that differences between scenes cancel out. Counts are (2,
+    S): of each run in each scene.
     """
     above, below = np.asarray(numerators, float), np.asarray(denominators, float)
     if (below.sum(axis=1) == 0).any():

@@ -115,10 +115,7 @@ class Layout(NamedTuple):
 
 
 def make_packed(layout: Layout) -> list[SceneObject]:
-    """Stand objects upright on the table, each where it touches no other.
-
-    `PACKED.attempts` objects are drawn, so that a scene may hold fewer than asked for.
-    """
+    """Stand `PACKED.attempts` objects or fewer upright, each where it touches no other."""
     rng = layout.rng
     placed: list[SceneObject] = []
     for _ in range(PACKED.attempts):
@@ -131,10 +128,7 @@ def make_packed(layout: Layout) -> list[SceneObject]:
 
 
 def make_table(layout: Layout) -> list[SceneObject]:
-    """Put objects on a table or a shelf beside what is there: most upright, some as they fall.
-
-    `CROWD.attempts` objects are drawn for each, so that there may be fewer than asked for.
-    """
+    """Put objects on a table or a shelf beside what is there: most upright, some as they fall."""
     rng, reach = layout.rng, np.array(layout.surroundings.reach)
     placed: list[SceneObject] = []
     for _ in range(CROWD.attempts * layout.num_objects):
@@ -221,10 +215,7 @@ def _covered(layout: Layout, placed: Sequence[SceneObject]) -> float:
 def _drop(
     layout: Layout, number: int, where: tuple[Matrix, Matrix], height: float, seconds: float
 ) -> list[SceneObject]:
-    """Drop objects, turned any way, one after another; each has `seconds` to come to rest.
-
-    `where` are the lowest and highest x and y, (2,) each, and `height` the z of the drop, metres.
-    """
+    """Drop objects one by one, turned any way, between the corners `where`, (2,) each, metres."""
     rng = layout.rng
     dropped: list[SceneObject] = []
     for _ in range(number):

@@ -287,11 +287,9 @@ class ClutterSimulation:
     def try_grasp(
         self, T_world_hand: ArrayLike, *, shake: bool = False, to_the_end: bool = False
     ) -> GraspResult:
-        """Simulate a grasp and return to the scene as it was; ValueError: the pose is not rigid.
+        """Simulate a grasp, (4, 4) of the `panda_hand` link, and return to the scene as it was.
 
-        `T_world_hand` is the (4, 4) pose of the `panda_hand` link in the world, metres. With
-        `shake` a held object is also shaken, see `GraspResult.held_after_shaking`. `to_the_end`
-        simulates every step, as `execute_grasp` does; otherwise the try ends once its outcome is
+        `shake` also shakes a held object. Unless `to_the_end`, the try ends once its outcome is
         clear: twice as fast, with another outcome for 1 grasp in 100.
         """
         result = self._run(T_world_hand, to_the_end=to_the_end, shake=shake)
@@ -301,11 +299,7 @@ class ClutterSimulation:
     def execute_grasp(
         self, T_world_hand: ArrayLike, motion: ArmMotion | None = None
     ) -> GraspResult:
-        """Grasp for real: a held object leaves the scene, and the others come to rest.
-
-        The outcome is that of `try_grasp(..., to_the_end=True)`; an arm needs the motion that leads
-        there. ValueError: the pose is not rigid, or an arm has no motion.
-        """
+        """Grasp to the end: a held object leaves the scene, the others come to rest; ValueError."""
         if isinstance(self._hand, ArmGripper):
             self._hand.motion = motion
         result = self._run(T_world_hand, to_the_end=True)

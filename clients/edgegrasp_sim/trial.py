@@ -110,10 +110,7 @@ def run_round(
     seed: int,
     index: int,
 ) -> Round:
-    """Run one round with a planner.
-
-    See `RoundDriver` for the other arguments, and errors.
-    """
+    """Run one round with a planner; see `RoundDriver`."""
     driver = RoundDriver(simulation, scene, protocol, seed=seed, index=index)
     while driver.end is None:
         observation = driver.look()
@@ -126,10 +123,7 @@ def run_round(
 
 
 class RoundDriver:
-    """A round, step by step: `look`, `plan`, `execute`, as long as `end` is None.
-
-    Scene and views depend on `seed` and `index` alone.
-    """
+    """A round, step by step: `look`, `plan`, `execute`, as long as `end` is None."""
 
     def __init__(
         self,

@@ -166,10 +166,7 @@ class GraspDetector:
     def prepare(
         self, cloud: object, options: DetectOptions, max_voxels: int | None = None
     ) -> Prepared:
-        """First stage: choose the gripper, and build the scene if enough of the cloud is left.
-
-        `max_voxels`: lower than the constructor's if time is short.
-        """
+        """First stage: choose the gripper, and build the scene if enough of the cloud is left."""
         sent = check_cloud(cloud, options.num_approach_points or 1)
         return self._with_scene(sent, options, max_voxels)
 
@@ -460,10 +457,7 @@ class ModelCatalogue:
         grippers: Sequence[Path] = (),  # files that requests may name by their stem
         max_voxels: int = MAX_VOXELS,  # most that a request's cloud may have
     ) -> Self:
-        """Load the shipped weights, then the user's own, which replace those of the same name.
-
-        A model is named as its file. Raises InvalidCheckpoint, UnknownModel or InvalidGripper.
-        """
+        """Load the shipped weights, then the user's own, named as their files; EdgeGraspError."""
         own = {file.stem: load_gripper(file) for file in grippers}
         files: dict[str, Path] = {}
         for source in (WEIGHTS_FOLDER, *weights):
@@ -506,11 +500,7 @@ class ModelCatalogue:
         ]
 
     def warm_up(self) -> None:
-        """Run every model once on a small synthetic cloud, so that the first request is not slow.
-
-        Few candidates: they exercise every code path in a tenth of the time. InvalidCheckpoint: a
-        network does not give the logits that it was written with.
-        """
+        """Run every model once, so that no request is slow; InvalidCheckpoint: wrong logits."""
         rng = np.random.default_rng(0)
         box = rng.uniform(-1.0, 1.0, (2000, 3)) * (0.02, 0.03, 0.04)
         options = DetectOptions(

@@ -14,10 +14,7 @@ from edgegrasp_camera import InvalidRequest as InvalidRequest
 def invalid_fields(
     error: ValidationError, fields: object, prefix: str, known: Iterable[str] = ()
 ) -> InvalidRequest:
-    """The first fault of pydantic in fields of a request under `prefix`, as field, value and fix.
-
-    `known` top-level fields are listed when an unknown one is sent.
-    """
+    """The first fault of pydantic in fields under `prefix`; top-level fields `known` are listed."""
     first = error.errors(include_url=False)[0]
     named = first["type"] in ("missing", "extra_forbidden")
     path = _path(first["loc"], fields, named)
@@ -35,10 +32,7 @@ def invalid_fields(
 
 
 def _path(location: Sequence[str | int], fields: object, named: bool) -> list[str]:
-    """A location in the request, without pydantic's names for members of unions.
-
-    If `named`, the last part is a missing or unexpected field.
-    """
+    """A location without names of unions' members; `named`: the last part is a field's name."""
     path: list[str] = []
     here: Any = fields
     for place, part in enumerate(location):

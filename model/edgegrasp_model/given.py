@@ -227,10 +227,7 @@ def from_hand_poses(
 
 
 def _approach_points(view: HandView, contact: Int64, crop_radius: float) -> Int64:
-    """Rows (M,) of the cloud: of each hand's view the point nearest to its axis; -1: none.
-
-    It is near the contact (M,), within `crop_radius` metres, but not at it.
-    """
+    """Rows (M,) of the points nearest to the hands' axes, near the contacts (M,); -1: none."""
     result = np.full(len(contact), -1, dtype=np.int64)
     if len(view.row) == 0:
         return result

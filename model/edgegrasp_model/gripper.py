@@ -62,10 +62,7 @@ class Gripper:
         return self.tip_z + float(self.tip_advance(upright))
 
     def tip_advance(self, opening: ArrayLike) -> Floats:
-        """Metres along z that the fingertips have moved since it was open, by opening (...).
-
-        0 for fingers that close in a straight line.
-        """
+        """Metres along z that the fingertips have moved since it was open, by opening (...)."""
         opening = np.asarray(opening)
         if self.linkage is None:
             return np.zeros_like(opening, dtype=np.float64)
@@ -75,10 +72,7 @@ class Gripper:
         return advance
 
     def contact_z_at(self, opening: ArrayLike) -> Float32:
-        """Metres along z of a contact once the fingers have closed to an opening (...), metres.
-
-        A constant distance inside the fingertips, which move forward with a swinging finger.
-        """
+        """Metres along z of a contact, inside the fingertips, by opening (...), metres."""
         return (self.contact_z + self.tip_advance(opening)).astype(np.float32)
 
     def boxes(self, opening: ArrayLike, advance: ArrayLike | None = None) -> Float64:
@@ -183,11 +177,7 @@ def _first_fault(error: ValidationError) -> str:
 
 
 def choose_gripper(options: DetectOptions, default: Gripper, own: Mapping[str, Gripper]) -> Gripper:
-    """The gripper of a request, at the opening it asks for; `default` if it names none.
-
-    The user's `own`, by name, replace shipped ones of the same name. InvalidRequest: no gripper has
-    that name, or it does not open that far.
-    """
+    """The gripper of a request, `own` ones first, at its opening; raises InvalidRequest."""
     asked = options.gripper
     if asked is None:
         gripper = default

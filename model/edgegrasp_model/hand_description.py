@@ -56,11 +56,7 @@ class Surroundings:
         return self.viewpoints[0] if self.viewpoints is not None and one else None
 
     def mirror_sides(self, T_cloud_hand: Float32) -> Float32:
-        """1 or -1 (E,): the factor on a hand's x that puts the camera on its positive side.
-
-        Mirroring a hand and its object does not change the outcome. 1 for all unless there is
-        exactly one camera.
-        """
+        """Factor (E,), 1 or -1, on a hand's x that puts a single camera on its positive side."""
         if self.viewpoint is None:
             return np.ones(len(T_cloud_hand), dtype=np.float32)
         # If a hand approaches straight from the camera, up decides instead of rounding errors.
@@ -146,10 +142,7 @@ def points_around_fingers(
 
 
 def seen_part(gripper: Gripper) -> Gripper:
-    """The same hand with its palm at most a given distance behind its fingertips.
-
-    The finger ends hold the object, so relative to them hands of any length look alike.
-    """
+    """The hand with a palm at most SEEN_LENGTH behind its tips, as if its fingers were short."""
     return replace(gripper, palm_z=max(gripper.palm_z, gripper.tip_z - SEEN_LENGTH))
 
 

@@ -781,10 +781,7 @@ def parse_options(fields: object) -> DetectOptions:
 
 
 def parse(schema: type[Schema], fields: object, name: str, known: Iterable[str] = ()) -> Schema:
-    """Check plain values against a schema; raises InvalidRequest that names the field.
-
-    `known`: names to list when a top-level field is unknown.
-    """
+    """Check plain values against a schema; raises InvalidRequest that names the field."""
     try:
         return schema.model_validate(fields)
     except ValidationError as error:

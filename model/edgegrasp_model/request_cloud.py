@@ -107,10 +107,7 @@ def _source(fields: Mapping[str, Any]) -> str:
 
 
 def decode_points(points: object, max_points: int) -> Array:
-    """Read points like `decode_array`; [null, null, null] in an organised list is a hole.
-
-    Returns (N, 3) float32 of bytes; float64 of lists, in the shape that they have.
-    """
+    """Read points (N, 3) of bytes, or of lists, in which a row of null is a hole."""
     array = decode_array("points", points, max_points)
     if array.size // 3 > max_points:
         raise too_many(array.size // 3, max_points)
@@ -269,10 +266,7 @@ DEPTH_ENCODINGS = {"32FC1": "<f4", "64FC1": "<f8", "16UC1": "<u2"}
 
 
 def read_depth_images(images: object, max_points: int) -> tuple[CloudInput, list[Position]]:
-    """Read DepthImages, given as plain values, and fuse them; InvalidRequest, PayloadTooLarge.
-
-    Their `depth` may also be a File.
-    """
+    """Read DepthImages, plain values whose `depth` may also be a File, and fuse them."""
     if not isinstance(images, list) or not 1 <= len(images) <= MAX_VIEWS:
         count = f"{len(images)} images" if isinstance(images, list) else brief(images)
         raise InvalidRequest("depth_images", count, f"Send a list of 1 to {MAX_VIEWS} images.")

@@ -59,8 +59,7 @@ class Followed:
 def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOptions:
     """The options for building the scene: without a search, only around followed objects.
 
-    `points` (N, 3) are the cloud. InvalidRequest: `previous` is for another gripper than that of
-    this name, or in another frame.
+    InvalidRequest: `previous` is for another gripper, or in another frame than the points (N, 3).
     """
     previous = options.previous
     assert previous is not None

@@ -31,10 +31,7 @@ FARTHEST_EXTENT = 0.25  # metres; extents are clipped here
 
 
 class UnseenSpace(NamedTuple):
-    """Unseen parts of E hands and of the space around them; all 0 if everything was seen.
-
-    Of two fingers, the one on the side of positive y comes first.
-    """
+    """Unseen parts of E hands and of the space around them; the finger at +y is first."""
 
     parts: list[Float32]  # (E,) each: the unseen share of each of `probes`
     ways: list[Float32]  # (E,) each: of the space that each finger sweeps on the approach
@@ -75,10 +72,7 @@ def unseen_space(
 
 
 def enters_unseen(depths: Sequence["DepthMap"], T_cloud_hand: Float32, gripper: Gripper) -> Bools:
-    """Which hands (E,) would put their palm, or a finger during the approach, into unseen space.
-
-    Behind a surface, only the finger ends may reach into unseen space.
-    """
+    """Which hands (E,) would enter unseen space with more than their finger ends."""
     entered = np.zeros(len(T_cloud_hand), dtype=np.bool_)
     for places in (probes(gripper)[-1], *_ways(gripper)) if depths else ():
         behind = _behind_all(depths, T_cloud_hand, places)
@@ -272,20 +266,14 @@ class DepthMap:
 
     @classmethod
     def of_each(cls, points: Float32, viewpoints: Float32 | None, up: Float32) -> list[Self]:
-        """The depth map of each camera (W, 3) for a cloud (N, 3); empty if the cameras are unknown.
-
-        A point blocks the view of every camera, whichever saw it.
-        """
+        """The depth map of each camera (W, 3) for a cloud (N, 3); none if unknown."""
         if viewpoints is None or len(points) == 0:
             return []
         return [cls.of_cloud(points, viewpoint, up) for viewpoint in viewpoints]
 
     @classmethod
     def of_cloud(cls, points: Float32, viewpoint: Float32, up: Float32) -> Self:
-        """The depth map of a camera at `viewpoint`, of points (N, 3) in the same frame, metres.
-
-        `up` fixes the map's roll, so that it rotates with the scene.
-        """
+        """The depth map of points (N, 3), metres, from a camera; `up` fixes its roll."""
         frame = CameraFrame.toward(points.mean(axis=0, dtype=np.float64), viewpoint, up)
         cell, distance = frame.seen(points)
         half = min(int(np.abs(cell).max()) + SPLAT, HALF)
@@ -294,10 +282,7 @@ class DepthMap:
         return cls(frame, depth)
 
     def behind(self, T_cloud_hand: Float32, places: Float32) -> Float32:
-        """Metres (E, S) that places (S, 3) of hands (E, 4, 4) lie behind the first surface.
-
-        0 in front of it, and where nothing was seen.
-        """
+        """Metres (E, S) that places (S, 3) of hands (E, 4, 4) lie behind a surface, or 0."""
         frame = self.frame
         turn = frame.axes @ T_cloud_hand[:, :3, :3]
         shift = (T_cloud_hand[:, :3, 3] - frame.viewpoint) @ frame.axes.T

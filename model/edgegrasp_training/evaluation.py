@@ -109,10 +109,7 @@ def calibration_error(score: Floats, held: NDArray[np.generic]) -> float:
 def write_model_card(
     path: Path, metadata: CheckpointMetadata, evaluation: Evaluation, log: Path, command: str
 ) -> None:
-    """Write a card in Markdown.
-
-    The evaluation is from before calibration.
-    """
+    """Write a card in Markdown, with the evaluation before calibration."""
     network = {name: value for name, value in asdict(metadata.network).items() if value != ()}
     facts = network | {"voxel_size": metadata.voxel_size, "gripper": metadata.gripper}
     facts |= metadata.training

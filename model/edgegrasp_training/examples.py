@@ -115,12 +115,7 @@ def pack_balls(
     config: NetworkConfig,
     soft_labels: SoftLabels | None = None,
 ) -> Packed:
-    """Crop some balls of a view and pack the candidates in them.
-
-    The axes are those of the detector's frame; lengths are multiples of LENGTH_UNIT.
-
-    The balls are ascending rows (A,) of the cloud to crop around.
-    """
+    """Pack candidates in balls, rows (A,) of a view; detector's axes, multiples of LENGTH_UNIT."""
     rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, balls))
     tried = grasps.candidates.take(rows)
     approach_index, contact_index = tried.approach_index, tried.contact_index
@@ -161,10 +156,7 @@ def pack_hands(
     config: NetworkConfig,
     rng: np.random.Generator | None = None,
 ) -> Packed:
-    """Pack the hand network's inputs for the candidates of some balls.
-
-    The balls are rows (A,) of the cloud; without `rng` each hand's points are spread evenly.
-    """
+    """Pack the hand network's inputs in balls, rows (A,) of the cloud."""
     seen = grasps.seen
     assert seen is not None
     rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, balls))
@@ -208,10 +200,7 @@ def random_turn(rotations: Rotations, rng: np.random.Generator) -> Float32:
 
 
 def _labels(view: LabelledView) -> Float32:
-    """Targets (E,): whether each grasp holds, and a little more where it survives shaking.
-
-    Most of the best candidates hold; the one to execute is one that also survives shaking.
-    """
+    """Targets (E,): whether each grasp holds, and a little more where it survives shaking."""
     held = view.success == 1
     firm = np.full(len(held), FIRM_SHARE)
     if view.firm is not None:

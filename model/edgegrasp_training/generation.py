@@ -257,10 +257,7 @@ def _hard_view(
     guide: GraspDetector,
     streams: list[np.random.Generator],
 ) -> Query | None:
-    """The first view in which the network is unsure of its best grasp, or sure and wrong.
-
-    Until then its grasps are executed, so that easy objects go. None if all are easy.
-    """
+    """The first view in which the network is unsure, or sure and wrong; easy objects go before."""
     for _ in range(min(simulation.num_objects, HARD_LOOKS)):
         query = ask(simulation, kind, seen_from, streams)
         if len(query.observation.cloud) == 0:
@@ -395,10 +392,7 @@ def label(
 def choose_grasps(
     query: Query, options: GenerationOptions, rng: np.random.Generator, *, hard: bool
 ) -> tuple[SelectedPoints, Scene, Candidates] | None:
-    """Sample candidates of a view as the detector does and choose some; None without any.
-
-    See `label` for the arguments.
-    """
+    """Sample candidates of a view as the detector does and choose some; None without any."""
     observation, request = query
     if len(observation.cloud) == 0:
         return None

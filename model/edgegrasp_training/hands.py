@@ -22,10 +22,7 @@ STEEPEST = 0.75  # most of it, in radii
 
 
 def hand_of_scene(name: str, rng: np.random.Generator) -> dict[str, Any] | None:
-    """The fields of the gripper of a scene; None for the Panda, whose hand has shapes of its own.
-
-    `name` is of a gripper, a .toml file, or `random`; raises InvalidGripper if there is none.
-    """
+    """The fields of a gripper, by name or file, or random; None for the Panda."""
     if name == RANDOM:
         return random_gripper(rng)
     return None if name == PANDA else gripper_fields(name)

@@ -37,11 +37,7 @@ class Outcomes:
 
 
 def read_outcomes(path: Path, digest: str = "") -> Outcomes:
-    """The outcomes in a file that a server wrote, an object of JSON on each line.
-
-    `digest`: of the weights whose scores count; empty: all. ValueError: a line is no outcome, or
-    none is of these weights.
-    """
+    """The outcomes, lines of JSON, of the weights with a `digest`, or of all; ValueError: none."""
     scores, held = [], []
     for number, line in enumerate(path.read_text().splitlines(), start=1):
         try:
@@ -72,10 +68,7 @@ def fit(outcomes: Outcomes) -> tuple[float, float]:
 
 
 def recalibrate(weights: Path, outcomes_file: Path, folder: Path) -> str:
-    """Write NAME-robot.safetensors, calibrated on the outcomes of the old weights.
-
-    Returns what was done, in a sentence.
-    """
+    """Write NAME-robot.safetensors, calibrated on outcomes; returns what was done."""
     network, metadata = load_checkpoint(weights)
     outcomes = read_outcomes(outcomes_file, metadata.digest)
     scale, shift = fit(outcomes)

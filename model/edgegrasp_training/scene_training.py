@@ -86,10 +86,7 @@ def image_points(image: SceneImage) -> Float32:
 def make_batch(
     images: Sequence[SceneImage], rng: np.random.Generator, up_known: bool | None = None
 ) -> SceneBatch:
-    """Features and targets of images of one size.
-
-    `up_known`: whether the network gets `up`; None: at random, and images are mirrored too.
-    """
+    """Features and targets of images of one size; `up_known` None: at random, and mirrored."""
     size = SIZES[0] if up_known is not None else SIZES[int(rng.choice(len(SIZES), p=SIZE_SHARES))]
     rows = [_example(image, rng, up_known, size) for image in images]
     return SceneBatch(*(torch.from_numpy(np.stack(each)) for each in zip(*rows, strict=True)))
@@ -231,10 +228,7 @@ def fit_confidence(network: SceneNet, images: SceneImages) -> list[float]:
 
 
 def batches(data: Path, images: SceneImages, rng: np.random.Generator) -> Iterator[SceneBatch]:
-    """Endless batches in random order; the next one is prepared during each training step.
-
-    Files added to the folder meanwhile are read too.
-    """
+    """Endless batches of the folder's files, prepared ahead; files added meanwhile are read too."""
 
     def one(rows: Int64) -> SceneBatch:
         return make_batch([images[int(k)] for k in rows], rng)

@@ -42,11 +42,7 @@ Rings = Float64  # (R, S, 3) corners of each ring along a part, any unit
 
 
 def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -> ObjectSet:
-    """Draw up to `NUM_VARIED` objects of a set and computed ones, each stretched at random.
-
-    Each keeps its name. The folder gets descriptions and computed objects; other meshes stay where
-    they are.
-    """
+    """Draw up to `NUM_VARIED` objects of a set and computed ones, each stretched at random."""
     drawn: dict[str, ObjectModel] = {}
     for _ in range(NUM_VARIED):
         draw = rng.random()

@@ -28,10 +28,7 @@ class Teacher:
     """A hand network that scores the candidates of views."""
 
     def __init__(self, weights: Path, crop_radius: float) -> None:
-        """Load a checkpoint of architecture `hand`; ValueError: it is of another.
-
-        Candidates are drawn from balls of `crop_radius` metres.
-        """
+        """Load a `hand` checkpoint; candidates are drawn from balls of `crop_radius` metres."""
         self.network, self.metadata = load_checkpoint(weights)
         if self.metadata.network.architecture != "hand":
             found = self.metadata.network.architecture

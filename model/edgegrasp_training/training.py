@@ -62,10 +62,7 @@ class Trainer:
         teacher: Teacher | None = None,  # scores further candidates to learn from
         start: Path | None = None,  # weights to start from; None: random ones
     ) -> None:
-        """Set up, and resume from the folder's last state if there is one.
-
-        ValueError: the weights to start from do not fit, or no teacher can teach this network.
-        """
+        """Set up, and resume from the folder's last state if there is one; ValueError: no fit."""
         if teacher is not None and metadata.network.architecture == "hand":
             raise ValueError(f"teacher: {metadata.name} learns from labels alone. Name none.")
         self.teacher = teacher
@@ -101,10 +98,7 @@ class Trainer:
         return self.step >= self.options.steps
 
     def run(self, progress: Callable[[int, float], None], until: int | None = None) -> None:
-        """Train until finished, or up to a step.
-
-        `progress` is called after each step with its number and training loss.
-        """
+        """Train until finished, or up to a step; `progress` gets each step's number and loss."""
         while not self.finished and (until is None or self.step < until):
             start = time.perf_counter()
             loss = self._train_step()
@@ -165,11 +159,7 @@ class Trainer:
         return evaluation
 
     def _mix_in(self, start: Path) -> None:
-        """Move the result toward the weights it started from, so that less is forgotten.
-
-        The mean of both keeps most of what either can do (Wortsman et al., Robust fine-tuning of
-        zero-shot models, CVPR 2022).
-        """
+        """Move the result toward the weights it started from (Wortsman et al., CVPR 2022)."""
         first = deepcopy(self.average)
         start_from(first, load_checkpoint(start, self.device)[0])
         with torch.no_grad():

@@ -171,12 +171,7 @@ def scene_of(path: Path) -> str:
 def split_by_scene(
     paths: list[Path], validation_share: float, seed: int
 ) -> tuple[list[Path], list[Path]]:
-    """Training and validation views; all views of one scene fall on the same side.
-
-    A scene keeps its side when scenes are added, so that a run may resume with more data.
-
-    At least one scene is held out.
-    """
+    """Training and validation views; a scene keeps its side when scenes are added."""
     place = {
         scene: zlib.crc32(f"{seed} {scene}".encode()) / 2**32 for scene in map(scene_of, paths)
     }

@@ -24,10 +24,7 @@ ENGINES = ("pybullet", "mujoco")  # the first that is installed is the default
 
 
 def choose_engine(asked: str | None = None, protocol: str = "") -> str:
-    """The engine asked for, else the protocol's where it is installed, else the first there is.
-
-    ValueError: there is no such engine; RuntimeError: it is not installed, or none is.
-    """
+    """The engine asked for, else the protocol's if installed, else any; or raises."""
     for name in filter(None, (asked, protocol)):
         if name not in ENGINES:
             raise ValueError(f"engine is {name!r}; choose one of {', '.join(ENGINES)}")
@@ -95,10 +92,7 @@ Parts: TypeAlias = tuple[Matrix, ...]  # convex ones, each by its points, (P, 3)
 
 @dataclass(frozen=True, slots=True)
 class HandModel:
-    """A floating hand with two coupled fingers that slide apart along y.
-
-    Fields that no gripper file gives have a default, the same for every hand.
-    """
+    """A floating hand with two coupled fingers that slide apart along y."""
 
     palm: Parts  # in the hand's frame
     fingers: tuple[Parts, Parts]  # that at y > 0 and the other, shut, each in its own frame
@@ -190,10 +184,7 @@ class World(ABC):
         mass: float,
         friction: float,
     ) -> "Body":
-        """Load a body from a URDF file, with its link frame there; FileNotFoundError, ValueError.
-
-        Its mass and friction are those given, its inertia that of its collision shape.
-        """
+        """Load a body with its link frame there; its inertia is that of its collision shape."""
 
     @abstractmethod
     def add_box(self, size: Vector, centre: Vector, *, friction: float, yaw: float = 0.0) -> "Body":
@@ -209,10 +200,7 @@ class World(ABC):
 
     @abstractmethod
     def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
-        """Distance along the line of sight for every pixel: (height, width) metres.
-
-        Pixels that show nothing read `far`. A pixel is sampled at its lower left corner.
-        """
+        """Depth (height, width) of pixels' lower left corners, metres; `far`: nothing seen."""
 
 
 class Body(ABC):

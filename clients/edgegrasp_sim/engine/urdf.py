@@ -34,11 +34,7 @@ class Shape(NamedTuple):
 
 
 def read_urdf(path: Path, scale: float) -> Shape:
-    """The shape of the first link of a URDF file, `scale` times as large.
-
-    Each object of an OBJ file is one convex part. ValueError: it cannot be read, or contains no
-    solid shape.
-    """
+    """The shape of the first link of a URDF file, `scale` times as large; ValueError: no solid."""
     if not path.is_file():
         raise FileNotFoundError(f"no object file at {path}; check the object folder")
     centre, *surfaces = _read_urdf(path, path.stat().st_mtime_ns)
@@ -67,10 +63,7 @@ def _read_urdf(path: Path, _changed: int) -> Shape:
 
 
 def read_obj(path: Path) -> list[tuple[str, Surface]]:
-    """The objects of an OBJ file and their names, each with the points that its triangles use.
-
-    In a file without triangles an object has all the points that follow its name.
-    """
+    """The named objects of an OBJ file: the points that its triangles use, or all points."""
     return _read_obj(path, path.stat().st_mtime_ns)
 
 

@@ -474,10 +474,7 @@ class MujocoHand(MujocoBody, Hand):
 
 
 class MujocoArm(MujocoHand, Arm):
-    """A hand on an arm whose joints have controllers of place, which know the velocity too.
-
-    Its contacts are those of all substeps of the last time step that it was driven in.
-    """
+    """A hand on an arm; its contacts are those of all substeps of the last time step."""
 
     substeps = ARM_SUBSTEPS
     home: Matrix  # (J,)
@@ -573,10 +570,7 @@ def _gl_context(width: int, height: int) -> Any:
 
 
 def _look(eye: Any, T_world_camera: Matrix, camera: Intrinsics) -> None:
-    """Put OpenGL's camera where the pinhole camera is.
-
-    OpenGL samples a pixel at its middle; the image is moved so that this is the corner meant.
-    """
+    """Put OpenGL's camera, which samples a pixel at its middle, where the pinhole camera is."""
     per_pixel = camera.near / camera.focal_length
     eye.pos = T_world_camera[:3, 3]
     eye.forward = T_world_camera[:3, 2]

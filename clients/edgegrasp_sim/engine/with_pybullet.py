@@ -212,10 +212,7 @@ class PybulletBody(Body):
 
 
 class PybulletHand(PybulletBody, Hand):
-    """A hand whose last two links are its fingers; a fixed constraint drags its palm.
-
-    Fingers that swing slide along y on a link that slides along z.
-    """
+    """A hand that a fixed constraint drags; the last two links are its fingers."""
 
     def __init__(self, client: _Client, model: HandModel, position: Matrix) -> None:
         self.client, self.model = client, model

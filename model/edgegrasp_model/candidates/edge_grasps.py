@@ -197,10 +197,7 @@ def retract(
 
 
 def support_clearance(T_cloud_hand: Float32, support: SupportPlane, gripper: Gripper) -> Float32:
-    """Height (E,), metres, of the lowest corner of each open hand (E, 4, 4) over the support plane.
-
-    Fingers on a linkage are taken at their most forward position while closing.
-    """
+    """Height (E,), metres, of each hand's lowest corner over the support as it closes."""
     boxes = gripper.boxes(gripper.max_opening, gripper.max_tip_z - gripper.tip_z)
     middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2  # (B, 3) each
     x, y, z = support.normal

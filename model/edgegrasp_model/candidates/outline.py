@@ -134,10 +134,7 @@ def _inserted(
     gripper: Gripper,
     margin: float,
 ) -> Candidates:
-    """The hands moved along their approach until something is right ahead of them.
-
-    Hands that stop before the contact is TIP_MARGIN inside the fingertips are left out.
-    """
+    """The hands moved in until something is right ahead, without those that stop early."""
     least = gripper.contact_z + TIP_MARGIN - gripper.tip_z  # metres of way that it takes
     room = np.full(len(candidates), np.inf, dtype=np.float32)  # metres of way above the support
     if support is not None:

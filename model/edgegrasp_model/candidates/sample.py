@@ -80,10 +80,7 @@ class Sample:
 
 
 class Sampler:
-    """Draws the candidates of one request in rounds, collision-free ones if possible.
-
-    All rounds together give at most `num_candidates`; with `collision: avoid` none collides.
-    """
+    """Draws candidates in rounds, collision-free ones if possible, `num_candidates` in all."""
 
     def __init__(
         self,

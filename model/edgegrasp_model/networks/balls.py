@@ -60,10 +60,7 @@ class BallBatch:
         depth: Float32,  # (E,)
         k: int = 16,
     ) -> Self:
-        """Packs a cloud and its balls.
-
-        Contacts are rows of the crop, not of the cloud, as each contact belongs to a ball.
-        """
+        """Pack a cloud and its balls; contacts are rows of the crop, as each belongs to a ball."""
         centre = points[approach_index][crop.ball_of_point]
         return cls(
             points=_float_tensor(points[crop.ball_rows] - centre),

@@ -33,10 +33,7 @@ NETWORKS: dict[Architecture, Callable[[NetworkConfig], nn.Module]] = {
 
 
 def save_checkpoint(path: Path, network: nn.Module, metadata: CheckpointMetadata) -> None:
-    """Writes a checkpoint atomically: a reader sees the old file or the new one, never half of it.
-
-    The same weights and metadata make the same bytes; the network is built from `metadata.network`.
-    """
+    """Write a checkpoint atomically; equal weights and metadata make equal bytes."""
     tensors = {name: value.contiguous().cpu() for name, value in network.state_dict().items()}
     values = asdict(metadata) | {
         "format": _FORMAT,
@@ -78,10 +75,7 @@ def load_checkpoint(
 
 
 def check_reference_logits(network: nn.Module, metadata: CheckpointMetadata) -> None:
-    """Raise InvalidCheckpoint unless a network gives the logits stored in its checkpoint.
-
-    Compared on average, since a near tie may fall the other way on another processor.
-    """
+    """Raise InvalidCheckpoint unless the stored logits result, on average as near ties may flip."""
     found = np.asarray(reference_logits(network))
     expected = np.asarray(metadata.reference_logits or found)
     tolerance = MAX_DIFFERENCE * np.ptp(expected) + 1e-3
@@ -147,10 +141,7 @@ def _read_metadata(path: Path, text: str | None) -> CheckpointMetadata:
 
 
 def build_network(config: NetworkConfig, generator: torch.Generator | None = None) -> nn.Module:
-    """Builds a network with random weights.
-
-    From the generator, or without one from seed 0.
-    """
+    """Build a network with random weights, from the generator or from seed 0."""
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     # Layers initialise themselves from the global random stream, which is restored here.
     with torch.random.fork_rng(devices=[]):

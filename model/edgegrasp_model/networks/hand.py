@@ -127,10 +127,7 @@ class HandNet(nn.Module):
         self.std.copy_(torch.where(std < CONSTANT, 1.0, std.clamp_min(1e-3))[:size])
 
     def forward(self, batch: HandBatch, left_out: torch.Generator | None = None) -> Tensor:
-        """Scores the edge grasps of a batch: logits (E,) of success.
-
-        In training, `left_out` draws the inputs that dropout removes; None: no dropout.
-        """
+        """Logits (E,) of success; in training `left_out` draws what dropout removes."""
         known = batch.description[:, : self.config.description_size]
         description = (known - self.mean) / self.std  # (E, F)
         encoder = PackedMlp(self.point_encoder)

@@ -26,10 +26,7 @@ _PACKED: MutableMapping[Tensor, tuple[int, Tensor]] = WeakTensorKeyDictionary()
 
 
 class SharedProduct:
-    """A linear layer on rows [own, shared[row]] that multiplies each shared part only once.
-
-    Many ball points (or edge grasps) share one ball feature: W [a, b] = W_a a + W_b b.
-    """
+    """W [a, b] = W_a a + W_b b on rows [own, shared[row]], each shared part multiplied once."""
 
     def __init__(self, weight: Tensor, bias: Tensor | None, shared: Tensor) -> None:
         """Multiply the shared parts (B, ..., C2) by their part of the weight (outputs, C1 + C2)."""
@@ -74,10 +71,7 @@ def row_linear(values: Tensor, weight: Tensor, bias: Tensor | None = None) -> Te
 
 
 class PackedLinear:
-    """A linear layer applied to many chunks of rows in turn, by the faster of two libraries.
-
-    Valid while the weights do not change: for one forward pass.
-    """
+    """A linear layer for many chunks of rows in one forward pass, by the faster library."""
 
     def __init__(
         self, weight: Tensor, bias: Tensor | None = None, *, rectified: bool = False
@@ -87,10 +81,7 @@ class PackedLinear:
         self._packed = _packed(weight)
 
     def __call__(self, values: Tensor) -> Tensor:
-        """Maps (M, ..., C) to (M, ..., outputs).
-
-        oneDNN sets up again for each number of rows, so all chunks should have the same.
-        """
+        """Map (M, ..., C) to (M, ..., outputs); oneDNN sets up again for each number of rows M."""
         if self._packed is None:
             rows = row_linear(values, self._weight, self._bias)
             return rows.relu_() if self._rectified else rows
@@ -120,10 +111,7 @@ class PackedMlp:
 
 @cache
 def onednn_is_faster() -> bool:
-    """Whether oneDNN multiplies in float32 about twice as fast as MKL, which is behind F.linear.
-
-    True for AMD processors with AVX-512, as measured on an EPYC.
-    """
+    """Whether oneDNN multiplies about twice as fast as MKL: on AMD with AVX-512."""
     ours = torch.backends.cpu.get_cpu_capability() == "AVX512" and "AMD" in _processor()
     there = torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
     return ours and there and hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
@@ -166,10 +154,7 @@ class BallChunk(NamedTuple):
 
 
 def ball_chunks(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[BallChunk]:
-    """Splits values (P, ...) of a batch's points into chunks of `rows`, the last one filled up.
-
-    One chunk unless for float32 inference on the processor.
-    """
+    """Split values (P, ...) of a batch's points into chunks in float32 inference."""
     ball_of_point, sizes = batch.ball_of_point, batch.ball_sizes
     if not float32_inference(values):
         return [BallChunk(values, ball_of_point, list(range(len(sizes))), sizes)]
@@ -190,10 +175,7 @@ def ball_chunks(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[Ball
 
 
 def in_chunks(rows: int, *values: Tensor) -> list[tuple[Tensor, ...]]:
-    """Splits values (M, ...) of equal length into chunks of `rows`.
-
-    In inference the last one is padded with zeros. On a GPU there is one chunk.
-    """
+    """Split values (M, ...) into chunks of `rows`, padded with zeros in inference; one on a GPU."""
     if values[0].device.type != "cpu":
         return [values]
     chunks = list(zip(*(torch.split(each, rows) for each in values), strict=True))

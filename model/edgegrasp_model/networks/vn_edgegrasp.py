@@ -225,10 +225,7 @@ class Furthest:
         self._vectors = torch.zeros(groups, 3, width)
 
     def add(self, both: Tensor, groups: list[int], sizes: list[int]) -> None:
-        """Add vectors and directions (p, 3, 2 width), with the number of rows of each group.
-
-        All at once unless in float32 inference.
-        """
+        """Add vectors and directions (p, 3, 2 width), and the number of rows of each group."""
         if float32_inference(both):
             bounds = np.cumsum([0, *sizes[: len(groups)]])
             these = slice(groups[0], groups[-1] + 1)
@@ -289,10 +286,7 @@ def _relu_rows(both: Float32, result: Float32) -> None:
 
 @_compiled
 def _furthest_rows(both: Float32, bounds: Int64, best: Float32, result: Float32) -> None:
-    """The furthest vectors of the rows of `both` between each two of `bounds`; the first of a tie.
-
-    Continues from the vectors in `result` and their reach in `best`.
-    """
+    """The furthest vectors of the rows between each two of `bounds`, if beyond `result`."""
     width = result.shape[2]
     furthest = np.empty(width, np.int32)
     for i in range(len(bounds) - 1):
