@@ -7,16 +7,16 @@ all alike: a new design beside the old one.
 """
 
 import argparse
+import itertools
 import statistics
 import time
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from benchmarks.measuring import RESULTS, machine, served, write_results
@@ -32,23 +32,11 @@ START_SECONDS = 1.0  # from the order to the first request: clouds are made
 OK = "OK"
 
 
-@dataclass(frozen=True)
-class Task:
-    """The share of one process."""
-
-    address: str  # of the server
-    clients: int  # requests at a time
-    start: float  # moment of `time.monotonic` of the first request
-    seconds: float  # how long requests are sent
-    seed: int = 0  # of the cloud
-
-
-@dataclass(frozen=True)
-class Sample:
+class Sample(NamedTuple):
     """The outcome of one request."""
 
     seconds: float  # until its answer or error
-    detector_seconds: float | None  # of the detection, as the answer says; None without an answer
+    beyond: float  # of these, outside of the detector; NaN without an answer
     code: str  # OK, or the name of the client's error
 
 
@@ -61,7 +49,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=8.0, help="of each run")
     parser.add_argument("--rounds", type=int, default=3, help="turns of each server")
     given = parser.parse_args()
-    results: dict[str, Any] = {"machine": machine(), "points": POINTS, **OPTIONS}
+    results: dict[str, Any] = {"machine": machine(), "points": POINTS, **OPTIONS, "servers": []}
     with ExitStack() as stack:
         servers = {address: address for address in given.server or ()}
         if not servers:
@@ -69,73 +57,59 @@ def main() -> None:
             servers = {"grpc": own.grpc_address, "rest": own.http_url}
         pool = stack.enter_context(ProcessPoolExecutor(PROCESSES, mp_context=get_context("spawn")))
         list(pool.map(time.sleep, [START_SECONDS] * PROCESSES))  # until all processes have started
-        results["servers"] = closed_loops(pool, servers, given)
+        runs: dict[tuple[int, str], list[list[Sample]]] = {}
+        for _, clients, name in itertools.product(range(given.rounds), given.clients, servers):
+            samples = send(pool, servers[name], clients, given.seconds)
+            runs.setdefault((clients, name), []).append(samples)
+    for (clients, name), found in runs.items():
+        rates = [sum(one.code == OK for one in run) / given.seconds for run in found]
+        row = {"server": name, "clients": clients, "per_second": statistics.median(rates)}
+        results["servers"].append(row | summary(list(itertools.chain(*found))))
+        print(results["servers"][-1], flush=True)
     write_results(given.output, "load", results)
 
 
-def closed_loops(
-    pool: ProcessPoolExecutor, servers: dict[str, str], given: argparse.Namespace
-) -> list[dict[str, Any]]:
-    """A row for each server and number of clients, over all rounds."""
-    samples: dict[tuple[int, str], list[list[Sample]]] = {}
-    for _ in range(given.rounds):
-        for clients in given.clients:
-            for name, address in servers.items():
-                task = Task(address, clients, 0.0, given.seconds)
-                samples.setdefault((clients, name), []).append(send(pool, task))
-    rows = []
-    for (clients, name), runs in samples.items():
-        rates = [sum(one.code == OK for one in run) / given.seconds for run in runs]
-        row = {"server": name, "clients": clients, "per_second": statistics.median(rates)}
-        rows.append(row | summary([one for run in runs for one in run]))
-        print(rows[-1], flush=True)
-    return rows
-
-
-def send(pool: ProcessPoolExecutor, task: Task) -> list[Sample]:
-    """Share a task among the processes, as many as it has clients at most."""
-    processes = min(PROCESSES, task.clients)
+def send(pool: ProcessPoolExecutor, address: str, clients: int, seconds: float) -> list[Sample]:
+    """Share the clients among the processes."""
+    processes = min(PROCESSES, clients)
     start = time.monotonic() + START_SECONDS
-    share = replace(task, clients=task.clients // processes, start=start)
-    shares = [replace(share, seed=number) for number in range(processes)]
-    return [sample for samples in pool.map(run_clients, shares) for sample in samples]
+    shares = [
+        pool.submit(run_clients, address, clients // processes, start, seconds, seed)
+        for seed in range(processes)
+    ]
+    return [sample for share in shares for sample in share.result()]
 
 
-def run_clients(task: Task) -> list[Sample]:
-    """Send until the time is over; every request that was sent has its sample."""
-    points = cloud(POINTS, task.seed)
+def run_clients(
+    address: str, clients: int, start: float, seconds: float, seed: int
+) -> list[Sample]:
+    """Send from `start` on until the time is over; every request that was sent has its sample."""
+    points = cloud(POINTS, seed)
 
-    def work() -> list[Sample]:
+    def work(_: int) -> list[Sample]:
         samples = []
-        with GraspClient(task.address, timeout=TIMEOUT, retry=False) as client:
-            time.sleep(max(0.0, task.start - time.monotonic()))
-            while time.monotonic() < task.start + task.seconds:
-                samples.append(request(client, points))
+        with GraspClient(address, timeout=TIMEOUT, retry=False) as client:
+            time.sleep(max(0.0, start - time.monotonic()))
+            while (begun := time.monotonic()) < start + seconds:
+                try:
+                    code, detector = OK, client.detect(points, **OPTIONS).seconds["total"]
+                except GraspClientError as error:
+                    code, detector = type(error).__name__, np.nan
+                took = time.monotonic() - begun
+                samples.append(Sample(took, took - detector, code))
         return samples
 
-    with ThreadPoolExecutor(task.clients) as threads:
-        work_of_each = [threads.submit(work) for _ in range(task.clients)]
-        return [sample for one in work_of_each for sample in one.result()]
-
-
-def request(client: GraspClient, points: Float32) -> Sample:
-    """Send one request."""
-    begun = time.monotonic()
-    try:
-        answer = client.detect(points, **OPTIONS)
-    except GraspClientError as error:
-        return Sample(time.monotonic() - begun, None, type(error).__name__)
-    return Sample(time.monotonic() - begun, answer.seconds["total"], OK)
+    with ThreadPoolExecutor(clients) as threads:
+        return [sample for samples in threads.map(work, range(clients)) for sample in samples]
 
 
 def summary(samples: Sequence[Sample]) -> dict[str, Any]:
     """Counts of outcomes, and times in milliseconds."""
     answered = [one for one in samples if one.code == OK]
-    beyond = [one.seconds - one.detector_seconds for one in answered if one.detector_seconds]
     return {
         "codes": dict(Counter(one.code for one in samples)),
         "answered_ms": percentiles([one.seconds for one in answered]),
-        "beyond_the_detector_ms": percentiles(beyond),
+        "beyond_the_detector_ms": percentiles([one.beyond for one in answered]),
     }
 
 

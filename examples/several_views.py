@@ -11,7 +11,7 @@ import sys
 
 import numpy as np
 
-from edgegrasp_cli.detect import open_client
+from edgegrasp_cli.detect import DetectorFlags, open_client
 from edgegrasp_client import DepthImage
 from edgegrasp_sim.camera import CAMERA, EVALUATION_VIEWS
 from edgegrasp_sim.simulation import ClutterSimulation
@@ -31,7 +31,8 @@ def views(simulation: ClutterSimulation, rng: np.random.Generator) -> list[Depth
 
 def main(address: str = "127.0.0.1:50051", scenes: str = "1") -> None:
     """Print a line for each scene."""
-    with ClutterSimulation() as simulation, open_client(address, 60.0, {}) as client:
+    asked = DetectorFlags(server=address)
+    with ClutterSimulation() as simulation, open_client(asked) as client:
         for number in range(int(scenes)):
             rng = np.random.default_rng([0, number])
             simulation.reset(("packed", "pile")[number % 2], rng, num_objects=5)

@@ -3,7 +3,8 @@
 usage: python scripts/trace_request.py [--list]
 
 The server's front runs in this process with real workers; the worker's part is run again here, so
-that both are traced. A depth image of the samples is sent; what is loaded at the start is left out.
+that both are traced. A depth image of the samples is sent; what is loaded at the start, or goes on
+from before, is left out.
 """
 
 import asyncio
@@ -19,7 +20,7 @@ from PIL import Image
 from edgegrasp_service.server import Server
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer, load_catalogue
-from edgegrasp_service.worker.job import Job
+from edgegrasp_service.worker.process import Job
 
 ROOT = Path(__file__).parents[1]
 entered: set[tuple[str, str]] = set()  # file and function
@@ -29,7 +30,9 @@ def note(frame: FrameType, event: str, _: object) -> None:
     """Keep a function of the project that is called."""
     file, name = Path(frame.f_code.co_filename), frame.f_code.co_qualname
     ours = any(file.is_relative_to(ROOT / folder) for folder in ("clients", "model", "service"))
-    if event == "call" and ours and not name.endswith(">"):  # no lambda, no comprehension
+    if event != "call" or not ours or name.endswith(">"):  # no lambda, no comprehension
+        return
+    if frame.f_code.co_code[frame.f_lasti + 1] == 0:  # of RESUME: not after an await
         entered.add((str(file.relative_to(ROOT)), name))
 
 

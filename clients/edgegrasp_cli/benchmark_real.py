@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from edgegrasp_cli.detect import Device, Grippers, Weights, open_client
+from edgegrasp_cli.detect import DetectorFlags, open_client
 from edgegrasp_cli.flags import (
     CONNECTION,
-    Server,
-    Timeout,
+    given_flags,
+    model_flags,
     option_flags,
     parse_option_flags,
     takes_flags,
@@ -36,18 +36,16 @@ ON_SUPPORT, BACKGROUND, NO_READING = (92, 112, 140), (48, 48, 52), (0, 0, 0)  # 
 CAPTION = "\nwhite: labelled objects    green: labelled plane    pink: the plane found"
 
 
-@takes_flags(connection=CONNECTION, options=option_flags(*DECIDED))
+@takes_flags(
+    flags=model_flags(DetectorFlags), connection=CONNECTION, options=option_flags(*DECIDED)
+)
 def benchmark_real(
     scenes: Annotated[list[Path], Option(help="Folder of scenes, .npz; may be repeated.")],
     output: Annotated[
         Path, Option(help="Folder for results.json, index.html and pictures of each scene.")
     ] = Path("results/real"),
-    server: Server = None,
-    timeout: Timeout = 60.0,
-    weights: Weights = None,
-    grippers: Grippers = None,
-    device: Device = "cpu",
     *,
+    flags: dict[str, Any],
     connection: dict[str, Any],
     options: dict[str, Any],
 ) -> None:
@@ -62,12 +60,13 @@ def benchmark_real(
     from edgegrasp_cli.planners import model_used
     from edgegrasp_cli.real_scenes import BEST, judge, load_scenes
 
+    asked = given_flags(DetectorFlags, flags)
     fields, loaded = parse_option_flags(options), load_scenes(scenes)
     output.mkdir(parents=True, exist_ok=True)
     done: dict[str, SceneFigures] = {}
-    with open_client(server, timeout, connection, weights, grippers, device) as client:
+    with open_client(asked, connection) as client:
         model = model_used(client, fields.get("model", ""))
-        gripper = _gripper(model.gripper, grippers, fields)
+        gripper = _gripper(model.gripper, asked.grippers, fields)
         _ask(client, loaded[0], fields)  # loading and compiling take time
         for scene in track(loaded, "scenes", console=Console(stderr=True)):
             start = time.perf_counter()
@@ -109,12 +108,12 @@ def _labels(
     return np.full(len(scene.points), UNLABELLED)
 
 
-def _gripper(name: str, files: Sequence[Path] | None, options: Mapping[str, Any]) -> "Gripper":
+def _gripper(name: str, files: Sequence[Path], options: Mapping[str, Any]) -> "Gripper":
     """The gripper named by the options, else the model's."""
     from edgegrasp_model.gripper import choose_gripper, load_gripper
     from edgegrasp_model.options import parse_options
 
-    own = {file.stem: load_gripper(file) for file in files or ()}
+    own = {file.stem: load_gripper(file) for file in files}
     return choose_gripper(parse_options(options), load_gripper(name), own)
 
 

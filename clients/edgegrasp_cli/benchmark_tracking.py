@@ -12,8 +12,8 @@ import numpy as np
 import typer
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_cli.detect import Device, Weights, open_client
-from edgegrasp_cli.flags import CONNECTION, Server, takes_flags
+from edgegrasp_cli.detect import DetectorFlags, open_client
+from edgegrasp_cli.flags import CONNECTION, given_flags, model_flags, takes_flags
 
 if TYPE_CHECKING:
     from edgegrasp_camera.arrays import Float64
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 Option = typer.Option
 RATE = 30.0  # images a second
-TIMEOUT = 60.0  # seconds for a server's answer
 NOISE, MISSING = (0.0003, 0.0015), 0.005  # metres, and for each square metre of depth; of pixels
 EYE, TARGET = np.array([0.15, -0.35, 0.65]), np.array([0.15, 0.15, 0.05])  # of the camera, metres
 OBJECTS = 3  # in a simulated scene
@@ -159,7 +158,7 @@ class SimulatedScene(Scene):
         self.simulation.move(self.held, place.tolist(), turn.as_quat().tolist())
 
 
-@takes_flags(connection=CONNECTION)
+@takes_flags(flags=model_flags(DetectorFlags), connection=CONNECTION)
 def benchmark_tracking(
     scenes: Annotated[
         list[Path] | None, Option(help="Folder of recorded still scenes, .npz; else simulated.")
@@ -175,10 +174,8 @@ def benchmark_tracking(
     output: Annotated[Path, Option(help="Folder for results.json and jitter.svg.")] = Path(
         "results/tracking"
     ),
-    server: Server = None,
-    weights: Weights = None,
-    device: Device = "cpu",
     *,
+    flags: dict[str, Any],
     connection: dict[str, Any],
 ) -> None:
     """Follow a grasp at 30 images a second, then execute it in simulation.
@@ -189,15 +186,16 @@ def benchmark_tracking(
     names = motion or (["still"] if scenes else list(MOTIONS))
     if unknown := [name for name in names if name not in MOTIONS]:
         raise ValueError(f"--motion: got {unknown[0]!r}. Choose one of {', '.join(MOTIONS)}.")
-    clock = time.perf_counter if server else time.process_time
+    asked = given_flags(DetectorFlags, flags)
+    clock = time.perf_counter if asked.server else time.process_time
     done: dict[str, list[Followed]] = {}
-    with open_client(server, TIMEOUT, connection, weights, None, device) as client:
+    with open_client(asked, connection) as client:
         for name in names:
-            asked = MOTIONS[name]
-            asked = replace(asked, seconds=asked.seconds if seconds is None else seconds)
-            made = recorded(scenes) if scenes else simulated(objects, asked, rounds)
+            moving = MOTIONS[name]
+            moving = replace(moving, seconds=moving.seconds if seconds is None else seconds)
+            made = recorded(scenes) if scenes else simulated(objects, moving, rounds)
             for label, scene in made:
-                followed = follow(client, scene, asked.seconds, clock)
+                followed = follow(client, scene, moving.seconds, clock)
                 if followed.first is not None:
                     followed.success = scene.execute(followed)
                     if name == "still":

@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -18,8 +19,6 @@ from edgegrasp_camera.files import pixels, sent_cloud
 from edgegrasp_camera.picture import draw_detection
 from edgegrasp_cli.flags import (
     CONNECTION,
-    Server,
-    Timeout,
     connect,
     given_flags,
     model_flags,
@@ -35,18 +34,26 @@ if TYPE_CHECKING:
 Option = typer.Option
 PICTURES = (".png", ".jpg", ".jpeg")
 
-Weights = Annotated[
-    list[Path] | None,
-    Option(help="Weights file or folder besides those that ship, without a server."),
-]
-Grippers = Annotated[list[Path] | None, Option(help="Gripper file (.toml), without a server.")]
 Cloud = Annotated[
     Path | None, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
 ]
-Device = Annotated[str, Option(help="auto, cpu, cuda or cuda:N, without a server.")]
 
 
-class DetectFlags(BaseModel):
+class DetectorFlags(BaseModel):
+    """The flags that choose a server, or a detector in this process."""
+
+    server: str | None = Field(
+        None, description="host:port (gRPC) or http://host:port; else in this process"
+    )
+    timeout: float = Field(60.0, description="Seconds to wait for a server")
+    weights: tuple[Path, ...] = Field(
+        (), description="Weights file or folder besides those that ship, without a server"
+    )
+    grippers: tuple[Path, ...] = Field((), description="Gripper file (.toml), without a server")
+    device: str = Field("cpu", description="auto, cpu, cuda or cuda:N, without a server")
+
+
+class DetectFlags(DetectorFlags):
     """The flags of `edgegrasp detect` beside the options of the detection."""
 
     depth: tuple[Path, ...] = Field(
@@ -86,15 +93,6 @@ class DetectFlags(BaseModel):
     trajectory: Path | None = Field(
         None, description="JSON file to write the arm's motion to the best pick to"
     )
-    server: str | None = Field(
-        None, description="host:port (gRPC) or http://host:port; else in this process"
-    )
-    timeout: float = Field(60.0, description="Seconds to wait for a server")
-    weights: tuple[Path, ...] = Field(
-        (), description="Weights file or folder besides those that ship, without a server"
-    )
-    grippers: tuple[Path, ...] = Field((), description="Gripper file (.toml), without a server")
-    device: str = Field("cpu", description="auto, cpu, cuda or cuda:N, without a server")
 
 
 @takes_flags(
@@ -134,9 +132,8 @@ def detect(
         from edgegrasp_client import on_mask
 
         fields = dict(on_mask(pixels(asked.mask), fields))
-    own = asked.weights, asked.grippers, asked.device
     waiting = Console(stderr=True).status("Looking for grasps…")
-    with waiting, open_client(asked.server, asked.timeout, connection, *own) as client:
+    with waiting, open_client(asked, connection) as client:
         detection = client.detect(file, depth_images=images, colors=colors, **fields)
     if asked.picture is not None:
         draw_detection(asked.picture, detection, sent_cloud(file, images), fields, colors)
@@ -150,14 +147,8 @@ def detect(
         _print_detection(detection)
 
 
-@takes_flags(connection=CONNECTION)
-def models(
-    server: Server = None,
-    timeout: Timeout = 60.0,
-    weights: Weights = None,
-    *,
-    connection: dict[str, Any],
-) -> None:
+@takes_flags(flags=model_flags(DetectorFlags), connection=CONNECTION)
+def models(*, flags: dict[str, Any], connection: dict[str, Any]) -> None:
     """List the weights that can be used, here or on a server."""
     from rich import box
     from rich.console import Console
@@ -167,7 +158,8 @@ def models(
     architecture = Column("architecture", no_wrap=True)
     table = Table(name, architecture, "parameters", "gripper", "device", box=box.SIMPLE)
     waiting = Console(stderr=True).status("Loading weights…")
-    with waiting, open_client(server, timeout, connection, weights) as client:
+    asked = given_flags(DetectorFlags, flags)
+    with waiting, open_client(asked, connection) as client:
         found = client.models()
     for row in found:
         table.add_row(
@@ -181,17 +173,12 @@ def models(
 
 
 def open_client(
-    server: str | None,
-    timeout: float,
-    connection: Mapping[str, Any],
-    weights: Sequence[Path] | None = None,
-    grippers: Sequence[Path] | None = None,
-    device: str = "cpu",
+    asked: DetectorFlags, connection: Mapping[str, Any] = MappingProxyType({})
 ) -> AbstractContextManager[Any]:
     """A client of a server, or an OwnDetector if no server is given."""
-    if server:
-        return connect(server, timeout, **connection)
-    return nullcontext(OwnDetector(weights or (), grippers or (), device))
+    if asked.server:
+        return connect(asked.server, asked.timeout, **connection)
+    return nullcontext(OwnDetector(asked.weights, asked.grippers, asked.device))
 
 
 class OwnDetector:
@@ -199,7 +186,9 @@ class OwnDetector:
 
     robot: str | None = None  # a name or file, in place of the name in a request
 
-    def __init__(self, weights: Sequence[Path], grippers: Sequence[Path], device: str) -> None:
+    def __init__(
+        self, weights: Sequence[Path] = (), grippers: Sequence[Path] = (), device: str = "cpu"
+    ) -> None:
         self._load = weights, grippers, device
 
     def detect(

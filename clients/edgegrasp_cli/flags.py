@@ -20,9 +20,6 @@ Flags: TypeAlias = list[inspect.Parameter]
 PLAIN = (bool, int, float, str, Path)  # types that a flag takes directly
 TOKEN_VARIABLE = "EDGEGRASP_CLIENT_TOKEN"
 
-Server = Annotated[
-    str | None, typer.Option(help="host:port (gRPC) or http://host:port; else in this process.")
-]
 Timeout = Annotated[float, typer.Option(help="Seconds to wait for a server.")]
 
 

@@ -132,7 +132,7 @@ class _OneThread(OwnDetector):
     """A detector whose sums do not depend on how many threads the process has."""
 
     def __init__(self, weights: Sequence[Path], robot: str | None, timeout: float) -> None:
-        super().__init__(weights, (), "cpu")
+        super().__init__(weights)
         self.robot = robot
 
     def detect(self, cloud: Any = None, **options: Any) -> Any:

@@ -22,7 +22,7 @@ from edgegrasp_service.front.grpc import ERROR_METADATA, error_detail
 from edgegrasp_service.front.http import METHODS, requested_timeout
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer, load_catalogue, load_robots
-from edgegrasp_service.worker.job import Answer, Facts, Job, Method
+from edgegrasp_service.worker.process import Answer, Facts, Job, Method
 
 
 @serve.deployment(max_ongoing_requests=1, user_config={})

@@ -10,7 +10,7 @@ import typer
 
 if TYPE_CHECKING:
     from edgegrasp_service.settings import Settings
-    from edgegrasp_service.worker.job import Answer, Job
+    from edgegrasp_service.worker.process import Answer, Job
 
 Option = typer.Option
 
@@ -82,7 +82,7 @@ def request(
 def answer_again(file: Path, settings: "Settings") -> "tuple[Job, Answer, Answer]":
     """A recorded request, the answer that is recorded, and the answer now; raises ValueError."""
     from edgegrasp_service.worker import answer as worker
-    from edgegrasp_service.worker.job import Answer, Job, receive
+    from edgegrasp_service.worker.process import Answer, Job, receive
 
     with file.open("rb") as stream:
         job, recorded = receive(stream), receive(stream)

@@ -23,7 +23,7 @@ from prometheus_client.exposition import choose_encoder
 
 from edgegrasp_service.errors import Problem
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import Facts, Transport
+from edgegrasp_service.worker.process import Facts, Transport
 
 REQUEST_ID_HEADER = "x-request-id"  # of HTTP requests and answers, and in gRPC metadata of both
 
@@ -89,14 +89,7 @@ def network_of(address: str) -> str:
     return str(mapped or ipaddress.ip_network((int(found) >> 64 << 64, 64)))
 
 
-CALL: ContextVar[Call | None] = ContextVar("call", default=None)  # of the running task
-
-
-def current_call() -> Call:
-    """The call of the running task."""
-    call = CALL.get()
-    assert call is not None, "outside of the middleware"
-    return call
+CALL: ContextVar[Call | None] = ContextVar("call", default=None)  # of the running task, for logs
 
 
 # Logs: JSON lines, written by a thread so that logging never delays a request

@@ -16,7 +16,7 @@ import orjson
 from pydantic import BaseModel, ConfigDict, Field
 
 from edgegrasp_service.errors import DiskFull, InvalidSettings, PayloadTooLarge
-from edgegrasp_service.worker.job import Answer, Job, pack
+from edgegrasp_service.worker.process import Answer, Job, pack
 
 logger = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ class Recorder:
 
     def record(self, job: Job, answer: Answer) -> None:
         """Queue one request and its answer for writing."""
-        size = job.size + len(answer.body)
+        size = sum(map(len, job.parts)) + len(answer.body)
         if not self._hold(size):
             logger.warning("%s is not recorded: the disk is too slow", job.request_id)
             return

@@ -33,8 +33,8 @@ from edgegrasp_service.observability import LogQueue, Metrics, log_call, start_l
 from edgegrasp_service.recording import Recorder, check_outcomes
 from edgegrasp_service.security import ServerTls, load_tokens
 from edgegrasp_service.settings import UNIX, Settings
-from edgegrasp_service.worker.job import PIECE
 from edgegrasp_service.worker.pool import NURSERY, WorkerPool
+from edgegrasp_service.worker.process import PIECE
 
 logger = logging.getLogger(__name__)
 

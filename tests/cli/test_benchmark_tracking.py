@@ -25,7 +25,7 @@ def test_the_grasp_of_a_recorded_scene_stays_where_it_is(run, tmp_path: Path) ->
 
 
 def test_the_grasp_of_an_object_on_a_belt_moves_with_it() -> None:
-    client = OwnDetector((), (), "cpu")
+    client = OwnDetector()
     scenes = simulated(None, MOTIONS["belt-10"], 1)
     _, scene = next(scenes)
     done = follow(client, scene, 0.2, clock=lambda: 0.0)

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_cli import main
-from edgegrasp_service.worker.job import Answer, Facts, Job
+from edgegrasp_service.worker.process import Answer, Facts, Job
 
 HEAVY = {
     "torch",

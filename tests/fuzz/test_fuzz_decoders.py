@@ -21,7 +21,7 @@ from edgegrasp_model.request_cloud import GIVEN, PER_POINT, File, decode_cloud
 from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer
-from edgegrasp_service.worker.job import Job
+from edgegrasp_service.worker.process import Job
 
 from .conftest import (
     DEPTH_IMAGE,

@@ -23,7 +23,7 @@ from edgegrasp_results import Detection
 from edgegrasp_robot import load_robots
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer
-from edgegrasp_service.worker.job import Job
+from edgegrasp_service.worker.process import Job
 
 SETTINGS = Settings(robots=(Path("fr3"),))
 

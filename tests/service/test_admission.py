@@ -123,7 +123,7 @@ async def test_a_body_larger_than_all_the_bytes_comes_in_alone() -> None:
 
 async def test_a_deadline_that_cannot_be_met_is_refused() -> None:
     inside = Inside(Admission(workers=2, max_waiting=10, max_bytes=100))
-    inside.admission.worked(4.0)
+    inside.admission.took.append(4.0)
     for _ in range(3):
         await inside.enter("a")
     assert not (await inside.enter("b", seconds=5.0)).done()  # nobody knows when bodies arrive
@@ -140,7 +140,7 @@ async def test_a_deadline_that_cannot_be_met_is_refused() -> None:
 
 async def test_an_empty_server_tries_any_deadline() -> None:
     inside = Inside(Admission(workers=1, max_waiting=10, max_bytes=100))
-    inside.admission.worked(1000.0)
+    inside.admission.took.append(1000.0)
     assert not (await inside.enter("a", seconds=0.5)).done()
     await inside.leave()
 
@@ -149,7 +149,7 @@ async def test_one_slow_request_does_not_change_the_pace() -> None:
     """One of 18 s among many of 50 ms, and then nobody with 5 s was let in."""
     inside = Inside(Admission(workers=1, max_waiting=10, max_bytes=100))
     for seconds in (0.05, 0.05, 18.0, 0.05):
-        inside.admission.worked(seconds)
+        inside.admission.took.append(seconds)
     for _ in range(5):
         assert not (await inside.enter("a", seconds=5.0)).done()
     await inside.leave()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_service.worker.job import Answer, Job
+from edgegrasp_service.worker.process import Answer, Job
 
 
 def grown(running) -> int:

@@ -19,7 +19,7 @@ from edgegrasp_model.results import Pace
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer
-from edgegrasp_service.worker.job import Job
+from edgegrasp_service.worker.process import Job
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from edgegrasp_service.front.admission import Admission
 from edgegrasp_service.recording import Recorder
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import answer
-from edgegrasp_service.worker.job import Answer, Facts, Job
+from edgegrasp_service.worker.process import Answer, Facts, Job
 
 
 async def test_recorded_requests_are_replayed(serve, transport, cloud, tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ import statistics
 from collections import Counter, deque
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 
 from edgegrasp_service.errors import DeadlineExceeded, Overloaded, ServiceError
 
@@ -13,23 +14,23 @@ LATEST = 15  # latest service times, whose median is the pace; one slow request 
 MARGIN = 1.5  # the wait is estimated from a median, and half of the requests take longer
 
 
+@dataclass(eq=False)
 class Ticket:
     """The slot of one request in the server."""
 
-    def __init__(self, client: str) -> None:
-        self.client = client
-        self.whole = False  # whether its body has arrived
-        self.at_work = False  # whether a worker has started it
-        self.bytes = 0
-        self.left = False
-        self._reason: ServiceError | None = None
-        self._timeout: asyncio.Timeout | None = None
+    client: str
+    timeout: asyncio.Timeout  # that ends it
+    whole: bool = False  # whether its body has arrived
+    at_work: bool = False  # whether a worker has started it
+    bytes: int = 0
+    left: bool = False
+    reason: ServiceError | None = None  # why it was refused
 
     def refuse(self, reason: ServiceError) -> None:
         """End the request with an error, at any stage."""
-        self._reason = reason
-        if self._timeout is not None and not self._timeout.expired():
-            self._timeout.reschedule(asyncio.get_running_loop().time())
+        self.reason = reason
+        if not self.timeout.expired():
+            self.timeout.reschedule(asyncio.get_running_loop().time())
 
 
 class Admission:
@@ -52,7 +53,7 @@ class Admission:
         self._tickets: list[Ticket] = []  # in the order they came
         self._client_bytes: Counter[str] = Counter()
         self._waiting: deque[asyncio.Future[None]] = deque()  # for bytes
-        self._took: deque[float] = deque(maxlen=LATEST)  # seconds of the latest jobs
+        self.took: deque[float] = deque(maxlen=LATEST)  # seconds of the latest jobs of workers
         self._empty = asyncio.Event()
         self._empty.set()
 
@@ -72,19 +73,27 @@ class Admission:
             Overloaded: There is no place, or its turn would come after its deadline.
             DeadlineExceeded: The deadline passed inside.
         """
-        self._check_pace(deadline)
+        remaining = deadline - asyncio.get_running_loop().time()
+        if remaining <= 0.0:
+            raise DeadlineExceeded()
+        wait = self._wait
+        if self._tickets and wait * MARGIN > remaining:
+            raise self._full(
+                f"{len(self._tickets)} requests come first, which take about {wait:.3g} s, and "
+                f"the deadline is {remaining:.3g} s away"
+            )
         self._make_room(client)
-        ticket = Ticket(client)
+        ticket = Ticket(client, asyncio.timeout_at(deadline))
         self._tickets.append(ticket)
         self._empty.clear()
         try:
-            async with asyncio.timeout_at(deadline) as ticket._timeout:
+            async with ticket.timeout:
                 await self._reserve(ticket, size)
                 yield ticket
         except TimeoutError:
-            if ticket._timeout is None or not ticket._timeout.expired():
+            if not ticket.timeout.expired():
                 raise
-            raise ticket._reason or DeadlineExceeded() from None
+            raise ticket.reason or DeadlineExceeded() from None
         finally:
             self._leave(ticket)
 
@@ -116,12 +125,6 @@ class Admission:
             ticket.bytes = size
             self._wake()
 
-    def _wake(self) -> None:
-        for waiting in self._waiting:
-            if not waiting.done():
-                waiting.set_result(None)
-        self._waiting.clear()
-
     def hold(self, size: int) -> bool:
         """Reserve bytes of no request, or free them (negative); returns whether they fit."""
         if size > 0 and self.held_bytes + size > self._max_bytes:
@@ -131,9 +134,11 @@ class Admission:
             self._wake()
         return True
 
-    def worked(self, seconds: float) -> None:
-        """Record how long a worker took."""
-        self._took.append(seconds)
+    def _wake(self) -> None:
+        for waiting in self._waiting:
+            if not waiting.done():
+                waiting.set_result(None)
+        self._waiting.clear()
 
     def refuse_all(self, reason: ServiceError) -> None:
         """End every request with an error."""
@@ -147,25 +152,12 @@ class Admission:
     @property
     def _wait(self) -> float:
         """Estimated seconds until a worker begins a new request."""
-        pace = statistics.median(self._took) if self._took else 0.0
+        pace = statistics.median(self.took) if self.took else 0.0
         ahead = sum(ticket.whole for ticket in self._tickets)  # others' bodies may be late
         return max(0, ahead + 1 - self._workers) * pace / self._workers
 
-    def _check_pace(self, deadline: float) -> None:
-        remaining = deadline - asyncio.get_running_loop().time()
-        if remaining <= 0.0:
-            raise DeadlineExceeded()
-        wait = self._wait
-        if self._tickets and wait * MARGIN > remaining:
-            seconds = _whole_seconds(wait)
-            raise Overloaded(
-                f"The deadline is {remaining:.3g} s away, and {len(self._tickets)} requests come "
-                f"first, which take about {wait:.3g} s. Try again in {seconds} s.",
-                seconds,
-            )
-
     def _full(self, why: str) -> Overloaded:
-        seconds = _whole_seconds(self._wait)
+        seconds = max(1, math.ceil(self._wait))  # as the header Retry-After has them
         return Overloaded(f"The server is busy: {why}. Try again in {seconds} s.", seconds)
 
     async def _reserve(self, ticket: Ticket, size: int) -> None:
@@ -193,8 +185,3 @@ class Admission:
             del self._client_bytes[ticket.client]
         if not self._tickets:
             self._empty.set()
-
-
-def _whole_seconds(wait: float) -> int:
-    """Whole seconds, at least 1, as the header Retry-After has them."""
-    return max(1, math.ceil(wait))

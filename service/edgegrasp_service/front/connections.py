@@ -15,6 +15,7 @@ import time
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,7 +32,7 @@ from edgegrasp_service.errors import (
 )
 from edgegrasp_service.observability import network_of
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import PIECE
+from edgegrasp_service.worker.process import PIECE
 
 # Connections of HTTP
 HEALTH_PLACES = 16  # beside max_connections, never held by requests to /v1/
@@ -63,13 +64,14 @@ LAST_RECEIVED = struct.Struct("52xI")  # of struct tcp_info: tcpi_last_data_recv
 T = TypeVar("T")
 
 
+@dataclass(eq=False)
 class Place:
     """One of the places below."""
 
-    def __init__(self, owner: str, lose: Callable[[], None]) -> None:
-        self.owner, self.lose = owner, lose
-        self.idle = True  # can be evicted
-        self.used = time.monotonic()
+    owner: str
+    lose: Callable[[], None]  # called on eviction
+    idle: bool = True  # can be evicted
+    used: float = field(default_factory=time.monotonic)
 
 
 class Places:
@@ -187,7 +189,7 @@ class HttpProtocol(HttpToolsProtocol):
         self._write_timer: asyncio.TimerHandle | None = None
         self._header_timer: asyncio.TimerHandle | None = None
         self._header_bytes = 0
-        self._in_headers = self._receiving = True
+        self._in_headers = True
         self._pieces = self._body_bytes = 0
         self._refusal: EdgeGraspError | None = None  # why the parser is ended
         self._place = Place("", lambda: None)
@@ -196,9 +198,7 @@ class HttpProtocol(HttpToolsProtocol):
         """Take a place, and wait for the first headers."""
         super().connection_made(transport)
         transport.max_size = PIECE  # read in one turn of the event loop
-        self.transport = _GentleTransport(  # type: ignore[assignment]
-            transport, lambda: self._receiving
-        )
+        self.transport = _GentleTransport(transport, self._receiving)  # type: ignore[assignment]
         self._await_headers()
         try:
             owner = network_of(self.client[0] if self.client else "")
@@ -223,20 +223,19 @@ class HttpProtocol(HttpToolsProtocol):
         """Prepare for a new request."""
         super().on_message_begin()
         self.scope["state"]["abort"] = self.transport.abort
-        self._receiving = True
         self._pieces = self._body_bytes = 0
         self._await_headers()
 
     def on_headers_complete(self) -> None:
         """Mark the connection as busy for requests to /v1/."""
-        self._in_headers = False
-        _cancel(self._header_timer)
-        self._header_timer = None
         try:
             self._places.use(self._place, idle=not self.url.startswith(b"/v1/"))
         except Overloaded as error:
             self._refusal = error
             raise  # ends the parser too
+        self._in_headers = False
+        _cancel(self._header_timer)
+        self._header_timer = None
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
@@ -248,11 +247,6 @@ class HttpProtocol(HttpToolsProtocol):
             self._refusal = InvalidRequest("body", value, "Send larger pieces.")
             raise self._refusal  # ends the parser too
         super().on_body(body)
-
-    def on_message_complete(self) -> None:
-        """Note that the whole request has arrived."""
-        self._receiving = False
-        super().on_message_complete()
 
     def on_response_complete(self) -> None:
         """Mark the connection as idle."""
@@ -301,6 +295,10 @@ class HttpProtocol(HttpToolsProtocol):
             self.cycle.message_event.set()
         self.transport.write(head.encode() + body)
         self.transport.close()
+
+    def _receiving(self) -> bool:
+        """Whether more of a request is to come."""
+        return self._in_headers or self.cycle is None or self.cycle.more_body
 
     def _await_headers(self) -> None:
         self._in_headers = True

@@ -54,9 +54,9 @@ from edgegrasp_service.front.connections import (
     send,
 )
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
-from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, current_call
+from edgegrasp_service.observability import REQUEST_ID_HEADER, Call
 from edgegrasp_service.settings import UNIX
-from edgegrasp_service.worker.job import Job, Method
+from edgegrasp_service.worker.process import Job, Method
 
 logger = logging.getLogger(__name__)
 
@@ -75,7 +75,7 @@ DOMAIN = "edgegrasp"  # of google.rpc.ErrorInfo
 ERROR_METADATA = "edgegrasp-error-bin"  # trailing: an ErrorDetail
 STATUS_METADATA = "grpc-status-details-bin"  # trailing: a google.rpc.Status
 
-Behaviour = Callable[[Any], Awaitable[None]]  # takes the context
+Behaviour = Callable[[Call, Any], Awaitable[None]]  # takes the call and its context
 
 
 class GrpcServer:
@@ -205,32 +205,29 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
                     self._service.authorize(call, headers.get("authorization"))
                 if call.long:
                     await context.send_initial_metadata(name)
-                await behave(context)
+                await behave(call, context)
             except Cancelled:
                 raise asyncio.CancelledError from None  # an error could not be sent either
             except EdgeGraspError as error:
-                await _abort(context, report(error))
+                await _abort(call, context, report(error))
             except aio.AbortError:
                 raise
             except Exception as error:
                 logger.exception("%s failed", method)
-                await _abort(context, report(error))
+                await _abort(call, context, report(error))
 
-    async def _answer(self, method: Method, context: Any) -> None:
-        service, call = self._service, current_call()
+    async def _answer(self, method: Method, call: Call, context: Any) -> None:
+        service = self._service
         async with service.admit(call, service.settings.max_body_bytes) as ticket:
-            answer = await service.answer(call, ticket, await self._read_job(method, context))
+            body = await receive(service.settings, context.read())
+            if body is EOF:
+                raise InvalidRequest("request", "nothing", "Send one message.")
+            answer = await service.answer(call, ticket, Job(method, "grpc", body))
             if answer.error is not None:
-                await _abort(context, answer.error)
+                await _abort(call, context, answer.error)
             await send(service.settings, context.write(answer.body), call.bytes_out)
 
-    async def _read_job(self, method: Method, context: Any) -> Job:
-        body = await receive(self._service.settings, context.read())
-        if body is EOF:
-            raise InvalidRequest("request", "nothing", "Send one message.")
-        return Job(method, "grpc", body)
-
-    async def _stream(self, context: Any) -> None:
+    async def _stream(self, call: Call, context: Any) -> None:
         """Answer the requests of one stream in their order; several are processed in parallel.
 
         A request is read only when fewer than `max_stream_requests` are unanswered; flow control
@@ -242,7 +239,7 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
             RequestTimeout: No message came for long.
             Overloaded: There is no place for the stream, or it was given to another client.
         """
-        service, call = self._service, current_call()
+        service = self._service
         ahead: deque[asyncio.Task[bytes]] = deque()  # unanswered requests
         stopping = asyncio.create_task(service.stopping.wait())
         reading: asyncio.Task[Any] | None = asyncio.create_task(_next_request(context))
@@ -272,36 +269,35 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
                 if task is not None:
                     task.cancel()
 
-    async def _list_models(self, context: Any) -> None:
+    async def _list_models(self, call: Call, context: Any) -> None:
         models = [grasp_pb2.Model(**facts) for facts in self._service.loaded().models]
         await context.write(grasp_pb2.ListModelsResponse(models=models))
 
-    async def _list_robots(self, context: Any) -> None:
+    async def _list_robots(self, call: Call, context: Any) -> None:
         robots = [grasp_pb2.Robot(**facts) for facts in self._service.loaded().robots]
         await context.write(grasp_pb2.ListRobotsResponse(robots=robots))
 
-    async def _reload_models(self, context: Any) -> None:
-        call = current_call()
+    async def _reload_models(self, call: Call, context: Any) -> None:
         models = [grasp_pb2.Model(**facts) for facts in await self._reloader.reload(call)]
         await context.write(grasp_pb2.ReloadModelsResponse(models=models))
 
-    async def _check_health(self, context: Any) -> None:
+    async def _check_health(self, call: Call, context: Any) -> None:
         request = await self._read_health(context)
         if request.service not in ("", SERVICE.full_name):
-            await _abort(context, _not_found(grpc.StatusCode.NOT_FOUND, request.service))
+            await _abort(call, context, _not_found(grpc.StatusCode.NOT_FOUND, request.service))
         status = STATES.SERVING if self._service.ready else STATES.NOT_SERVING
         await context.write(health_pb2.HealthCheckResponse(status=status))
 
-    async def _watch_health(self, context: Any) -> None:
+    async def _watch_health(self, call: Call, context: Any) -> None:
         request = await self._read_health(context)
-        async with self._watchers.hold(current_call().client):
+        async with self._watchers.hold(call.client):
             await self._checks.Watch(request, context)
 
     async def _read_health(self, context: Any) -> Any:
         kind = health_pb2.HealthCheckRequest
         return await self._read_small(kind, context) or kind()
 
-    async def _reflect(self, context: Any) -> None:
+    async def _reflect(self, call: Call, context: Any) -> None:
         async def requests() -> AsyncIterator[Any]:
             kind = reflection_pb2.ServerReflectionRequest
             while (message := await self._read_small(kind, context)) is not None:
@@ -324,8 +320,8 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
             raise _no_message(data) from None
 
 
-async def _unimplemented(context: Any) -> None:
-    await _abort(context, _not_found(grpc.StatusCode.UNIMPLEMENTED, "Method not found!"))
+async def _unimplemented(call: Call, context: Any) -> None:
+    await _abort(call, context, _not_found(grpc.StatusCode.UNIMPLEMENTED, "Method not found!"))
 
 
 def _not_found(code: grpc.StatusCode, detail: str) -> Problem:
@@ -347,9 +343,8 @@ def _address(peer: str) -> str:
     return urllib.parse.unquote(peer).partition(":")[2].rpartition(":")[0].strip("[]")
 
 
-async def _abort(context: Any, problem: Problem) -> NoReturn:
+async def _abort(call: Call, context: Any, problem: Problem) -> NoReturn:
     """End a call with an error: our ErrorDetail, google.rpc's details and the request id."""
-    call = current_call()
     call.problem = problem
     code = grpc.StatusCode[problem.code]
     status = Status(code=code.value[0], message=problem.detail, details=_details(problem))

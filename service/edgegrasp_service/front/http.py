@@ -41,8 +41,8 @@ from edgegrasp_service.front.connections import (
     Places,
 )
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
-from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics, current_call
-from edgegrasp_service.worker.job import PIECE, Answer, Job, Method
+from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics
+from edgegrasp_service.worker.process import PIECE, Answer, Job, Method
 
 logger = logging.getLogger(__name__)
 
@@ -126,7 +126,8 @@ class HttpMiddleware:
                     message = {**message, "headers": [*message.get("headers", []), *extra]}
                 await send(message)
 
-            scope = {**scope, "app": self}  # with it, routing raises what is not there
+            # With an app, routing raises what is not there.
+            scope = {**scope, "app": self, "call": call}
             if scope["method"] == "HEAD":  # the protocol leaves the body out
                 scope["method"] = "GET"
             try:
@@ -152,6 +153,7 @@ class HttpMiddleware:
             yield
 
     def _check(self, scope: Scope, call: Call, headers: dict[str, str]) -> None:
+        """Refuse headers that are too large, a foreign host, a wrong token, a compressed body."""
         size = sum(len(name) + len(value) for name, value in scope["headers"])
         size += len(scope["raw_path"]) + len(scope["query_string"])
         most = self._service.settings.max_header_bytes
@@ -168,18 +170,15 @@ class HttpMiddleware:
         """Refuse host names that a malicious web page may have pointed here (DNS rebinding)."""
         name = re.sub(r":\d*$", "", host).strip("[]").lower()
         allowed = self._service.settings.allowed_hosts
-        if not allowed and (self._service.tokens.required or "." not in name or is_address(name)):
+        if not allowed and (self._service.tokens.required or "." not in name):
             return  # such names cannot be registered
-        if name not in allowed and "*" not in allowed and name != self._service.settings.host:
-            fix = "Use an address of the server, or name it in the setting allowed_hosts."
-            raise InvalidRequest("Host", brief(host), fix)
-
-
-def is_address(name: str) -> bool:
-    """Whether it is an IP address."""
-    with suppress(ValueError):
-        return bool(ipaddress.ip_address(name))
-    return False
+        if name in allowed or "*" in allowed or name == self._service.settings.host:
+            return
+        with suppress(ValueError):
+            if not allowed and ipaddress.ip_address(name):
+                return
+        fix = "Use an address of the server, or name it in the setting allowed_hosts."
+        raise InvalidRequest("Host", brief(host), fix)
 
 
 def create_router(service: GraspService, metrics: Metrics, reloader: Reloader) -> Router:
@@ -193,7 +192,7 @@ def create_router(service: GraspService, metrics: Metrics, reloader: Reloader) -
         return JSONResponse({"robots": service.loaded().robots})
 
     async def reload(request: Request) -> Response:
-        return JSONResponse({"models": await reloader.reload(current_call())})
+        return JSONResponse({"models": await reloader.reload(request.scope["call"])})
 
     async def ready(request: Request) -> Response:
         status = "ready" if service.ready else "not ready"
@@ -264,13 +263,17 @@ class _Work:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request; raises the errors of `GraspService`."""
-        service, call, headers = self._service, current_call(), Headers(scope=scope)
+        service, call, headers = self._service, scope["call"], Headers(scope=scope)
         call.limit(requested_timeout(headers))
         size = int(headers.get("content-length", service.settings.max_body_bytes))
         async with service.admit(call, size) as ticket:
             job = self._read_job(scope, headers, receive)
             answer = await _unless_gone(receive, service.answer(call, ticket, await job))
-            sending = _send_answer(call, answer, send)
+            if answer.error is not None:
+                response = _problem_response(call, answer.error)
+            else:
+                response = Response(answer.body, media_type="application/json")
+            sending = _send_slowly(response, send)
             await connections.send(service.settings, sending, call.bytes_out)
 
     async def _read_job(self, scope: Scope, headers: Headers, receive: Receive) -> Job:
@@ -292,14 +295,6 @@ class _Work:
         query = scope["query_string"].decode("latin-1")
         content_type = headers.get("content-type", "")
         return Job(self._method, "http", b"", 0.0, content_type, query, pieces=pieces)
-
-
-async def _send_answer(call: Call, answer: Answer, send: Send) -> None:
-    if answer.error is not None:
-        response = _problem_response(call, answer.error)
-    else:
-        response = Response(answer.body, media_type="application/json")
-    await _send_slowly(response, send)
 
 
 async def _send_slowly(response: Response, send: Send) -> None:

@@ -27,8 +27,8 @@ from edgegrasp_service.front.admission import Admission, Ticket
 from edgegrasp_service.observability import CALL, Call
 from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens, load_tokens
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import Answer, Job
 from edgegrasp_service.worker.pool import CRASH_FIX, CRASHED, WORKER_LOST, WorkerPool
+from edgegrasp_service.worker.process import Answer, Job
 
 logger = logging.getLogger(__name__)
 
@@ -125,7 +125,7 @@ class GraspService:
             WorkerLost: The worker died for another reason.
         """
         call.end_stage("read")
-        call.bytes_in = job.size
+        call.bytes_in = sum(map(len, job.parts))
         self.check_size(call.bytes_in)
         self.admission.resize(ticket, call.bytes_in)
         ticket.whole = True
@@ -140,7 +140,7 @@ class GraspService:
             await self._harmful.note(job, 1 if isinstance(error, WorkerLost) else MOST_DEATHS)
             raise
         finally:
-            self.admission.worked(time.monotonic() - began)
+            self.admission.took.append(time.monotonic() - began)
             ticket.at_work = False
         if answer.error is None:
             await self._harmful.forget(job)

@@ -27,8 +27,7 @@ from edgegrasp_service.errors import (
 )
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import http_bodies, messages
-from edgegrasp_service.worker.job import Answer, Facts, Job
-from edgegrasp_service.worker.process import limited_memory
+from edgegrasp_service.worker.process import Answer, Facts, Job, limited_memory
 
 if TYPE_CHECKING:
     from edgegrasp_model.detector import ModelCatalogue
@@ -127,17 +126,11 @@ class _Work:
     def _detect(self) -> Detection:
         with self._stage("decode"):
             detector, cloud, options, _ = self._decode()
-        if options.robot is None:
-            detection, _ = self._grasps(detector, cloud, options)
-        else:
-            detection = self._picks(detector, cloud, options, options.robot.name)
-        self.facts.grasps = len(detection.grasps)
-        return detection
+        robot = None if options.robot is None else self._robot(options.robot.name)
+        if robot is not None:
+            from edgegrasp_robot import plan_picks, with_robot
 
-    def _grasps(
-        self, detector: Any, cloud: CloudInput, options: DetectOptions
-    ) -> tuple[Detection, Any]:
-        """The detection and its prepared request."""
+            asked, options = options, with_robot(options, robot)
         with self._stage("prepare"):
             most = self._within_deadline(self._settings.max_voxels, self._catalogue.pace.voxel)
             prepared = detector.prepare(cloud, options, most)
@@ -145,23 +138,21 @@ class _Work:
         with self._stage("network"):
             logits = detector.evaluate(prepared)
         with self._stage("finish"):
-            return detector.finish(prepared, logits), prepared
+            detection: Detection = detector.finish(prepared, logits)
+        if robot is not None:
+            until = self._deadline - TO_ENCODE * self._job.remaining
+            with self._stage("arm"):
+                detection = plan_picks(detection, prepared.scene, cloud.points, asked, robot, until)
+        self.facts.grasps = len(detection.grasps)
+        return detection
 
-    def _picks(
-        self, detector: Any, cloud: CloudInput, options: DetectOptions, name: str
-    ) -> Detection:
-        """The detection with the arm's plans for its grasps."""
+    def _robot(self, name: str) -> "Robot":
+        """The robot that a request names."""
         robots = load_robots(self._settings)
         if name not in robots:
             fix = f"Use one of: {', '.join(robots)}." if robots else "Set the setting `robots`."
             raise InvalidRequest("options.robot.name", repr(name), fix)
-        from edgegrasp_robot import plan_picks, with_robot
-
-        robot = robots[name]
-        detection, prepared = self._grasps(detector, cloud, with_robot(options, robot))
-        until = self._deadline - TO_ENCODE * self._job.remaining
-        with self._stage("arm"):
-            return plan_picks(detection, prepared.scene, cloud.points, options, robot, until)
+        return robots[name]
 
     def _score(self) -> Scoring:
         with self._stage("decode"):

@@ -24,7 +24,7 @@ from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.request_cloud import CAMERA, GIVEN, PER_POINT, File
 from edgegrasp_results import Detection, Scoring
 from edgegrasp_service.errors import UnsupportedMediaType
-from edgegrasp_service.worker.job import Job
+from edgegrasp_service.worker.process import Job
 
 JSON, FORM = "application/json", "multipart/form-data"
 FILE_TYPES = {f"application/x-{name}": name for name in FILE_FORMATS}

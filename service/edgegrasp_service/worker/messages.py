@@ -17,7 +17,7 @@ from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import MAX_CANDIDATES, MAX_ROWS
 from edgegrasp_model.request_cloud import PER_POINT, File
 from edgegrasp_results import Detection, Scoring
-from edgegrasp_service.worker.job import Job
+from edgegrasp_service.worker.process import Job
 
 MAX_PARTS = 64  # most messages in a repeated field; no option takes more
 MAX_GIVEN = {"edges": MAX_CANDIDATES, "hand_poses": MAX_CANDIDATES}

@@ -17,8 +17,17 @@ from typing import Any
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import HarmfulRequest, InvalidSettings, WorkerLost, kind_of
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import HEADER, PIECE, Answer, Job, pack, receive, unpack
-from edgegrasp_service.worker.process import ENDED, LOST
+from edgegrasp_service.worker.process import (
+    ENDED,
+    HEADER,
+    LOST,
+    PIECE,
+    Answer,
+    Job,
+    pack,
+    receive,
+    unpack,
+)
 
 # -P: nothing is imported from the folder the server was started in.
 NURSERY = (sys.executable, "-P", "-m", "edgegrasp_service.worker.process")

@@ -1,11 +1,11 @@
-"""The nursery, which loads everything once, and the workers that fork from it.
+"""Worker processes: their messages with the front, the workers, and the nursery they fork from.
 
 usage: python -m edgegrasp_service.worker.process SETTINGS    as JSON; standard input: the pool's
 socket
 
 `main` runs the nursery. It imports and loads what a worker needs, then forks a worker whenever the
 pool asks for one; that takes milliseconds, and memory is shared until written to. The nursery never
-has a second thread.
+has a second thread. A message has plain values as JSON, and a body as bytes.
 """
 
 import contextlib
@@ -18,19 +18,109 @@ import socket
 import struct
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, Literal
 
 from edgegrasp_model.errors import EdgeGraspError
-from edgegrasp_service.errors import WorkerLost, report
+from edgegrasp_service.errors import Problem, WorkerLost, report
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import Answer, Facts, Ready, pack, receive
 
 ORPHAN_SECONDS = 10.0  # seconds after its deadline at which a worker ends itself if nobody kills it
 ENDED = struct.Struct("=ii")  # the nursery's message about a worker: process id and wait status
 LOST = "The worker of this request died or ran out of memory. Try again, or send fewer points."
+HEADER = struct.Struct(">QQ")  # bytes of a message's JSON, and of the body that follows it
+PIECE = 2**16  # bytes of a body that the front reads or writes at a time
+
+Method = Literal["DetectGrasps", "ScoreGrasps", "RecordOutcome", "Beat"]  # Beat: nothing
+Transport = Literal["http", "grpc"]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One request as it arrived; the front passes it on undecoded."""
+
+    method: Method
+    transport: Transport
+    body: bytes  # of HTTP, or the serialized request message
+    remaining: float = 0.0  # seconds until its deadline at the time it was handed over
+    content_type: str = ""  # HTTP: the header as sent
+    query: str = ""  # HTTP: the query string, without the question mark
+    request_id: str = ""  # for the worker's log
+    pieces: Sequence[bytearray] = ()  # the body where the front has it in pieces
+
+    @property
+    def parts(self) -> Sequence[bytes | bytearray]:
+        """The body, in one or more parts."""
+        return self.pieces or (self.body,)
+
+
+@dataclass
+class Facts:
+    """Facts about a request for logs and metrics, as far as it got."""
+
+    model: str = ""  # name of the weights
+    points: int = 0  # in the cloud as sent, holes included
+    grasps: int = 0  # returned, or evaluated if given by the caller
+    seconds: dict[str, float] = field(default_factory=dict)  # of each stage, in order
+    counts: dict[str, int] = field(default_factory=dict)  # what passed each stage
+    options: str = ""  # options that differ from the defaults, as shortened JSON
+    traceback: str = ""  # of an internal error
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The result of a job."""
+
+    body: bytes  # JSON, or the serialized response message; empty for an error
+    facts: Facts
+    error: Problem | None = None  # None: a success
+
+
+@dataclass(frozen=True)
+class Ready:
+    """The first message of the nursery and of each worker."""
+
+    pid: int
+    models: list[dict[str, Any]]  # the catalogue's description of its weights; from workers
+    failure: str = ""  # why loading failed
+    robots: list[dict[str, Any]] = field(default_factory=list)  # the description of each robot
+
+
+MESSAGES = {kind.__name__: kind for kind in (Ready, Job, Answer)}
+
+
+def pack(message: Any) -> Sequence[bytes | bytearray]:
+    """Serialize one of MESSAGES: lengths, plain fields as JSON, and the body without a copy."""
+    fields = {name: one for name, one in vars(message).items() if name not in ("body", "pieces")}
+    text = json.dumps([type(message).__name__, fields], default=vars).encode()
+    parts = message.parts if isinstance(message, Job) else (getattr(message, "body", b""),)
+    return HEADER.pack(len(text), sum(map(len, parts))) + text, *parts
+
+
+def unpack(text: bytes, body: bytes) -> Any:
+    """Deserialize a message from its plain fields, as JSON, and its body."""
+    name, fields = json.loads(text)
+    if name != "Ready":
+        fields["body"] = body
+    if name == "Answer":
+        fields["facts"] = Facts(**fields["facts"])
+        fields["error"] = fields["error"] and Problem(**fields["error"])
+    return MESSAGES[name](**fields)
+
+
+def receive(file: BinaryIO) -> Any:
+    """The next message; None: there are no more."""
+    head = file.read(HEADER.size)
+    if len(head) < HEADER.size:
+        return None
+    length, body_length = HEADER.unpack(head)
+    return unpack(file.read(length), file.read(body_length))
+
+
+# The nursery and its workers
 
 
 def main(settings_json: str, load: Callable[[Settings], Any] | None = None) -> None:
@@ -132,4 +222,6 @@ def _send(to: socket.socket, message: object) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    from edgegrasp_service.worker import process  # whose messages workers make
+
+    process.main(sys.argv[1])

@@ -10,7 +10,7 @@ from edgegrasp.v1 import grasp_pb2
 from edgegrasp_service.errors import Problem
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer
-from edgegrasp_service.worker.job import Answer, Job
+from edgegrasp_service.worker.process import Answer, Job
 
 
 class Asker:

@@ -9,7 +9,7 @@ from benchmarks.dummy import DummyCatalogue
 
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer
-from edgegrasp_service.worker.job import Job
+from edgegrasp_service.worker.process import Job
 
 
 class FailingCatalogue(DummyCatalogue):
