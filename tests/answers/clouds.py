@@ -52,13 +52,6 @@ def with_table(points: np.ndarray, seed: int) -> np.ndarray:
     return np.concatenate([points, (table + noise).astype(np.float32)])
 
 
-def turned(points: np.ndarray, angle: float) -> np.ndarray:
-    """Turn about the x axis, so that the table's normal leans toward -y; radians."""
-    sine, cosine = np.sin(angle), np.cos(angle)
-    matrix = np.array([[1.0, 0.0, 0.0], [0.0, cosine, -sine], [0.0, sine, cosine]])
-    return (points.astype(np.float64) @ matrix.T).astype(np.float32)
-
-
 CAMERA = {"fx": 220.0, "fy": 220.0, "cx": 79.5, "cy": 59.5}  # pixels
 T_CLOUD_CAMERA = np.array(  # looks down at the table from 0.5 m, tilted by 30 degrees
     [
@@ -136,18 +129,6 @@ def pile_ransac() -> Case:
     return seen("pile_7-000013_0", 2, model="edgegrasp", collision=collision, **few)
 
 
-def organised_mask() -> Case:
-    points = points_of(drawn_image())
-    mask = np.zeros(points.shape[:2], dtype=bool)
-    mask[:, 60:130] = True
-    options = {
-        "viewpoint": T_CLOUD_CAMERA[:3, 3].tolist(),
-        "support": {"normal": (0.0, 0.0, 1.0), "offset": 0.0},
-        "approach_region": {"include": [{"kind": "mask", "mask": mask.ravel().tolist()}]},
-    }
-    return Case(options | {"suppression": None, "top_k": 40, "seed": 2}, points)
-
-
 def depth_image() -> Case:
     support = {"normal": (0.0, 0.0, 1.0), "offset": 0.0, "max_depth_error": 0.05}
     options = {"model": "edgegrasp-small", "support": support, "min_score": 0.9, "seed": 9}
@@ -204,50 +185,6 @@ def segments_own_gripper() -> Case:
     return case
 
 
-def robotiq_side() -> Case:
-    side = {"preset": "side"}
-    options = {"gripper": "robotiq-2f-85", "approach_direction": side, "collision": "ignore"}
-    return seen("packed_7-000014_0", model="edgegrasp-small", seed=8, **options)
-
-
-def obstacles_clearance() -> Case:
-    wall = {"center": (0.0, 0.1, 0.1), "half_extents": (0.01, 0.2, 0.1)}
-    turn = {"quaternion": (0.0, 0.0, 0.25881904510252074, 0.9659258262890683)}
-    obstacles = [
-        {"kind": "box", "min": (0.27, 0.0, 0.05), "max": (0.3, 0.3, 0.25)},
-        {"kind": "oriented_box"} | wall | turn,
-    ]
-    ways = {"approach_length": 0.04, "retreat_length": 0.06, "retreat_direction": "up"}
-    collision = {"margin": 0.001, "opening": 0.07, "obstacles": obstacles} | ways
-    return seen("packed_7-000004_0", collision=collision, order="clearance", seed=10)
-
-
-def indices_highest_debug() -> Case:
-    name = "packed_7-000008_0"
-    rows = list(range(len(view(name)["points"]) // 2))
-    options = {
-        "workspace": {"min": (0.0, 0.0, 0.0), "max": (0.3, 0.2, 0.3)},
-        "approach_region": {"include": [{"kind": "indices", "indices": rows}]},
-        "approach_direction": {"preset": "top-down"},
-        "num_approach_points": 8,
-        "num_candidates": 300,
-    }
-    return seen(name, order="highest", debug=True, seed=12, **options)
-
-
-def tilted_up() -> Case:
-    name, angle = "pile_7-000005_0", 0.4
-    options = {
-        "viewpoint": turned(np.array(camera(name)), angle).tolist(),
-        "up": (0.0, -np.sin(angle), np.cos(angle)),
-        "support": {"kind": "ransac"},
-        "approach_direction": {"preset": "top-down"},
-    }
-    case = seen(name, 4, seed=13, **options)
-    case.points = turned(case.points, angle)
-    return case
-
-
 def score_edges() -> Case:
     name = "packed_7-000012_0"
     case, arrays = seen(name, seed=15), view(name)
@@ -267,7 +204,6 @@ def score_hand_poses() -> Case:
     return case
 
 
-MAKERS = (packed_plane, pile_ransac, organised_mask, depth_image, two_views, given_normals)
-MAKERS += (segments_own_gripper, robotiq_side, obstacles_clearance, indices_highest_debug)
-MAKERS += (tilted_up, score_edges, score_hand_poses)
+MAKERS = (packed_plane, pile_ransac, depth_image, two_views, given_normals)
+MAKERS += (segments_own_gripper, score_edges, score_hand_poses)
 CASES = {make.__name__: make for make in MAKERS}

@@ -27,7 +27,6 @@ GRASP_FIELDS = (
     "collision_free",
     "clearance",
 )
-DEBUG_FIELDS = ("points", "normals", "approach_index", "contact_index", "T_cloud_hand", "score")
 
 Record = tuple[dict[str, Any], dict[str, np.ndarray]]
 
@@ -61,11 +60,6 @@ def record(answer: Any) -> Record:
         name: np.array([getattr(grasp, name) for grasp in grasps], dtype=np.float32)
         for name in GRASP_FIELDS
     }
-    debug = getattr(answer, "debug", None)
-    if debug is not None:
-        plain["outcomes"] = [str(outcome) for outcome in debug.outcome]
-        plain["support_plane"] = np.asarray(debug.support_plane).tolist()
-        arrays |= {f"debug_{name}": np.asarray(getattr(debug, name)) for name in DEBUG_FIELDS}
     return plain, arrays
 
 

@@ -14,12 +14,7 @@ TIED = 2e-5  # scores that differ by less may change places
 
 def assert_same(found: Record, expected: Record) -> None:
     (plain, arrays), (expected_plain, expected_arrays) = found, expected
-    plane, expected_plane = (each.get("support_plane", ()) for each in (plain, expected_plain))
-    assert plane == pytest.approx(expected_plane, abs=CLOSE)
-    assert plain | {"support_plane": ()} == expected_plain | {"support_plane": ()}
-    assert arrays.keys() == expected_arrays.keys()
-    for name in arrays.keys() - set(GRASP_FIELDS):
-        np.testing.assert_allclose(arrays[name], expected_arrays[name], rtol=0, atol=CLOSE)
+    assert plain == expected_plain
     assert len(arrays["score"]) == len(expected_arrays["score"])
     if "reasons" in plain:  # each evaluation has its own place
         for name in GRASP_FIELDS:

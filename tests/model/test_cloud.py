@@ -2,23 +2,13 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.scene.cloud import (
-    CUBE,
     CloudInput,
-    Neighbors,
     check_cloud,
-    estimate_normals,
-    orient_normals,
     seen_from_origin,
-    statistical_outlier_removal,
-    voxelise,
 )
-
-from .scenes import SEED
 
 GOOD = np.random.default_rng(0).uniform(0.0, 0.3, (12, 3)).astype(np.float32)
 
@@ -93,48 +83,3 @@ def test_a_camera_at_the_origin_sees_what_lies_wholly_in_front_of_it() -> None:
     assert not seen_from_origin(seen, (0, 0, 1.0))  # it would look straight up
     assert not seen_from_origin(seen - (0, 0, 0.8), None)
     assert not seen_from_origin(seen + np.array([1.5, 0, 0]), None)
-
-
-def voxel_means(points: np.ndarray, size: float) -> np.ndarray:
-    return voxelise(points, size).mean(points)
-
-
-def sphere(count: int = 2000, radius: float = 0.05) -> np.ndarray:
-    points = np.random.default_rng(1).normal(size=(count, 3))
-    return (radius * points / np.linalg.norm(points, axis=1, keepdims=True)).astype(np.float32)
-
-
-@given(seed=st.integers(0, SEED), size=st.floats(0.002, 0.1))
-def test_voxels_are_means_of_the_points_in_them_whatever_their_order(seed, size) -> None:
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(-0.2, 0.2, (300, 3)).astype(np.float32)
-    voxels = voxel_means(points, size)
-    np.testing.assert_allclose(voxels, voxel_means(rng.permutation(points), size), atol=1e-7)
-    low = points.min(axis=0).astype(np.float64)
-    by_cell: dict[tuple[int, ...], list[np.ndarray]] = {}
-    for point in points:
-        cell = tuple(int(c) for c in np.floor((point - low) / size))
-        by_cell.setdefault(cell, []).append(point)
-    in_order = sorted(by_cell, key=lambda cell: ([c // CUBE for c in cell], cell))
-    means = np.array([np.mean(by_cell[cell], axis=0) for cell in in_order])
-    np.testing.assert_allclose(voxels, means, atol=1e-6)
-
-
-def test_a_far_point_is_an_outlier_and_a_surface_is_not() -> None:
-    surface = voxel_means(sphere(), 0.005)
-    cloud = np.vstack([surface, [[0.3, 0.3, 0.3]]]).astype(np.float32)
-    kept = cloud[statistical_outlier_removal(Neighbors.within(cloud))]
-    assert not (kept == 0.3).any()
-    assert len(kept) > 0.9 * len(surface)
-
-
-def test_normals_of_a_sphere_are_radial_and_face_the_camera() -> None:
-    points = voxel_means(sphere(), 0.004)
-    viewpoint = np.array([0.0, 0.0, 1.0], dtype=np.float32)
-    normals = orient_normals(points, estimate_normals(points, Neighbors.within(points)), viewpoint)
-    radial = points / np.linalg.norm(points, axis=1, keepdims=True)
-    cosine = (normals * radial).sum(axis=1)
-    assert np.median(np.abs(cosine)) > 0.98
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
-    assert ((normals * (viewpoint - points)).sum(axis=1) >= 0).all()
-    assert (cosine[points[:, 2] > 0.02] > 0.9).all()

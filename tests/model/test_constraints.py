@@ -17,7 +17,6 @@ from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Detection, Grasp
 
-from .oracles import any_point_in_boxes, signed_distance_to_boxes
 from .scenes import box_on_table, detector
 
 CASES = 75  # for each seed
@@ -349,3 +348,28 @@ def check_suppression(fields: dict, grasps: list[Grasp]) -> None:
         )
         near = np.linalg.norm(tcp[:i] - tcp[i], axis=1) < rule["translation"] - 1e-6
         assert not (near & (angle < rule["rotation"] - 2e-3)).any()
+
+
+def in_hand(points: np.ndarray, T_cloud_hand: np.ndarray) -> np.ndarray:
+    """Points (N, 3) in the frames of hands (E, 4, 4).  # (E, N, 3)."""
+    shifted = points.astype(np.float64) - T_cloud_hand[:, None, :3, 3]
+    return shifted @ T_cloud_hand[:, :3, :3].astype(np.float64)
+
+
+def any_point_in_boxes(
+    points: np.ndarray, T_cloud_hand: np.ndarray, boxes: np.ndarray
+) -> np.ndarray:
+    """Which hands (E,) have a point in one of their boxes (B, 2, 3)."""
+    position = in_hand(points, T_cloud_hand)[:, :, None]  # (E, N, 1, 3)
+    inside = ((position > boxes[:, 0]) & (position < boxes[:, 1])).all(axis=3)
+    return inside.any(axis=(1, 2))
+
+
+def signed_distance_to_boxes(
+    points: np.ndarray, T_cloud_hand: np.ndarray, boxes: np.ndarray
+) -> np.ndarray:
+    """Least signed distance (E,) of points to the boxes (B, 2, 3) of each hand."""
+    position = in_hand(points, T_cloud_hand)[:, :, None]  # (E, N, 1, 3)
+    beyond = np.maximum(boxes[:, 0] - position, position - boxes[:, 1])
+    outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=3)
+    return np.where(outside > 0, outside, beyond.max(axis=3)).min(axis=(1, 2))

@@ -14,6 +14,7 @@ from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequ
 from edgegrasp_model.networks.checkpoint import save_checkpoint
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Outcome
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Detection
 
 from .rendered import FOCAL_LENGTH, HEIGHT, WIDTH, boxes_on_table, camera, render, table
@@ -52,6 +53,38 @@ def test_several_depth_images_show_each_object_once() -> None:
     found = detector().detect(cloud, DetectOptions.model_validate({"viewpoint": cameras}))
     assert len(found.objects) == 4
     assert found.grasps
+
+
+def test_each_camera_orients_the_normals_of_what_it_saw() -> None:
+    sheets = np.random.default_rng(0).uniform(-0.1, 0.1, (6000, 3)).astype(np.float32)
+    sheets[:, 2] = np.repeat([0.3, 0.2], 3000)
+    cameras = [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
+    asked = {"viewpoint": cameras, "support": None, "objects": "off", "debug": True}
+    found = detect(CloudInput(sheets, view_ids=np.repeat([0, 1], 3000)), **asked)
+    assert found.debug is not None
+    upper = found.debug.points[:, 2] > 0.25
+    assert (found.debug.normals[upper, 2] > 0.99).all()
+    assert (found.debug.normals[~upper, 2] < -0.99).all()
+    for views, value in (
+        (None, "nothing, for 2 viewpoints"),
+        (np.repeat([0, 2], 3000), "values from 0 to 2"),
+    ):
+        with pytest.raises(InvalidRequest) as caught:
+            detect(CloudInput(sheets, view_ids=views), **asked)
+        assert (caught.value.field, caught.value.value) == ("view_ids", value)
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"support": {"normal": (0.0, 0.0, 1.0), "offset": 0.2}},
+        {"support": {"normal": (0.0, 0.6, 0.8), "offset": 0.2}, "workspace": NOWHERE},
+    ],
+    ids=["below the plane", "outside the workspace"],
+)
+def test_nothing_above_a_given_plane_is_no_error(asked: dict[str, object]) -> None:
+    found = detect(**asked)
+    assert (found.grasps, found.counts["above_support"]) == ([], 0)
 
 
 def test_a_raw_cloud_is_seen_from_its_origin_and_the_answer_says_so() -> None:

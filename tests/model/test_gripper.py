@@ -33,33 +33,6 @@ def panda_fields() -> dict[str, Any]:
     return tomllib.loads((GRIPPER_FOLDER / "panda.toml").read_text())
 
 
-@by_name
-def test_fingers_mirror_each_other_and_stand_the_opening_apart(gripper: Gripper) -> None:
-    hands, fingers = len(gripper.hand_boxes), len(gripper.finger_boxes)
-    for opening in (0.0, 0.05, gripper.max_opening):
-        boxes = gripper.boxes(opening)
-        right, left = boxes[hands : hands + fingers], boxes[hands + fingers :]
-        np.testing.assert_allclose(right[:, 0, 1].min() - left[:, 1, 1].max(), opening, atol=1e-9)
-        np.testing.assert_allclose(left[..., [0, 2]], right[..., [0, 2]])
-        np.testing.assert_allclose(left[:, :, 1], -right[:, ::-1, 1])
-        np.testing.assert_allclose(boxes[:hands], gripper.hand_boxes)
-    many = gripper.boxes(np.array([0.01, 0.05]))
-    np.testing.assert_array_equal(many, [gripper.boxes(0.01), gripper.boxes(0.05)])
-
-
-@with_linkage
-def test_swinging_fingers_stay_on_their_link_and_come_forward(gripper: Gripper) -> None:
-    opening = np.linspace(0.0, gripper.max_opening, 50)
-    advance = gripper.tip_advance(opening)
-    outward = gripper.linkage.reach - (gripper.max_opening - opening) / 2
-    ahead = np.sqrt(gripper.linkage.radius**2 - gripper.linkage.reach**2) + advance
-    np.testing.assert_allclose(np.hypot(outward, ahead), gripper.linkage.radius)
-    assert gripper.tip_advance(gripper.max_opening) == pytest.approx(0.0)
-    assert gripper.max_tip_z == pytest.approx(gripper.tip_z + advance.max(), abs=1e-5)
-    tips = gripper.boxes(opening)[:, :, 1, 2].max(axis=1)
-    np.testing.assert_allclose(tips, gripper.tip_z + advance)
-
-
 @with_linkage
 def test_a_swinging_gripper_stays_clear_of_the_support_as_it_closes(gripper: Gripper) -> None:
     down = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)[None]

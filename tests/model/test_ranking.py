@@ -1,24 +1,15 @@
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.candidates.collision import FINGER_CLEARANCE
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue
-from edgegrasp_model.hand_kernels import non_max_suppression
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import parse_options
-from edgegrasp_model.ranking import objects_first, openings
+from edgegrasp_model.ranking import openings
 
-from .scenes import PANDA, TINY, box_on_table, random_hands, scene_of
-
-
-def test_each_object_has_its_best_grasp_before_any_has_a_second() -> None:
-    score = np.array([0.9, 0.8, 0.7, 0.6, 0.4, 0.3])
-    number = np.array([2, 2, 1, 2, 3, 1])
-    order = objects_first(np.arange(6), score, number)
-    assert order.tolist() == [0, 2, 1, 3, 4, 5]  # what is on 3 is not good
+from .scenes import PANDA, TINY, box_on_table, scene_of
 
 
 @pytest.mark.parametrize(
@@ -40,28 +31,6 @@ def test_a_hand_opens_fully_where_the_far_side_is_hidden(camera, opening, hidden
     width, far_side_hidden = openings(scene, np.eye(4, dtype=np.float32)[None], PANDA)
     np.testing.assert_allclose(width, opening, atol=1e-6)
     assert far_side_hidden == hidden
-
-
-def test_of_hands_that_are_near_each_other_the_first_is_kept() -> None:
-    hands = random_hands(60, seed=1)
-    hands[:, :3, 3] = np.random.default_rng(1).uniform(0, 0.015, (60, 3))
-    hands[30:, :3, :3] = hands[:30, :3, :3] * (-1, -1, 1)  # turned about their approach
-    order = np.random.default_rng(2).permutation(60)
-    kept, dropped = non_max_suppression(hands, order, 0.01, 0.8, 60)
-    turns, flip = Rotation.from_matrix(hands[:, :3, :3]), Rotation.from_euler("z", np.pi)
-
-    def near(row: int, others: np.ndarray) -> np.ndarray:
-        apart = np.linalg.norm(hands[others, :3, 3] - hands[row, :3, 3], axis=1)
-        between = turns[row].inv() * turns[others]
-        angle = np.minimum(between.magnitude(), (between * flip).magnitude())
-        return (apart < 0.01) & (angle < 0.8)
-
-    assert 10 < len(kept) < 60
-    assert sorted([*kept, *dropped]) == list(range(60))
-    before = np.argsort(order)
-    for row in range(60):
-        earlier = kept[before[kept] < before[row]]
-        assert (row in kept) == (len(earlier) == 0 or not near(row, earlier).any())
 
 
 def hopeless() -> GraspDetector:

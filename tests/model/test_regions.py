@@ -8,23 +8,17 @@ from pydantic import ValidationError
 
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import (
-    Box,
-    HalfSpace,
     Indices,
     Mask,
-    OrientedBox,
     Region,
     Segments,
-    Sphere,
 )
 from edgegrasp_model.scene.cloud import CheckedCloud, CloudInput, check_cloud, voxelise
-from edgegrasp_model.scene.regions import check_region, inside_region, inside_shape
+from edgegrasp_model.scene.regions import check_region, inside_region
 
 from .scenes import SEED
 
 SIZE = 0.01  # edge of a voxel, metres
-QUARTER = (0, 0, np.sqrt(0.5), np.sqrt(0.5))  # turn about z: the long side along the cloud's y
-TURNED_BOX = OrientedBox(center=(1, 0, 0), half_extents=(0.5, 0.1, 0.1), quaternion=QUARTER)
 
 
 def rows(count: int = 40, seed: int = 0, **fields: object) -> CheckedCloud:
@@ -36,20 +30,6 @@ def inside(region: Region, cloud: CheckedCloud) -> tuple[np.ndarray, np.ndarray]
     """Which voxels a region holds, and the voxel of each point."""
     voxels = voxelise(cloud.points, SIZE)
     return inside_region(region, voxels.mean(cloud.points), voxels, cloud), voxels.voxel
-
-
-@pytest.mark.parametrize(
-    ("shape", "within", "outside"),
-    [
-        (Box(min=(0, 0, 0), max=(1, 2, 3)), (1, 2, 3), (1.01, 2, 3)),
-        (TURNED_BOX, (1.05, 0.45, 0), (1.45, 0.05, 0)),
-        (Sphere(center=(0, 1, 0), radius=0.5), (0, 1.4, 0.2), (0.4, 1.4, 0)),
-        (HalfSpace(normal=(0, 0, -1), offset=-2), (9, 9, 1.9), (0, 0, 2.1)),
-    ],
-)
-def test_shapes_contain_points_inside_and_none_outside(shape, within, outside) -> None:
-    points = np.array([within, outside], dtype=np.float32)
-    assert inside_shape(shape, points).tolist() == [True, False]
 
 
 @given(seed=st.integers(0, SEED))
@@ -65,21 +45,6 @@ def test_rows_contain_a_voxel_if_they_have_half_of_its_points(seed: int) -> None
         held, voxel = inside(region, cloud)
         for number, found in enumerate(held):
             assert found == (chosen[voxel == number].mean() >= 0.5)
-
-
-def test_a_region_is_what_is_included_and_not_excluded() -> None:
-    cloud = rows(200)
-    low = HalfSpace(normal=(0, 0, -1), offset=-0.015)
-    left = HalfSpace(normal=(-1, 0, 0), offset=-0.015)
-    in_low, in_left = (inside(Region(include=(one,)), cloud)[0] for one in (low, left))
-    assert (in_low & in_left).any()
-    for region, expected in (
-        (Region(include=(low,), exclude=(left,)), in_low & ~in_left),
-        (Region(include=(low, left)), in_low | in_left),
-        (Region(exclude=(left,)), ~in_left),
-        (Region(), np.ones_like(in_low)),
-    ):
-        np.testing.assert_array_equal(inside(region, cloud)[0], expected)
 
 
 def test_a_mask_may_be_an_array_lists_bytes_or_base64() -> None:

@@ -2,23 +2,16 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import SupportPlane, parse_options
-from edgegrasp_model.scene.cloud import CloudInput, check_cloud
+from edgegrasp_model.options import parse_options
+from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_model.scene.scene import build_scene, select_points
 from edgegrasp_model.scene.segment import FIXED, Segmentation
 from edgegrasp_model.scene.support import (
     Seen,
     choose_support,
-    correct_depth_scale,
-    fit_plane,
 )
-
-from .scenes import SEED
 
 CAMERA = np.array([0.0, -0.5, 0.4])
 PLANE = {"normal": (0.0, 0.0, 1.0), "offset": 0.05, "max_depth_error": 0.12}
@@ -31,30 +24,6 @@ def scene(rng: np.random.Generator, table: int = 2000, on_table: int = 1000) -> 
     box[: on_table // 2, 2] = 0.06
     points = np.concatenate([flat, box]) + np.array([0, 0, 0.05])
     return points + rng.normal(0, 0.001, points.shape)
-
-
-def largest(
-    points: np.ndarray, up: object, max_tilt: float = 0.5, seed: int = 1
-) -> SupportPlane | None:
-    """The plane of points that all count alike, without knowing the camera."""
-    up = np.asarray(up, float) / np.linalg.norm(up)
-    rng = np.random.default_rng(seed)
-    return fit_plane(Seen(points, None), np.ones(len(points)), rng, up, max_tilt)
-
-
-@given(seed=st.integers(0, SEED), share=st.floats(0.4, 0.9))
-def test_the_table_is_found_in_any_frame(seed: int, share: float) -> None:
-    rng = np.random.default_rng(seed)
-    turn, shift = Rotation.random(rng=rng), rng.uniform(-1, 1, 3)
-    table = int(3000 * share)
-    points = scene(rng, table, 3000 - table)
-    points = (turn.apply(points) + shift).astype(np.float32)
-    up = turn.apply([0.1, 0.0, 1.0])  # need not be exact
-    plane = largest(points, up, seed=seed)
-    assert plane is not None
-    normal = turn.apply([0, 0, 1])
-    assert np.dot(plane.normal, normal) > np.cos(0.03)
-    assert abs(plane.heights(shift[None] + 0.05 * normal)[0]) < 0.002
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -75,33 +44,9 @@ def test_the_floor_of_a_bin_counts_and_not_the_table_beside_it(seed: int) -> Non
     assert np.abs(found.plane.heights(floor[np.abs(floor[:, 0]) < 0.1])).max() < 0.001
 
 
-def test_a_wall_is_a_plane_only_where_it_may_be_steep() -> None:
-    rng = np.random.default_rng(1)
-    wall = (rng.uniform(-0.3, 0.3, (2000, 3)) * (1, 0, 1)).astype(np.float32)  # plane y = 0
-    assert largest(wall, (0, 0, 1), max_tilt=0.3) is None
-    plane = largest(wall, (0, 0.1, 1), max_tilt=1.6)
-    assert plane is not None
-    np.testing.assert_allclose(plane.normal, (0, 1, 0), atol=1e-4)
-
-
 def seen(points: np.ndarray, factor: float, camera: np.ndarray = CAMERA) -> np.ndarray:
     """The points as a camera sees them whose depths are wrong by a factor."""
     return (camera + factor * (points - camera)).astype(np.float32)
-
-
-def test_every_view_has_a_factor_of_its_own() -> None:
-    rng = np.random.default_rng(3)
-    cameras = np.array([CAMERA, [0.4, 0.2, 0.5], [-0.4, 0.2, 0.5]])
-    clean = [scene(rng) for _ in cameras]
-    factors = 0.96, 1.0, 1.05
-    sent = [seen(points, f, c) for points, f, c in zip(clean, factors, cameras, strict=True)]
-    ids = np.repeat(np.arange(3), [len(points) for points in sent])
-    cloud, warnings = check_cloud(CloudInput(np.concatenate(sent), view_ids=ids)), []
-    corrected = correct_depth_scale(cloud, SupportPlane(**PLANE), cameras, warnings)
-    np.testing.assert_allclose(corrected.points, np.concatenate(clean), atol=0.003)
-    assert len(warnings) == 2
-    for warning, *said in zip(warnings, ("view 0", "view 2"), ("1.04", "0.95"), strict=True):
-        assert all(text in warning for text in said)
 
 
 def built(points: np.ndarray, **support: object) -> tuple[np.ndarray, list[str]]:
