@@ -23,13 +23,6 @@ from edgegrasp_client.conversions import (
     to_frame,
 )
 
-AXES = ["x", "-x", "y", "-y", "z", "-z"]
-FRAMES = [
-    CONTACT_GRASPNET,
-    VGN,
-    graspnet_frame(0.1122),
-    *(HandFrame(a, c, 0.03) for a in AXES for c in AXES if a[-1] != c[-1]),
-]
 THUMB = FingerJoints(("thumb",), lambda opening: (0.8 - 9.0 * opening,))
 
 # The hand above the point (0.5, -0.1, 0), looking down, its fingers closing along the cloud's x.
@@ -66,15 +59,6 @@ def test_quaternions_and_matrices_are_those_of_scipy(quaternion: tuple[float, ..
     assert np.linalg.norm(found) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("frame", FRAMES, ids=lambda frame: f"{frame.approach}{frame.closing}")
-def test_the_named_axes_point_where_they_say(frame: HandFrame) -> None:
-    unit = {axis: (-1 if "-" in axis else 1) * np.eye(3)["xyz".index(axis[-1])] for axis in AXES}
-    turn = to_frame(DOWN, frame)[:3, :3]
-    np.testing.assert_allclose(turn @ unit[frame.approach], [0, 0, -1], atol=1e-12)
-    np.testing.assert_allclose(turn @ unit[frame.closing], [1, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(to_frame(DOWN, frame)[:3, 3], [0.5, -0.1, 0.3 - frame.origin_z])
-
-
 @pytest.mark.parametrize(
     ("frame", "expected"),
     [
@@ -88,25 +72,10 @@ def test_the_frames_of_others(frame: HandFrame, expected: list[list[float]]) -> 
     np.testing.assert_allclose(to_frame(DOWN, frame)[:3], expected, atol=1e-12)
 
 
-def test_many_poses_are_converted_at_once() -> None:
-    many = np.stack([DOWN, np.eye(4)]).astype(np.float32)
-    each = [to_frame(pose, VGN) for pose in many]
-    np.testing.assert_array_equal(to_frame(many, VGN), each)
-
-
 @pytest.mark.parametrize("axes", [("x", "-x"), ("up", "x"), ("x", "")])
 def test_axes_that_make_no_frame_are_refused(axes: tuple[str, str]) -> None:
     with pytest.raises(ValueError, match=r"both along x|Use one of"):
         HandFrame(*axes)
-
-
-@given(pose=poses(), T_hand_link=poses())
-def test_moveit_grasps_have_the_pose_of_the_parent_link(pose, T_hand_link) -> None:
-    sent = moveit_grasp(grasp(pose), "camera", T_hand_link=T_hand_link)["grasp_pose"]["pose"]
-    expected = pose @ T_hand_link
-    turn = Rotation.from_quat(list(sent["orientation"].values())).as_matrix()
-    np.testing.assert_allclose(turn, expected[:3, :3], atol=1e-5)
-    np.testing.assert_allclose(list(sent["position"].values()), expected[:3, 3], atol=1e-5)
 
 
 def test_the_pandas_parent_link_is_turned_by_45_degrees_at_the_same_place() -> None:

@@ -101,15 +101,6 @@ def test_edges_are_scored_in_their_order(client, cloud) -> None:
     assert scoring.seconds["total"] >= 0
 
 
-def test_hand_poses_are_scored(client, cloud) -> None:
-    found = client.detect(cloud, top_k=4)
-    poses = np.stack([grasp.T_cloud_hand for grasp in found.grasps])
-    scoring = client.score(cloud, hand_poses=poses)
-    for evaluation, grasp in zip(scoring.evaluations, found.grasps, strict=True):
-        assert evaluation.grasp is not None
-        np.testing.assert_allclose(evaluation.grasp.T_cloud_tcp, grasp.T_cloud_tcp, atol=1e-6)
-
-
 def test_scoring_over_any_cloud(client, cloud) -> None:
     edges = np.array([[0, 1], [2, 3]])
     expected = [e.grasp.score for e in client.score(cloud, edges=edges).evaluations]
@@ -117,20 +108,6 @@ def test_scoring_over_any_cloud(client, cloud) -> None:
         scoring = client.score(given, edges=edges, segment_ids=np.arange(500))
         assert [evaluation.grasp.score for evaluation in scoring.evaluations] == expected
     assert client.score(depth_images=[depth_image()], edges=edges).evaluations
-
-
-def test_debug_returns_every_candidate(client, cloud) -> None:
-    assert client.detect(cloud).debug is None
-    debug = client.detect(cloud, debug=True).debug
-    assert debug is not None
-    assert debug.points.shape == debug.normals.shape == (500, 3)
-    assert debug.T_cloud_hand.shape == (32, 4, 4)
-    for array in (debug.points, debug.normals, debug.T_cloud_hand, debug.score):
-        assert array.dtype == np.float32
-    assert debug.approach_index.dtype == debug.contact_index.dtype == np.int64
-    assert np.isnan(debug.score).sum() == 22
-    assert (debug.outcome.count("returned"), debug.outcome.count("not-scored")) == (10, 22)
-    assert debug.support_plane is None
 
 
 def test_options_too_long_for_a_query_are_sent(client, cloud) -> None:

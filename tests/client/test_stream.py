@@ -10,7 +10,6 @@ from edgegrasp_client import (
     GraspClient,
     InvalidRequestError,
     StreamRequest,
-    UnknownModelError,
 )
 
 
@@ -24,22 +23,6 @@ def test_answers_are_those_of_single_requests(client, cloud) -> None:
         found = answer.result()
         assert [grasp.score for grasp in found.grasps] == [grasp.score for grasp in alone.grasps]
         assert found.counts == alone.counts
-
-
-def test_errors_are_answers(client, cloud) -> None:
-    requests = [
-        StreamRequest(cloud, request_id="fine"),
-        StreamRequest(cloud[:0], request_id="empty"),
-        StreamRequest(cloud, request_id="model", model="none of mine"),
-        StreamRequest(cloud, request_id="fine again"),
-    ]
-    answers = list(client.detect_stream(requests))
-    assert [answer.request_id for answer in answers] == ["fine", "empty", "model", "fine again"]
-    kinds = [None if answer.error is None else type(answer.error) for answer in answers]
-    assert kinds == [None, InvalidRequestError, UnknownModelError, None]
-    assert (answers[1].error.field, answers[2].error.field) == ("cloud", "options.model")
-    with pytest.raises(UnknownModelError, match="'none of mine'"):
-        answers[2].result()
 
 
 def test_what_cannot_be_sent_ends_the_stream_after_what_went_before(client, cloud) -> None:

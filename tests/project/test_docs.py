@@ -1,7 +1,6 @@
 """The pages name what there is, their blocks run, and they make a site that needs no network."""
 
 import contextlib
-import hashlib
 import importlib.util
 import io
 import json
@@ -24,7 +23,6 @@ from tests.programs import EDGEGRASP, run
 
 from edgegrasp_cli.flags import TOKEN_VARIABLE
 from edgegrasp_cli.main import load_command
-from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_service.errors import STATUS, kind_of
 from edgegrasp_service.settings import Settings
@@ -191,28 +189,6 @@ def test_the_commands_of_the_start_pages_run_as_they_stand(tmp_path: Path) -> No
                 assert min(picture.size) > 300
             detected.add(shown)
     assert detected
-
-
-def test_no_page_installs_cuda_unasked() -> None:
-    with_torch = [
-        " ".join(words)
-        for _, words in commands()
-        if words[0] == "pip" and re.search(r"\[.*(service|model|train|dev)", words[-1])
-    ]
-    assert len(with_torch) >= 3
-    assert all("download.pytorch.org/whl/cpu" in line for line in with_torch)
-
-
-def test_the_results_say_which_weights_they_are_of() -> None:
-    files = {path.stem: path for path in WEIGHTS_FOLDER.glob("*.safetensors")}
-    files["scene"] = WEIGHTS_FOLDER.parent / "scene" / "network.safetensors"
-    shipped = {n: hashlib.sha256(file.read_bytes()).hexdigest()[:8] for n, file in files.items()}
-    tables = re.findall(r"(?:^\|.*\n)+(?:(?!\||#).*\n)*", PAGES["results.md"], re.MULTILINE)
-    lines = [re.search(r"^Weights: (.*)$", table, re.MULTILINE) for table in tables]
-    assert lines.count(None) == 1  # the figures of others
-    for line in (found[1] for found in lines if found):
-        for name, digest in re.findall(r"([\w-]+) `(\w{8})`", line):
-            assert shipped[name] == digest or f"{name} `{digest}` (not those shipped)" in line
 
 
 def test_json_and_toml_of_the_pages_can_be_read() -> None:

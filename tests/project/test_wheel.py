@@ -44,17 +44,6 @@ def test_sdist_and_wheel_hold_the_packages_and_no_caches(built: tuple[Path, Path
     assert packages == {Path(name).parent.name for name in ours if name.endswith("/py.typed")}
 
 
-def test_a_package_index_shows_a_page_without_dead_links(built: tuple[Path, Path]) -> None:
-    with zipfile.ZipFile(built[1]) as wheel:
-        (name,) = (each for each in wheel.namelist() if each.endswith(".dist-info/METADATA"))
-        page = wheel.read(name).decode()
-    links = re.findall(r"\]\(([^)]*)\)", page)
-    assert len(links) > 2
-    assert [link for link in links if not link.startswith("https://")] == []
-    assert "`docs/options.md`" in page
-    assert "Keywords: 6-dof grasping" in page
-
-
 def test_the_wheel_alone_serves(built: tuple[Path, Path], tmp_path: Path) -> None:
     """With what this environment has for it to require, and not its own edgegrasp."""
     new = tmp_path / "venv"

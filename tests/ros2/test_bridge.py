@@ -15,7 +15,6 @@ from edgegrasp_camera import InvalidRequest
 from edgegrasp_client import GraspClient, InvalidRequestError, Robot
 from edgegrasp_client.conversions import PANDA_LINK8, matrix_from_quaternion
 from edgegrasp_client.options import DetectOptions
-from edgegrasp_model.gripper import load_gripper
 from edgegrasp_results import ArmPlan, ArmTrajectory
 
 STAMP = {"sec": 12, "nanosec": 345}
@@ -123,18 +122,6 @@ def shifted(z: float) -> np.ndarray:
     return np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, z], [0, 0, 0, 1]])
 
 
-@pytest.mark.parametrize("gripper", ["panda", "robotiq-2f-140"])
-def test_markers_show_the_gripper_that_was_asked_for(client, sent, make_cloud, cloud, gripper):
-    scene, options = Scene(make_cloud(cloud)), {"gripper": gripper, "top_k": 1}
-    found = bridge.detect(client, scene, Settings(), options, lookup)
-    outline, (grasp,) = load_gripper(gripper), found.grasps
-    markers = sent("visualization_msgs/msg/MarkerArray", bridge.marker_array(found)).markers
-    ends = np.array([[p.x, p.y, p.z] for p in markers[1].points])
-    z = (ends - grasp.T_cloud_hand[:3, 3]) @ grasp.T_cloud_hand[:3, 2]
-    assert z.max() == pytest.approx(outline.tip_z, abs=1e-5)
-    assert z[1] == pytest.approx(outline.palm_z, abs=1e-5)
-
-
 def matrix(pose: Any) -> np.ndarray:
     transform = np.eye(4)
     turn = pose.orientation
@@ -239,13 +226,6 @@ def test_no_grasp_says_why(asked, sent, make_cloud, cloud) -> None:
     (each,) = sent("edgegrasp_ros2/msg/GenerateGrasps_Result", fields).results
     assert not each.success
     assert "No grasp: 500 points" in each.message
-
-
-def test_an_aborted_goal_says_why(sent) -> None:
-    fields = bridge.failed_result("mug", LookupError("no frame base"))
-    (each,) = sent("edgegrasp_ros2/msg/GenerateGrasps_Result", fields).results
-    assert (each.object_id, each.success) == ("mug", False)
-    assert each.message == "LookupError: no frame base"
 
 
 def test_a_mask_is_of_the_image_it_was_made_of_and_grows_old(make_image, camera) -> None:
@@ -372,8 +352,3 @@ def test_an_arm_that_is_not_known_is_not_planned_for(
     scene = Scene(make_cloud(cloud), joints=joints)
     with pytest.raises(ValueError, match=message):
         bridge.detect(planning, scene, Settings(), {"robot": {"name": name}}, lookup)
-
-
-def test_without_a_robot_there_is_no_trajectory(client, make_cloud, cloud) -> None:
-    found = bridge.detect(client, Scene(make_cloud(cloud)), Settings(), {}, lookup)
-    assert bridge.trajectories(found) == []

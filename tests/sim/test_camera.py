@@ -2,8 +2,6 @@ import numpy as np
 import pytest
 
 from edgegrasp_sim.camera import (
-    EVALUATION_VIEWS,
-    ViewRange,
     look_at,
     points_of,
 )
@@ -33,23 +31,3 @@ def test_a_box_appears_where_it_is(world: World, aside: float, azimuth: float) -
     top = points[points[:, 2] > CENTRE[2] + HALF[2] - 1e-4]
     assert top[:, :2].min(axis=0) == pytest.approx(CENTRE[:2] - HALF[:2], abs=1.5e-3)
     assert top[:, :2].max(axis=0) == pytest.approx(CENTRE[:2] + HALF[:2], abs=1.5e-3)
-
-
-FROM_ABOVE = ViewRange((0.5, 1.1), (0.0, 0.7), (0.0, 2 * np.pi))
-
-
-@pytest.mark.parametrize("views", [EVALUATION_VIEWS, FROM_ABOVE])
-def test_views_stay_in_their_range_and_look_at_the_target(views: ViewRange) -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        (T_world_camera,) = views.sample(rng)
-        sight = np.asarray(views.target) - T_world_camera[:3, 3]
-        radius = np.linalg.norm(sight)
-        assert views.radius[0] <= radius <= views.radius[1]
-        polar = np.arccos(-sight[2] / radius)
-        assert views.polar_angle[0] - 1e-9 <= polar <= views.polar_angle[1] + 1e-9
-        assert T_world_camera[:3, 2] == pytest.approx(sight / radius)
-        assert np.linalg.det(T_world_camera[:3, :3]) == pytest.approx(1.0)
-        assert T_world_camera[2, 1] < 0  # the image's y points down in the world
-    with pytest.raises(ValueError, match="two different points"):
-        look_at(np.zeros(3), np.zeros(3))

@@ -9,11 +9,9 @@ import pytest
 from tests.programs import run
 
 from edgegrasp_sim.camera import look_at
-from edgegrasp_sim.engine import Intrinsics, World, choose_engine, make_world
+from edgegrasp_sim.engine import Intrinsics, choose_engine, make_world
 from edgegrasp_sim.engine.urdf import read_obj, read_urdf
-from edgegrasp_sim.hand import FINGERTIP, Gripper, retreat_pose
 from edgegrasp_sim.objects import ObjectModel
-from edgegrasp_sim.poses import translation
 from edgegrasp_sim.scene import load_object
 from edgegrasp_sim.surroundings import OPEN_TABLE
 
@@ -96,20 +94,3 @@ def test_both_engines_see_the_same() -> None:
             images.append(world.render_depth(T_world_camera, Intrinsics()))
     differs = np.abs(images[0] - images[1]) > 2e-4
     assert differs.mean() < 0.002  # some pixels on edges
-
-
-def test_a_held_object_stays_where_it_is_held(world: World) -> None:
-    OPEN_TABLE.add_to(world)
-    cube = load_object(world, CUBE, (0.15, 0.15, 0.076), (0.0, 0.0, 0.0, 1.0), 1.0).body
-    hand = Gripper(world)
-    T_world_hand = np.diag([1.0, -1.0, -1.0, 1.0])
-    T_world_hand[:3, 3] = (0.15, 0.15, 0.06 + FINGERTIP)
-    hand.place(T_world_hand @ translation(0.0, 0.0, -0.05))
-    hand.move_to(T_world_hand, step_length=0.002)
-    hand.close()
-    world.step(40)
-    hand.move_to(retreat_pose(T_world_hand), step_length=0.002)
-    world.step(40)
-    before = cube.position - hand.body.position
-    world.step(160)
-    assert cube.position - hand.body.position == pytest.approx(before, abs=5e-4)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edgegrasp_sim.engine import Intrinsics
-from edgegrasp_sim.sensor import SENSORS, STRUCTURED_LIGHT, TIME_OF_FLIGHT
+from edgegrasp_sim.sensor import SENSORS, STRUCTURED_LIGHT
 
 CAMERA = Intrinsics()
 FAULTLESS = replace(
@@ -51,27 +51,6 @@ def test_what_the_projector_does_not_light_is_missing_on_its_other_side(side: fl
     assert missing[90:150, shadow].sum(axis=1) == pytest.approx(np.full(60, width), abs=2)
     assert not missing[90:150, lit].any()
     assert not missing[:70].any()
-
-
-def test_slanted_surfaces_and_patches_are_missing() -> None:
-    column = np.arange(-20, 20) / CAMERA.focal_length
-    for degrees, share in ((85.0, 1.0), (40.0, 0.0)):
-        slanted = np.tile(1.0 / (1.0 - column * np.tan(np.radians(degrees))), (40, 1))
-        image = seen(replace(FAULTLESS, grazing=70.0), slanted)
-        assert np.isnan(image[1:-1, 1:-1]).mean() == pytest.approx(share, abs=0.01)
-    patches = np.isnan(seen(replace(FAULTLESS, missing=0.05), wall(1.0)))
-    assert patches.mean() == pytest.approx(0.05, rel=0.4)
-    assert patches[:, 1:][patches[:, :-1]].mean() > 0.7  # the next pixel is missing too
-
-
-def test_at_edges_pixels_fly_or_belong_to_the_front() -> None:
-    depth = box_before_wall()
-    flying = seen(replace(FAULTLESS, flying=TIME_OF_FLIGHT.flying), depth)
-    between = (flying > 0.801) & (flying < 0.999)
-    assert 100 < between.sum() < 2 * 4 * 80
-    assert not between[82:158, 122:198].any()
-    fat = seen(replace(FAULTLESS, window=5, fattening=0.5), depth)
-    assert (fat < 0.801).sum() > 80 * 80 + 100
 
 
 @pytest.mark.parametrize("kind", SENSORS)

@@ -10,14 +10,13 @@ from examples.your_planner import plan
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
-from edgegrasp_sim.protocol import Protocol, load_protocol
+from edgegrasp_sim.protocol import Protocol
 from edgegrasp_sim.results import summarise
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trial import (
     PlannedGrasp,
     Planner,
     Round,
-    RoundDriver,
     RoundEnd,
     StartCollides,
     run_round,
@@ -108,14 +107,3 @@ def test_scenes_and_views_do_not_depend_on_the_planner(engine, run, paper_with) 
     assert np.array_equal(first_clouds[0], first_clouds[2])
     with pytest.raises(ValueError, match="seed is -1"):
         run(plan, PILE, 2, seed=-1)
-
-
-@pytest.mark.parametrize("name", ["giga", "vgn", "table"])
-def test_other_protocols_run(simulation: ClutterSimulation, name: str) -> None:
-    rules = load_protocol(name)
-    driver = RoundDriver(simulation, PACKED, rules, seed=0, index=0)
-    seen = driver.look()
-    assert len(seen.camera_positions) == rules.camera.views
-    assert set(seen.view_ids) == set(range(rules.camera.views))
-    on_table = np.abs(seen.cloud[:, 2] - seen.table_height) < 0.003
-    assert (on_table.mean() > 0.3) == (name == "table")

@@ -11,11 +11,9 @@ from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_training.examples import (
     TriedGrasps,
-    pack_balls,
     pack_hands,
     tried_grasps,
 )
-from edgegrasp_training.recipes import LENGTH_UNIT
 from edgegrasp_training.views import TABLE, UP, WORKSPACE, LabelledView
 
 Networks = dict[str, NetworkConfig]
@@ -33,23 +31,6 @@ def hands(networks: Networks) -> NetworkConfig:
 
 def grasps_of(view: LabelledView, config: NetworkConfig, *, camera: bool = True) -> TriedGrasps:
     return tried_grasps(view, config, viewpoint_known=camera)
-
-
-def test_packed_balls_hold_each_tried_grasp_and_its_contact(made_up_view, balls) -> None:
-    view = made_up_view(1)
-    grasps = grasps_of(view, balls)
-    batch, label, weight = pack_balls(grasps, grasps.balls(), balls)
-    assert len(label) == len(grasps.label) == len(batch.contact)
-    assert (weight == 1).all()
-    contact = grasps.cloud.points[grasps.candidates.contact_index]
-    edge = contact - grasps.cloud.points[grasps.candidates.approach_index]
-    found = batch.points[batch.contact].numpy() * LENGTH_UNIT
-    np.testing.assert_allclose(found, edge @ grasps.turn.T, atol=1e-6)
-    depth = batch.depth.numpy() * LENGTH_UNIT
-    np.testing.assert_allclose(depth, grasps.candidates.depth, atol=1e-6)
-    some = pack_balls(grasps, grasps.balls()[:2], balls)
-    assert some.batch.num_balls == 2
-    assert 0 < len(some.label) < len(label)
 
 
 def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(made_up_view, hands):

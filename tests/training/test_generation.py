@@ -3,16 +3,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_model.networks.config import HAND
 from edgegrasp_sim.engine import ENGINES, choose_engine, installed
-from edgegrasp_sim.objects import blob
 from edgegrasp_training.examples import tried_grasps
 from edgegrasp_training.generation import generate, missing_scenes
-from edgegrasp_training.household import FAMILIES
 from edgegrasp_training.options import GenerationOptions
-from edgegrasp_training.shapes import DRAWN_NAMES, made_object
-from edgegrasp_training.teacher import Teacher
 from edgegrasp_training.views import find_views, load_view
 
 
@@ -88,55 +83,3 @@ def test_random_hands_differ_between_scenes_and_are_what_the_network_is_told(tmp
     paths[2].unlink()
     list(generate(tmp_path, None, options))
     assert paths[2].read_bytes() == before
-
-
-def test_scenes_of_household_objects_name_them_and_are_reproducible(tmp_path: Path) -> None:
-    options = small(scenes=1, scene="table", household=1.0)
-    for folder in ("a", "b"):
-        list(generate(tmp_path / folder, None, options))
-    first, again = (load_view(find_views([tmp_path / folder])[0]) for folder in ("a", "b"))
-    assert {name.split("-")[0] for name in first.objects} <= set(FAMILIES)
-    assert len(first.tried()) > 0
-    assert first.object_digests == again.object_digests
-    np.testing.assert_array_equal(first.success, again.success)
-
-
-def test_workers_change_nothing(data: Path, tmp_path: Path) -> None:
-    list(generate(tmp_path, None, small(scenes=2), workers=2))
-    assert len(find_views([tmp_path])) == 2
-    for path in find_views([tmp_path]):
-        again = load_view(data / path.name)
-        np.testing.assert_array_equal(again.success, load_view(path).success)
-        np.testing.assert_array_equal(again.points, load_view(path).points)
-
-
-def test_a_teacher_labels_objects_in_views_without_tried_grasps(tmp_path: Path) -> None:
-    list(generate(tmp_path, None, small(scenes=1, grasps_per_view=0, scene="table")))
-    (path,) = find_views([tmp_path])
-    view = load_view(path)
-    assert len(view.tried()) == 0
-    assert len(view.points) > 100
-    teacher = Teacher(WEIGHTS_FOLDER / "edgegrasp-plus.safetensors", 0.04)
-    labels = teacher.soft_labels(path)
-    assert len(labels.chance) > 0
-    assert (view.object_of_point[labels.approach_index] >= 0).all()
-
-
-def test_views_of_varied_scenes_name_the_objects_as_they_were(tmp_path: Path) -> None:
-    train = tmp_path / "objects" / "pile" / "train"
-    plain = DRAWN_NAMES[:3]
-    models = {name: made_object(name, train) for name in plain}
-    (tmp_path / "objects" / "packed").symlink_to(tmp_path / "objects" / "pile")
-    options = small(scenes=2, grasps_per_view=4, seed=2, scene="pile")
-    list(generate(tmp_path / "views", tmp_path / "objects", options))
-    paths = find_views([tmp_path / "views"])
-    assert [path.name for path in paths] == [f"pile_2-00000{k}_0.npz" for k in range(2)]
-    views = [load_view(path) for path in paths]
-    assert any(view.objects for view in views)
-    for view in views:
-        for name, digest in zip(view.objects, view.object_digests, strict=True):
-            if name.startswith("blob_"):
-                model = blob(int(name.removeprefix("blob_")), tmp_path / "again")
-            else:
-                model = models.get(name) or made_object(name, tmp_path / "again")
-            assert digest == model.digest

@@ -12,13 +12,9 @@ from edgegrasp_sim.scene import load_object
 from edgegrasp_training.shapes import (
     DRAWN_NAMES,
     NUM_DRAWN,
-    NUM_VARIED,
-    STRETCH,
     drawn_shape,
     household_objects,
     made_object,
-    stretched,
-    varied_objects,
 )
 
 
@@ -49,56 +45,6 @@ def test_drawn_shapes_differ_and_stay_the_same() -> None:
 @pytest.fixture
 def shapes(tmp_path: Path) -> tuple[ObjectModel, ...]:
     return tuple(made_object(name, tmp_path / "shapes") for name in DRAWN_NAMES[:6])
-
-
-def _extents(model: ObjectModel) -> np.ndarray:
-    with make_world() as world:
-        body = load_object(world, model, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0), 1.0).body
-        low, high = body.bounds
-        return high - low
-
-
-def test_a_stretched_object_is_longer_by_each_factor(shapes, tmp_path) -> None:
-    model = shapes[1]
-    longer = stretched(model, (1.3, 0.8, 2.0), tmp_path / "stretched")
-    assert longer.name == model.name
-    assert longer.origin is model
-    margin = 0.004  # the engine's own, around every shape
-    np.testing.assert_allclose(
-        _extents(longer), _extents(model) * (1.3, 0.8, 2.0), atol=2 * margin, rtol=0
-    )
-    assert _extents(longer)[2] > 1.5 * _extents(model)[2]
-    twice = stretched(longer, (0.5, 1.0, 2.0), tmp_path / "twice")
-    assert 'scale="0.65000 0.80000 4.00000"' in twice.urdf.read_text()
-
-
-def test_varied_sets_hold_both_sorts_and_depend_on_the_seed_alone(shapes, tmp_path) -> None:
-    plain = ObjectSet("plain", shapes[:4])
-
-    def descriptions(folder: str, seed: int) -> dict[str, str]:
-        drawn = varied_objects(plain, tmp_path / folder, np.random.default_rng(seed))
-        assert len(drawn.models) <= NUM_VARIED
-        texts = {model.name: model.urdf.read_text() for model in drawn.models}
-        return {name: text.replace(f"/{folder}/", "/") for name, text in texts.items()}
-
-    first = descriptions("a", 1)
-    assert first == descriptions("b", 1)
-    assert first != descriptions("c", 2)
-    named = {model.name for model in plain.models}
-    assert set(first) & named
-    assert set(first) - named
-    factors = np.array(
-        [
-            text.split('scale="')[1].split('"')[0].split()
-            for name, text in first.items()
-            if not name.startswith("blob_")  # their meshes have a scale of their own
-        ],
-        dtype=float,
-    )
-    assert 1 / STRETCH <= factors.min() < 0.95
-    assert 1.05 < factors.max() <= STRETCH
-    alike = factors[:, 0] == factors[:, 1]
-    assert 0 < alike.sum() < len(factors)
 
 
 def test_household_objects_are_hollow_in_the_engine_and_read_again_from_their_folder(tmp_path):

@@ -3,22 +3,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
-from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
-from edgegrasp_training.examples import (
-    TRIED_WEIGHT,
-    pack_balls,
-    tried_grasps,
-)
+from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_training.teacher import GRASPS_PER_BALL, Teacher
 from edgegrasp_training.training import Trainer
-from edgegrasp_training.views import LabelledView
 
-MakeView = Callable[[int], LabelledView]
 MakeTrainer = Callable[..., Trainer]
-Networks = dict[str, NetworkConfig]
 
 
 @pytest.fixture(scope="module")
@@ -45,29 +36,6 @@ def test_a_teacher_scores_candidates_above_the_table(made_up_view, views, teache
     assert 0 < count.max() <= GRASPS_PER_BALL
     toward, chance = labels.approach[:, 2].astype(float), labels.chance.astype(float)
     assert chance[toward > 0.6].mean() > 1.5 * chance[toward < 0.2].mean()
-
-
-def test_soft_labels_are_those_of_the_view(made_up_view, views, weights, teacher, tmp_path) -> None:
-    first, again = (one.soft_labels(views[0]) for one in (teacher, Teacher(weights, 0.04)))
-    np.testing.assert_array_equal(first.chance, again.chance)
-    other = tmp_path / views[0].name
-    made_up_view(5).save(other)
-    assert not np.array_equal(teacher.soft_labels(other).contact_index, first.contact_index)
-
-
-def test_soft_labels_are_packed_beside_the_labels_which_weigh_more(
-    made_up_view: MakeView, networks: Networks, views: list[Path], teacher: Teacher
-) -> None:
-    labels = teacher.soft_labels(views[0])
-    grasps = tried_grasps(made_up_view(0), networks["balls"])
-    balls = np.unique(labels.approach_index).astype(np.int64)
-    batch, label, weight = pack_balls(grasps, balls, networks["balls"], labels)
-    tried = weight == TRIED_WEIGHT
-    assert tried.sum() == len(grasps.label)
-    np.testing.assert_array_equal(np.sort(label[tried]), np.sort(grasps.label))
-    np.testing.assert_array_equal(np.sort(label[~tried]), np.sort(labels.chance))
-    lengths = batch.approach.norm(dim=1)
-    torch.testing.assert_close(lengths, torch.ones(len(label)), atol=2e-3, rtol=0)
 
 
 def test_loss_falls_with_a_teacher_who_is_named_in_card_and_checkpoint(

@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
-from edgegrasp_training.examples import pack_hands, tried_grasps
 from edgegrasp_training.options import TrainingOptions
 from edgegrasp_training.recipes import (
     RECIPES,
     recipe,
 )
 from edgegrasp_training.training import Trainer
-from edgegrasp_training.views import find_views, load_view, split_by_scene
+from edgegrasp_training.views import find_views, split_by_scene
 
 SAMPLE = Path(__file__).parents[2] / "examples" / "labelled_views"
 
@@ -75,17 +74,6 @@ def test_pausing_and_resuming_is_the_same_as_going_through(make_trainer, tmp_pat
     assert not same_weights(through, other)
 
 
-@pytest.mark.parametrize("network", ["vn", "hands"])
-def test_mixed_precision_steps_are_nearly_those_in_full(make_trainer, tmp_path, network) -> None:
-    losses: dict[bool, list[float]] = {False: [], True: []}
-    for mixed, kept in losses.items():
-        run = make_trainer(tmp_path / str(mixed), network, mixed_precision=mixed)
-        run.run(lambda step, loss, kept=kept: kept.append(loss), until=3)
-        assert all(value.dtype == torch.float32 for value in run.network.parameters())
-    assert losses[True] != losses[False]
-    np.testing.assert_allclose(losses[True], losses[False], rtol=0.05)
-
-
 @pytest.mark.parametrize("network", ["balls", "hands"])
 def test_a_run_may_start_where_another_ended(make_trainer, tmp_path, network) -> None:
     first = make_trainer(tmp_path / "first", network, steps=4)
@@ -103,26 +91,6 @@ def test_a_run_may_start_where_another_ended(make_trainer, tmp_path, network) ->
     kept.run(ignore)
     logit = kept.finish({}, "edgegrasp train data").logit  # all of the old weights is kept
     np.testing.assert_allclose(logit, first.evaluate().logit, atol=1e-4)
-
-
-def test_a_run_may_start_from_weights_that_were_told_less(make_trainer, views, networks, tmp_path):
-    told_less = replace(networks["hands"], description_size=40)
-    network = build_network(told_less)
-    network.set_statistics(torch.linspace(-1, 1, 40), torch.linspace(0.1, 2, 40))
-    save_checkpoint(
-        tmp_path / "less.safetensors",
-        network,
-        CheckpointMetadata("less", told_less, 0.0045, "panda"),
-    )
-    run = make_trainer(tmp_path / "run", start=tmp_path / "less.safetensors", steps=4)
-    grasps = tried_grasps(load_view(views[0]), told_less)
-    batch = pack_hands(grasps, grasps.balls(), told_less).batch
-    with torch.no_grad():
-        torch.testing.assert_close(run.average(batch), network(batch), rtol=0, atol=1e-5)
-    run.run(ignore)
-    column = run.network.get_parameter("classifier.0.weight")[:, 40]
-    assert column.abs().max() > 0  # what is new is learned
-    run.finish({}, "edgegrasp train data")
 
 
 def test_weights_of_another_network_are_no_start(make_trainer, tmp_path) -> None:
