@@ -16,6 +16,8 @@ from edgegrasp_client import (
     Detection,
     GraspClient,
     InvalidRequestError,
+    object_in_scene,
+    on_mask,
 )
 
 
@@ -132,3 +134,45 @@ def test_a_forked_process_asks_over_rest_alone(dummy_server, cloud) -> None:
             os._exit(1)
         assert os.waitpid(child, 0)[1] == 0
         assert client.detect(cloud).grasps
+
+
+def test_poses_before_and_after_a_grasp(client, cloud) -> None:
+    detection = client.detect(cloud, top_k=1, gripper="robotiq-2f-85")
+    (grasp,), up = detection.grasps, detection.up
+    hand = grasp.T_cloud_hand
+    for moved, way in (
+        (grasp.pregrasp(0.1), -0.1 * hand[:3, 2]),
+        (grasp.retreat(0.2), -0.2 * hand[:3, 2]),
+        (grasp.retreat(0.3, 2 * up), 0.3 * up),
+    ):
+        np.testing.assert_allclose(moved[:3, 3] - hand[:3, 3], way, atol=1e-6)
+        np.testing.assert_array_equal(moved[:3, :3], hand[:3, :3])
+    assert detection.gripper.name == "robotiq-2f-85"
+
+
+def test_a_mask_narrows_the_regions_that_are_asked_for() -> None:
+    ball = {"kind": "sphere", "center": [0, 0, 0.5], "radius": 0.1}
+    asked = {"top_k": 3, "contact_region": {"include": [ball]}}
+    mask = np.zeros((2, 3, 4), np.uint8)
+    mask[0, 1, 2] = 255  # red, green, blue
+    mask[1, 2, 3] = 255  # transparency says nothing
+    options = on_mask(mask, asked)
+    assert options["top_k"] == 3
+    assert options["contact_region"]["include"] == [ball]
+    for name in ("approach_region", "contact_region"):
+        (outside,) = options[name]["exclude"]
+        np.testing.assert_array_equal(outside["mask"], [[True, False, True], [True] * 3])
+    assert "exclude" not in asked["contact_region"]
+
+
+def test_an_object_is_cut_out_of_the_scene_that_repeats_it() -> None:
+    rng = np.random.default_rng(0)
+    scene = rng.uniform(-0.3, 0.3, (4000, 3))
+    wanted = np.linalg.norm(scene - 0.1, axis=1) < 0.08
+    holed = np.concatenate([scene, [[np.nan] * 3]])
+    for around in (holed, scene[~wanted]):
+        cloud, segment_ids = object_in_scene(scene[wanted], around)
+        np.testing.assert_array_equal(cloud[segment_ids == 1], scene[wanted].astype(np.float32))
+        far = np.linalg.norm(cloud[segment_ids == 0] - 0.1, axis=1)
+        assert far.min() > 0.07
+        assert 0.97 * (~wanted).sum() < len(far) <= (~wanted).sum()

@@ -99,9 +99,7 @@ async def test_unforeseen_errors_tell_nothing(serve, cloud, fault: str, expected
     assert (response.status_code, status.code()) == expected
     assert "secret" not in response.text + (status.details() or "")
     await running.until(
-        lambda: any(
-            f"{fault}: secret" in vars(each).get("traceback", "") for each in caplog.records
-        )
+        lambda: any("secret" in vars(each).get("traceback", "") for each in caplog.records)
     )
 
 

@@ -6,7 +6,6 @@ import io
 import json
 import logging
 import os
-import sys
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -20,7 +19,7 @@ from hypothesis import strategies as st
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import AsyncGraspClient, GraspClient
-from edgegrasp_service.observability import CALL, Call, JsonFormatter, LogQueue
+from edgegrasp_service.observability import JsonFormatter, LogQueue
 
 TOKEN = "user-token-0123456789"
 ADMIN = "admin-token-0123456789"
@@ -154,22 +153,3 @@ def test_one_record_is_one_line(message: str, value: str) -> None:
     line = JsonFormatter().format(record)
     assert "\n" not in line
     assert json.loads(line)["message"] == message
-
-
-@pytest.mark.parametrize("given_id", ["käse", "a\nb"])
-def test_an_unusable_request_id_is_replaced(given_id: str) -> None:
-    assert len(Call("http", "DetectGrasps", request_id=given_id).request_id) == 32
-
-
-def test_a_fault_is_logged_with_its_traceback_and_request() -> None:
-    queue = LogQueue(None)
-    CALL.set(Call("http", "DetectGrasps", "mine"))
-    try:
-        raise ValueError("why")
-    except ValueError:
-        record = logging.makeLogRecord({"msg": "failed", "exc_info": sys.exc_info()})
-    line = json.loads(queue.prepare(record))
-    assert line["request_id"] == "mine"
-    assert "ValueError: why" in line["exception"]
-    CALL.set(None)
-    queue.close()

@@ -35,10 +35,6 @@ def message(file: File, name: str) -> descriptor_pb2.DescriptorProto:
     return next(one for one in file.message_type if one.name == name)
 
 
-def field(file: File, name: str, field_name: str) -> Field:
-    return next(one for one in message(file, name).field if one.name == field_name)
-
-
 def removed(parts: Any, name: str) -> None:
     parts.remove(next(part for part in parts if part.name == name))
 
@@ -52,18 +48,6 @@ def number_used_again(file: File) -> None:
     message(file, "Grasp").field.add(name="opening", number=4, type=Field.TYPE_FLOAT, label=1)
 
 
-def another_type(file: File) -> None:
-    field(file, "Grasp", "width").type = Field.TYPE_DOUBLE
-
-
-def not_repeated(file: File) -> None:
-    field(file, "DetectGraspsResponse", "warnings").label = Field.LABEL_OPTIONAL
-
-
-def out_of_its_oneof(file: File) -> None:
-    field(file, "DetectGraspsRequest", "encoded").ClearField("oneof_index")
-
-
 def number_not_reserved(file: File) -> None:
     del message(file, "DetectOptions").reserved_range[:]
 
@@ -75,9 +59,6 @@ def without_a_call(file: File) -> None:
 BREAKS = {
     without_a_field: "Grasp.field.4 (name width",
     number_used_again: "is now name opening",
-    another_type: "type TYPE_",
-    not_repeated: "label LABEL_",
-    out_of_its_oneof: "oneof cloud) is now",
     number_not_reserved: "messageType.DetectOptions.reservedRange.",
     without_a_call: "service.GraspService.method.ScoreGrasps (name",
 }

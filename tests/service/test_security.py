@@ -22,9 +22,7 @@ from edgegrasp_client import (
 )
 from edgegrasp_service.errors import (
     InvalidSettings,
-    PermissionDenied,
     ReloadFailed,
-    Unauthenticated,
 )
 from edgegrasp_service.probe import is_ready, read_settings
 from edgegrasp_service.security import ServerTls, load_tokens
@@ -34,7 +32,6 @@ from edgegrasp_service.settings import Settings
 USER = "user-token-0123456789"
 ADMIN = "admin-token-0123456789"
 WRONG = "wrong-token-0123456789"
-SECOND = "second-token-0123456789"
 HOST = "127.0.0.1"
 
 
@@ -174,8 +171,12 @@ async def test_only_probes_are_open(serve) -> None:
             await http.get("/v1/models", headers=evil),
         ):
             assert not [name for name in answer.headers if name.startswith("access-control")]
-        basic = await http.get("/v1/models", auth=("user", USER))
-        assert basic.json()["value"] == "another scheme than Bearer"
+        for header in ("", "Bearer", f"Basic {USER}", USER, b"Bearer \xc3\xbf\xff"):
+            answer = await http.get("/v1/models", headers={"authorization": header})
+            assert answer.status_code == 401, header
+        for header in (f"bearer  {USER} ", f"Bearer {ADMIN}"):
+            answer = await http.get("/v1/models", headers={"authorization": header})
+            assert answer.status_code == 200, header
     async with aio.insecure_channel(server.grpc_address) as channel:
         health = health_pb2_grpc.HealthStub(channel)
         status = (await health.Check(health_pb2.HealthCheckRequest())).status
@@ -244,50 +245,6 @@ def test_a_server_that_others_can_reach_warns(given, warned, caplog, tmp_path, m
 def test_a_folder_without_weights_warns(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     warn(Settings(weights=[tmp_path]))
     assert str(tmp_path) in caplog.text
-
-
-# Which tokens are good for what, and which texts are tokens
-
-
-@pytest.mark.parametrize(
-    ("header", "admin", "error"),
-    [
-        (f"Bearer {USER}", False, None),
-        (f"bearer  {SECOND} ", False, None),
-        (f"Bearer {ADMIN}", False, None),
-        (f"Bearer {ADMIN}", True, None),
-        (f"Bearer {USER}", True, PermissionDenied),
-        (f"Bearer {WRONG}", True, Unauthenticated),
-        (None, True, Unauthenticated),
-        (None, False, Unauthenticated),
-        ("", False, Unauthenticated),
-        ("Bearer", False, Unauthenticated),
-        (f"Basic {USER}", False, Unauthenticated),
-        (USER, False, Unauthenticated),
-        ("Bearer \udcff\xff", False, Unauthenticated),
-    ],
-)
-def test_check(header, admin, error, tmp_path) -> None:
-    users, admins = tmp_path / "tokens", tmp_path / "admin_tokens"
-    users.write_text(f"{USER}\n{SECOND}\n")
-    admins.write_text(ADMIN)
-    known = load_tokens(Settings(token_file=users, admin_token_file=admins))
-    if error is None:
-        known.check(header, admin=admin)
-    else:
-        with pytest.raises(error):
-            known.check(header, admin=admin)
-
-
-def test_tokens_have_names(tmp_path: Path) -> None:
-    file = tmp_path / "tokens"
-    file.write_text(f"# of the cell\narm-1:{USER}\n  {SECOND}\n")
-    admins = tmp_path / "admins"
-    admins.write_text(ADMIN)
-    known = load_tokens(Settings(token_file=file, admin_token_file=admins))
-    names = [known.check(f"Bearer {token}").name for token in (USER, SECOND, ADMIN)]
-    assert names == ["arm-1", "token_file 2", "admin_token_file 1"]
-    assert USER not in repr(vars(known))
 
 
 @pytest.mark.parametrize(

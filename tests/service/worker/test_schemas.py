@@ -1,4 +1,4 @@
-"""Answers and clouds have the same fields everywhere; those of options are generated."""
+"""Requests and answers have the same fields everywhere."""
 
 import dataclasses
 import inspect
@@ -10,14 +10,25 @@ import pytest
 import edgegrasp_client as client
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model import request_cloud
+from edgegrasp_model.options import DetectOptions
 from edgegrasp_service.errors import STATUS
 from edgegrasp_service.front.http import DOCUMENT
 
 SCHEMAS = DOCUMENT["components"]["schemas"]
+OPTIONS = DetectOptions.model_json_schema()
+OPTIONS_BY_NAME: dict[str, Any] = {"DetectOptions": OPTIONS, **OPTIONS["$defs"]}
+NAMES = {"SupportPlane": "Support", "Linkage": "Swing"}  # of messages that are called otherwise
+BESIDE = {"disabled", "auto", "ransac", "object_choice"}  # fields for what JSON has no field for
 
 
 def fields(message: str) -> list[str]:
     return [field.name for field in getattr(grasp_pb2, message).DESCRIPTOR.fields]
+
+
+@pytest.mark.parametrize("name", OPTIONS_BY_NAME)
+def test_options(name: str) -> None:
+    ours = set(OPTIONS_BY_NAME[name]["properties"]) - {"kind"}
+    assert ours == set(fields(NAMES.get(name, name))) - BESIDE
 
 
 @pytest.mark.parametrize("name", ["PointCloud2", "PointField", "DepthImage", "Intrinsics", "Depth"])
