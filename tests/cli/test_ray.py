@@ -135,10 +135,9 @@ def test_answers_are_those_of_one_process_though_a_replica_dies(cluster, tmp_pat
     here = catalogue.get("").detect(points, DetectOptions(**OPTIONS))
     answered = f"{len(here.grasps)} grasps"
     with served(cluster, tmp_path) as addresses:
-        with GraspClient(addresses["rest"]) as client:
-            client.wait_until_ready(PATIENCE)
         for address in addresses.values():
             with GraspClient(address, timeout=PATIENCE) as client:
+                client.wait_until_ready(PATIENCE)  # though Ray's gRPC has no health service
                 for _ in range(4):  # of either replica
                     found = client.detect(points, **OPTIONS)
                     assert found.counts == here.counts

@@ -170,14 +170,6 @@ def test_an_isaac_file_says_what_the_format_asks_for() -> None:
     )
 
 
-def test_isaac_ros_calls_the_frames_otherwise() -> None:
-    names = {"object_frame": "mug", "gripper_frame": "hand"}
-    text = isaac_grasps([grasp(UP)], **names, dialect="isaac-ros")
-    assert "\nobject_frame: mug\ngripper_frame: hand\ngrasps:\n" in text
-    (read,) = read_isaac_grasps(text)
-    np.testing.assert_allclose(read.T_object_gripper, UP, atol=1e-6)
-
-
 def test_isaac_files_say_which_extra_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "yaml", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'edgegrasp\[yaml\]'"):

@@ -15,7 +15,6 @@ from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import (
     AccessDeniedError,
     DeadlineError,
-    GraspClient,
     GraspClientError,
     InvalidRequestError,
     OverloadedError,
@@ -276,22 +275,3 @@ def test_a_cloud_that_is_too_large_is_refused(size: int, client) -> None:
     with pytest.raises(PayloadTooLargeError):
         client.detect(np.zeros((size, 3), np.float32))
     assert client.ready()
-
-
-class ModelsAlone(grasp_pb2_grpc.GraspServiceServicer):
-    """As Ray serves gRPC: without the health service."""
-
-    def ListModels(self, request: Any, context: Any) -> Any:  # noqa: N802
-        return grasp_pb2.ListModelsResponse(models=[{"name": "fake"}])
-
-
-def test_a_server_without_a_health_service_is_ready_once_it_answers() -> None:
-    server = grpc.server(ThreadPoolExecutor(1))
-    grasp_pb2_grpc.add_GraspServiceServicer_to_server(ModelsAlone(), server)
-    port = server.add_insecure_port("127.0.0.1:0")
-    server.start()
-    try:
-        with GraspClient(f"127.0.0.1:{port}") as client:
-            client.wait_until_ready(20)
-    finally:
-        server.stop(None)

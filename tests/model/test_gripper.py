@@ -127,17 +127,6 @@ def test_an_unknown_gripper_or_opening_is_refused_by_field(fields, field, fix) -
 
 
 @by_name
-@pytest.mark.parametrize("share", [0.3, 0.6, 1.0])
-def test_a_gripper_that_opens_less_is_the_same_one_half_closed(gripper, share) -> None:
-    opening = share * gripper.max_opening
-    part = choose(gripper=gripper.name, collision={"opening": opening})
-    for narrower in (opening, 0.5 * opening, 0.0):
-        np.testing.assert_allclose(part.boxes(narrower), gripper.boxes(narrower), atol=1e-9)
-        np.testing.assert_allclose(part.contact_z_at(narrower), gripper.contact_z_at(narrower))
-    np.testing.assert_allclose(part.tip_z, part.boxes(opening)[:, 1, 2].max())
-
-
-@by_name
 def test_grasps_fit_the_gripper_that_was_asked_for(gripper: Gripper) -> None:
     options = DetectOptions(
         viewpoint=VIEW, gripper=gripper.name, num_approach_points=12, suppression=None

@@ -96,15 +96,6 @@ def test_pixels_without_a_reading_are_holes(nothing: float) -> None:
     assert 5 * 32 + 7 not in checked.row
 
 
-def test_intrinsics_in_every_form_and_a_camera_at_the_origin() -> None:
-    named = image(depth_of(), np.eye(4))
-    expected, _ = read_depth_images([named], MANY)
-    for form in ([FX, FY, CX, CY], [[FX, 0, CX], [0, FY, CY], [0, 0, 1]],
-                 [FX, 0.0, CX, 0.0, FY, CY, 0.0, 0.0, 1.0]):  # fmt: skip
-        sent = {"depth": named["depth"], "intrinsics": form}
-        cloud, cameras = read_depth_images([sent], MANY)
-        np.testing.assert_array_equal(cloud.points, expected.points)
-        assert cameras == [(0.0, 0.0, 0.0)]
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import runpy
 import shlex
 import shutil
 import sys
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -189,13 +188,6 @@ def test_the_commands_of_the_start_pages_run_as_they_stand(tmp_path: Path) -> No
                 assert min(picture.size) > 300
             detected.add(shown)
     assert detected
-
-
-def test_json_and_toml_of_the_pages_can_be_read() -> None:
-    for page, block in blocks("json"):
-        assert json.loads(block), page
-    for page, block in blocks("toml"):
-        assert tomllib.loads(block), page
 
 
 def test_the_site_is_built_without_a_warning_and_asks_nobody(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import pytest
 from edgegrasp_sim.engine import World
 from edgegrasp_sim.objects import (
     LONGEST_SIDE,
-    OBJECT_MASS,
     SHORTEST_SIDE,
     ObjectModel,
     ObjectSet,
@@ -18,7 +17,6 @@ from edgegrasp_sim.objects import (
     prepare_mesh,
 )
 from edgegrasp_sim.scene import load_object
-from edgegrasp_sim.surroundings import OPEN_TABLE
 
 MARGIN = {"pybullet": 0.006, "mujoco": 0.0}  # metres that an engine's boxes are wider
 
@@ -83,18 +81,6 @@ def test_meshes_of_any_unit_are_scaled_to_the_hand(world: World, meshes: Path, c
     # A ring of six-sided tubes is a little lower than it is thick.
     assert ring[0] == pytest.approx(LONGEST_SIDE / 4, rel=0.15)
     assert max(brick[0], ring[0]) <= SHORTEST_SIDE
-
-
-def test_a_ring_has_a_hole_and_every_object_s_mass(world: World, meshes: Path, cache: Path) -> None:
-    urdf = prepare_mesh(meshes / "ring.obj")
-    OPEN_TABLE.add_to(world)
-    ring = load_object(world, ObjectModel("ring", urdf), (0.15, 0.15, 0.07), (0, 0, 0, 1), 1.0)
-    above = np.array([[x, 0.15, 0.3] for x in (0.15, 0.15 + 0.055)])
-    below = above - np.array([0.0, 0.0, 0.245])
-    assert world.first_hits(above, below) == [-1, ring.body.uid]
-    # The centre of mass is in the middle of the hole, where the body's frame is.
-    np.testing.assert_allclose(ring.body.position, (0.15, 0.15, 0.07), atol=2e-3)
-    assert f'mass value="{OBJECT_MASS}"' in urdf.read_text()
 
 
 def test_prepared_meshes_are_cached_by_content(meshes: Path, cache: Path, tmp_path: Path) -> None:

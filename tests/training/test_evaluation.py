@@ -9,10 +9,8 @@ from scipy.special import expit
 from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_training.evaluation import (
-    Scored,
     evaluate_scores,
     reliability,
-    reliability_tables,
     score_views,
 )
 
@@ -26,24 +24,6 @@ def test_the_temperature_undoes_overconfidence() -> None:
     ranges = reliability(expit(found.logit / found.temperature), found.label)
     assert all(each.score == pytest.approx(each.held, abs=0.05) for each in ranges.values())
     assert sum(each.number for each in ranges.values()) == 20_000
-
-
-def test_tables_tell_the_better_weights_from_the_worse_ones_by_group() -> None:
-    rng = np.random.default_rng(0)
-    logit = rng.normal(0.0, 3.0, 4000)
-    held = rng.random(4000) < 1.0 / (1.0 + np.exp(-logit))
-    kind = np.where(np.arange(4000) % 2, "table", "pile")
-    hidden = np.arange(4000) < 1000
-    text = reliability_tables(Scored(kind, hidden, held, np.stack([logit, -logit])), ["a", "b"])
-    figures = {}
-    for line in text.splitlines():
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        figures[tuple(cells[:2])] = cells[2:]
-    for group, number in (("all", 4000), ("pile scenes", 2000), ("far side hidden", 1000)):
-        good, bad = figures[group, "a"], figures[group, "b"]
-        assert int(good[0]) == int(bad[0]) == number
-        assert all(float(g) < float(b) for g, b in zip(good[3:], bad[3:], strict=True))
-        assert float(good[5]) < 0.05
 
 
 def test_views_are_scored_by_hand_networks_alone(made_up_view, networks, tmp_path: Path) -> None:
