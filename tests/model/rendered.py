@@ -113,3 +113,15 @@ def render(boxes: list[SolidBox], T_world_camera: np.ndarray, seed: int = 0) -> 
     noise = np.random.default_rng(seed).normal(0.0, NOISE, len(depth))
     points = rays * (depth + noise * depth**2)[:, None]
     return points.reshape(HEIGHT, WIDTH, 3).astype(np.float32)
+
+
+def wavy(distance: float) -> np.ndarray:
+    """Depths (HEIGHT, WIDTH) of an uneven wall before the camera."""
+    row, column = np.indices((HEIGHT, WIDTH))
+    depth = distance * (1 + 0.05 * np.sin(column / 9) * np.cos(row / 11))
+    return depth.astype(np.float32)
+
+
+SCENE = render([table(), *boxes_on_table(3)], camera(0.7, -1.2, 0.85))
+ROOM = [box(3 * way, 3.1 - 3 * np.abs(way)) for way in np.concatenate([np.eye(3), -np.eye(3)])]
+ROOM_INSIDE = render(ROOM, camera(1.2, 0.3, 0.4))

@@ -96,8 +96,6 @@ def test_pixels_without_a_reading_are_holes(nothing: float) -> None:
     assert 5 * 32 + 7 not in checked.row
 
 
-
-
 @pytest.mark.parametrize(
     ("intrinsics", "field", "value"),
     [

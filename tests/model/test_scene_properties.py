@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import SUPPORT
 from edgegrasp_model.scene.cloud import CloudInput
@@ -99,42 +98,3 @@ def test_every_row_is_labelled_with_an_object_the_support_or_neither() -> None:
     assert set(labels[labels >= 0].tolist()) == {one.number for one in found.objects}
     assert (labels[number == 0] == SUPPORT).mean() > 0.95
     assert (labels[number == -1] < 0).all()
-
-
-def answer(cloud: object) -> Detection | InvalidRequest:
-    try:
-        return ask(cloud)
-    except InvalidRequest as error:
-        return error
-
-
-def flat(distance: float) -> np.ndarray:
-    """An uneven wall (240, 320, 3) before the camera."""
-    row, column = np.indices((240, 320))
-    depth = distance * (1 + 0.05 * np.sin(column / 9) * np.cos(row / 11))
-    rays = np.stack([(column - 160) / 270, (row - 120) / 270, np.ones((240, 320))], axis=-1)
-    return (rays * depth[..., None]).astype(np.float32)
-
-
-SCENE = render([table(), *boxes_on_table(3)], camera(0.7, -1.2, 0.85))
-ROOM = [box(3 * way, 3.1 - 3 * np.abs(way)) for way in np.concatenate([np.eye(3), -np.eye(3)])]
-NO_SCENES = {
-    "one pixel": SCENE[120:121, 160:161],
-    "one row": SCENE[120:121],
-    "one column": SCENE[:, 160:161],
-    "holes": np.full_like(SCENE, np.nan),
-    "too close": flat(0.04),
-    "too far": flat(12.0),
-    "a room from inside": render(ROOM, camera(1.2, 0.3, 0.4)),
-    "the camera itself": np.zeros((50, 3), np.float32),
-    "one place": np.full((50, 3), 1e-3, np.float32),
-}
-
-
-@pytest.mark.parametrize("name", sorted(NO_SCENES))
-def test_what_is_no_scene_gets_no_grasps_and_a_reason(name: str) -> None:
-    found = answer(NO_SCENES[name])
-    if isinstance(found, InvalidRequest):
-        assert all((found.field, found.value, found.fix))
-    else:
-        assert (found.grasps, bool(found.warnings)) == ([], True)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from tests.cloud_files import npy
 from tests.many_options import MANY
-from tests.model.scenes import box_on_table
+from tests.model.rendered import FOCAL_LENGTH, ROOM_INSIDE, SCENE, wavy
+from tests.model.scenes import box_on_table, random_hands
 from typer.testing import CliRunner
 
 from edgegrasp_cli import main
@@ -132,3 +133,38 @@ def test_clouds_that_take_too_long_are_refused(catalogue, monkeypatch, pace, kin
 def test_the_pace_is_measured(catalogue: ModelCatalogue) -> None:
     catalogue.warm_up()
     assert 0 < catalogue.pace.point < catalogue.pace.voxel < 1e-3
+
+
+ONE_PLACE = np.full((50, 3), 1e-3, np.float32)
+NO_SCENES = {  # depth images (H, W), or clouds (N, 3), in metres
+    "one pixel": SCENE[120:121, 160:161, 2],
+    "one row": SCENE[120:121, :, 2],
+    "one column": SCENE[:, 160:161, 2],
+    "holes": np.zeros((240, 320), np.float32),
+    "within 5 cm": wavy(0.04),
+    "beyond 10 m": wavy(12.0),
+    "a room from inside": ROOM_INSIDE[..., 2],
+    "points all around the camera": random_hands(5000, 0, reach=0.5)[:, :3, 3],
+    "the camera itself": 0 * ONE_PLACE,
+    "one place": ONE_PLACE,
+}
+
+
+@pytest.mark.parametrize("name", NO_SCENES)
+def test_what_is_no_scene_gets_no_grasps_and_a_reason(real_server, name: str) -> None:
+    sent, url = NO_SCENES[name], f"{real_server.http_url}/v1/grasps"
+    if sent.shape[1] == 3:
+        kind = {"content-type": "application/x-npy"}
+        answer = httpx.post(url, content=npy(sent), headers=kind, timeout=60)
+    else:
+        middle = (sent.shape[1] // 2, sent.shape[0] // 2)
+        camera = json.dumps([FOCAL_LENGTH, FOCAL_LENGTH, *middle])
+        files = {"depth": ("depth.npy", npy(sent))}
+        answer = httpx.post(url, files=files, data={"intrinsics": camera}, timeout=60)
+    document = answer.json()
+    if answer.status_code == 200:
+        assert (document["grasps"], bool(document["warnings"])) == ([], True)
+        assert document["counts"]["points"] >= 0
+    else:
+        assert answer.status_code in (400, 413, 422)
+        assert all(document[part] for part in ("field", "value", "fix"))
