@@ -115,6 +115,12 @@ def render(boxes: list[SolidBox], T_world_camera: np.ndarray, seed: int = 0) -> 
     return points.reshape(HEIGHT, WIDTH, 3).astype(np.float32)
 
 
+def seen_box(boxes: list[SolidBox], pose: np.ndarray) -> np.ndarray:
+    """The row in `boxes` (H * W,) of the one that each pixel shows; -1: none."""
+    depth = np.stack([np.nan_to_num(render([one], pose)[..., 2], nan=np.inf) for one in boxes])
+    return np.where(np.isfinite(depth.min(axis=0)), depth.argmin(axis=0), -1).ravel()
+
+
 def wavy(distance: float) -> np.ndarray:
     """Depths (HEIGHT, WIDTH) of an uneven wall before the camera."""
     row, column = np.indices((HEIGHT, WIDTH))

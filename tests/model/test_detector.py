@@ -112,6 +112,7 @@ def test_one_of_the_objects_by_number_by_pixel_or_by_place() -> None:
 
     every = network.detect(image, DetectOptions(viewpoint=(0.0, 0.0, 0.0)))
     numbers = {each.number for each in every.objects}
+    assert not any(each.reason for each in every.objects if (each.best_score or 0.0) > 0.5)
     one = every.grasps[0].object
     assert one is not None
     assert objects(objects={"include": [one]}) == {one}

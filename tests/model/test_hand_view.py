@@ -54,24 +54,6 @@ def scores(batch: HandBatch, config: NetworkConfig = TINY["hand"]) -> torch.Tens
         return build_network(config).eval()(batch)
 
 
-def test_points_are_those_between_and_around_the_fingers() -> None:
-    cloud, candidates = scene(0)
-    batch = look(cloud, candidates, camera=None)
-    turn, shift = candidates.T_cloud_hand[:, :3, :3], candidates.T_cloud_hand[:, :3, 3]
-    seen = np.einsum("end,edk->enk", cloud.points - shift[:, None], turn)  # (E, N, 3)
-    seen[:, :, 2] -= PANDA.tip_z
-    inside = (np.abs(seen) < (0.0375, 0.1, np.inf)).all(axis=2)
-    inside &= (seen[:, :, 2] > PANDA.palm_z - 0.026 - PANDA.tip_z) & (seen[:, :, 2] < 0.012)
-    # Points within rounding of the region's edge may fall on its other side.
-    assert (np.abs(batch.point_count.numpy() - inside.sum(axis=1)) <= 1).all()
-    for hand in np.flatnonzero(batch.point_count.numpy() == inside.sum(axis=1)):
-        count = int(batch.point_count[hand])
-        normal = cloud.normals[inside[hand]] @ turn[hand]
-        expected = np.hstack([seen[hand][inside[hand]], normal])
-        np.testing.assert_allclose(batch.points[hand, :count], expected, atol=1e-5)
-        assert (batch.points[hand, count:] == 0).all()
-
-
 def test_the_order_of_the_points_and_what_follows_them_mean_nothing() -> None:
     batch = look(*scene(3))
     draws = torch.rand(batch.points.shape[:2], generator=torch.Generator().manual_seed(1))

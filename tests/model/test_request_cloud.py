@@ -86,16 +86,6 @@ def test_encodings_give_the_same_depths(encoding: str) -> None:
     assert caught.value.field == "depth_images"
 
 
-@pytest.mark.parametrize("nothing", [0.0, np.nan, np.inf])
-def test_pixels_without_a_reading_are_holes(nothing: float) -> None:
-    depth = depth_of()
-    depth[5, 7] = nothing
-    cloud, _ = read_depth_images([image(depth, pose(4))], MANY)
-    checked = check_cloud(cloud)
-    assert len(checked.points) == 24 * 32 - 1
-    assert 5 * 32 + 7 not in checked.row
-
-
 @pytest.mark.parametrize(
     ("intrinsics", "field", "value"),
     [

@@ -8,7 +8,16 @@ from edgegrasp_model.results import SUPPORT
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Detection
 
-from .rendered import BACKGROUND, SolidBox, box, boxes_on_table, camera, render, table, to_world
+from .rendered import (
+    BACKGROUND,
+    box,
+    boxes_on_table,
+    camera,
+    render,
+    seen_box,
+    table,
+    to_world,
+)
 from .scenes import detector
 
 ORIGIN = (0.0, 0.0, 0.0)
@@ -18,12 +27,6 @@ PANEL = box((0.0, 0.22, 0.06), (0.3, 0.015, 0.06))  # too long for an object, th
 def ask(cloud: object, **fields: object) -> Detection:
     fields = {"viewpoint": ORIGIN, "debug": True, "num_candidates": 200, **fields}
     return detector().detect(cloud, DetectOptions.model_validate(fields))
-
-
-def seen_box(boxes: list[SolidBox], pose: np.ndarray) -> np.ndarray:
-    """The row in `boxes` (H * W,) of the one that each pixel shows; -1: none."""
-    depth = np.stack([np.nan_to_num(render([one], pose)[..., 2], nan=np.inf) for one in boxes])
-    return np.where(np.isfinite(depth.min(axis=0)), depth.argmin(axis=0), -1).ravel()
 
 
 @pytest.mark.parametrize("roll", [0.5, np.pi])
