@@ -26,6 +26,7 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import islice
@@ -57,6 +58,7 @@ FAULTS: tuple[dict[str, Any], ...] = ({"seed": -1}, {"model": "none"}, {"viewpoi
 SECONDS = 30.0  # until a request counts as lost
 TOGETHER = 8  # requests of one stream
 ALONE = 0.1  # of the time, before the attacks begin
+START_SECONDS = 1.0  # for processes to start
 PROBE_SECONDS = 0.1  # between two questions for health
 HEALTH_TIMEOUT = 5.0 * float(os.environ.get("SOAK_PATIENCE", "1"))  # as in docker/kubernetes
 MEMORY_SAMPLES = 60
@@ -101,23 +103,16 @@ def run(
     server: Served, clients: int, seconds: float, seed: int, attacks: tuple[Any, ...]
 ) -> dict[str, Any]:
     """Clients beside attacks, which with the probe are processes of their own; the figures."""
-    context = multiprocessing.get_context("spawn")
-    stop, processes, tellers = context.Event(), [], []
-    for work in (probe, *attacks):
-        reports, pipe = context.Pipe(duplex=False)
-        given = (work, server.http_url, server.grpc_address, stop, pipe)
-        processes.append(context.Process(target=begin, args=given))
-        processes[-1].start()
-        pipe.close()  # here: the end of a process is the end of its pipe
-        tellers.append(reports)
-    for reports in tellers:
-        reports.recv()  # it has begun
-    soak = Soak(server, seed)
-    asyncio.run(soak.run(clients, seconds))
-    stop.set()
-    health, *attacked = (reports.recv() for reports in tellers)
-    for process in processes:
-        process.join()
+    context, count = multiprocessing.get_context("spawn"), 1 + len(attacks)
+    with context.Manager() as manager, ProcessPoolExecutor(count, context) as pool:
+        stop = manager.Event()
+        list(pool.map(time.sleep, [START_SECONDS] * count))  # until all processes have started
+        where = server.http_url, server.grpc_address, stop
+        works = [pool.submit(work, *where) for work in (probe, *attacks)]
+        soak = Soak(server, seed)
+        asyncio.run(soak.run(clients, seconds))
+        stop.set()
+        health, *attacked = (work.result() for work in works)
     return soak.figures() | {"health": health, "attacks": attacked}
 
 
@@ -252,14 +247,8 @@ def outcome(plan: Plan, came: Detection | GraspClientError) -> str:
 # The attackers and the probe
 
 
-def begin(work: Any, url: str, address: str, stop: Any, pipe: Any) -> None:
-    """Work in a process of its own, once it has imported everything."""
-    pipe.send("begun")
-    work(url, address, stop, pipe)
-
-
-def poison(url: str, address: str, stop: Any, pipe: Any) -> None:
-    """Small requests that ended workers once; tells the statuses of the answers."""
+def poison(url: str, address: str, stop: Any) -> dict[str, int]:
+    """Send small requests that ended workers once; returns the statuses of the answers."""
     came: Counter[str] = Counter()
     transport = httpx.HTTPTransport(local_address=ATTACKER)
     with httpx.Client(base_url=url, transport=transport, timeout=SECONDS) as http:
@@ -271,7 +260,7 @@ def poison(url: str, address: str, stop: Any, pipe: Any) -> None:
                     came[f"{media}: {answer.status_code}"] += 1
                 except httpx.HTTPError as error:
                     came[f"{media}: {type(error).__name__}"] += 1
-    pipe.send(dict(came))
+    return dict(came)
 
 
 def poisons(number: int) -> dict[str, bytes]:
@@ -294,7 +283,7 @@ def poisons(number: int) -> dict[str, bytes]:
     }
 
 
-def lock_out(url: str, address: str, stop: Any, pipe: Any) -> None:
+def lock_out(url: str, address: str, stop: Any) -> dict[str, int]:
     """Open pages that nobody reads and silent gRPC calls, hold them, and open them anew."""
     came: Counter[str] = Counter()
     page = b"GET /docs/assets/swagger-ui-bundle.js HTTP/1.1\r\nHost: x\r\n\r\n"
@@ -311,7 +300,7 @@ def lock_out(url: str, address: str, stop: Any, pipe: Any) -> None:
                     connection.sendall(http2_headers(path, 2 * (number % OF_ONE) + 1))
                     came["silent calls"] += 1
             stop.wait(HELD_SECONDS)
-    pipe.send(dict(came))
+    return dict(came)
 
 
 def connect(address: str, source: str = ATTACKER, timeout: float = SECONDS) -> socket.socket:
@@ -342,7 +331,7 @@ def http2_headers(path: str, stream: int) -> bytes:
     return http2_frame(1, 4, stream, headers)
 
 
-def probe(url: str, address: str, stop: Any, pipe: Any) -> None:
+def probe(url: str, address: str, stop: Any) -> dict[str, Any]:
     """Ask for health over both transports, each time on a new connection; returns the outcome."""
     questions = {"http": partial(ask_http, url), "grpc": partial(ask_grpc, address)}
     refused: Counter[str] = Counter()
@@ -356,7 +345,7 @@ def probe(url: str, address: str, stop: Any, pipe: Any) -> None:
                 refused[f"{name}: {error}"[:200]] += 1
             seconds[name].append(time.monotonic() - start)
     figures = {name: {"asked": len(one), "ms": milliseconds(one)} for name, one in seconds.items()}
-    pipe.send({"refused": dict(refused), **figures})
+    return {"refused": dict(refused), **figures}
 
 
 def ask_http(url: str) -> None:

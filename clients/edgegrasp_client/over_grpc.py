@@ -30,7 +30,7 @@ from edgegrasp_client.requests import (
     is_point_cloud2,
     point_cloud2_fields,
 )
-from edgegrasp_client.results import Models, Robots, StreamAnswer, read_as
+from edgegrasp_client.results import Models, StreamAnswer, read_as
 from edgegrasp_results import Detection
 
 Answer = TypeVar("Answer")
@@ -89,15 +89,13 @@ class GrpcTransport:
         method = self._stub.ScoreGrasps if request.scores else self._stub.DetectGrasps
         return read_as(kind, await self._call(method, message_of(request), timeout), read_field)
 
-    async def models(self, timeout: float) -> Models:
-        """The weights that the server has loaded."""
-        answer = await self._call(self._stub.ListModels, grasp_pb2.ListModelsRequest(), timeout)
-        return read_as(Models, answer, read_field)
-
-    async def robots(self, timeout: float) -> Robots:
-        """The robots that the server plans for."""
-        answer = await self._call(self._stub.ListRobots, grasp_pb2.ListRobotsRequest(), timeout)
-        return read_as(Robots, answer, read_field)
+    async def listed(self, kind: type[Answer], timeout: float) -> Answer:
+        """The server's Models or Robots."""
+        name = f"List{kind.__name__}"
+        call = self._call(
+            getattr(self._stub, name), getattr(grasp_pb2, f"{name}Request")(), timeout
+        )
+        return read_as(kind, await call, read_field)
 
     async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
         """Refused: gRPC has no such call."""
@@ -144,7 +142,7 @@ class GrpcTransport:
             if error.code() != grpc.StatusCode.UNIMPLEMENTED:
                 return False
         try:  # a server without gRPC's health service, such as Ray's: try a request
-            return bool((await self.models(timeout)).models)
+            return bool((await self.listed(Models, timeout)).models)
         except GraspClientError:
             return False
 

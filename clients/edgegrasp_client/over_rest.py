@@ -30,7 +30,7 @@ from edgegrasp_client.requests import (
     npy_bytes,
     point_cloud2_fields,
 )
-from edgegrasp_client.results import Models, Robots, StreamAnswer, read_as
+from edgegrasp_client.results import StreamAnswer, read_as
 from edgegrasp_results import Detection
 
 MAX_QUERY = 4000  # characters; servers and proxies limit the length of an address
@@ -65,13 +65,10 @@ class RestTransport:
         """The answer to a request."""
         return await self._call(kind, call_of(request), timeout)
 
-    async def models(self, timeout: float) -> Models:
-        """The weights that the server has loaded."""
-        return await self._call(Models, {"method": "GET", "url": "/v1/models"}, timeout)
-
-    async def robots(self, timeout: float) -> Robots:
-        """The robots that the server plans for."""
-        return await self._call(Robots, {"method": "GET", "url": "/v1/robots"}, timeout)
+    async def listed(self, kind: type[Answer], timeout: float) -> Answer:
+        """The server's Models or Robots."""
+        call = {"method": "GET", "url": f"/v1/{kind.__name__.lower()}"}
+        return await self._call(kind, call, timeout)
 
     async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
         """Report to the server whether a grasp held."""

@@ -41,11 +41,7 @@ class Tokens:
     def __init__(self, known: Iterable[Token] = ()) -> None:
         # Looked up by digest, so that timing reveals nothing about a token.
         self._known = {token.digest: token for token in known}
-
-    @property
-    def required(self) -> bool:
-        """Whether requests need a token."""
-        return any(not token.is_admin for token in self._known.values())
+        self.required = any(not token.is_admin for token in self._known.values())  # by requests
 
     def check(self, authorization: str | None, *, admin: bool = False) -> Token | None:
         """The valid token of a request, by its header `authorization`; None if none is needed.

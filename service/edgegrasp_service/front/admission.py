@@ -82,7 +82,11 @@ class Admission:
                 f"{len(self._tickets)} requests come first, which take about {wait:.3g} s, and "
                 f"the deadline is {remaining:.3g} s away"
             )
-        self._make_room(client)
+        if len(self._tickets) >= self._max_tickets:
+            counts = Counter(ticket.client for ticket in self._tickets)
+            holder, count = counts.most_common(1)[0]
+            if count <= counts[client] + 1 or not self._give_up(holder):
+                raise self._full(f"it holds {len(self._tickets)} requests")
         ticket = Ticket(client, asyncio.timeout_at(deadline))
         self._tickets.append(ticket)
         self._empty.clear()
@@ -96,15 +100,6 @@ class Admission:
             raise ticket.reason or DeadlineExceeded() from None
         finally:
             self._leave(ticket)
-
-    def _make_room(self, client: str) -> None:
-        """Free a slot, if need be by refusing another client's request; raises Overloaded."""
-        if len(self._tickets) < self._max_tickets:
-            return
-        counts = Counter(ticket.client for ticket in self._tickets)
-        holder, count = counts.most_common(1)[0]
-        if count <= counts[client] + 1 or not self._give_up(holder):
-            raise self._full(f"it holds {len(self._tickets)} requests")
 
     def _give_up(self, holder: str) -> bool:
         """Refuse the client's latest request that no worker has started; false: there is none."""

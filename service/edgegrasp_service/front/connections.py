@@ -234,8 +234,9 @@ class HttpProtocol(HttpToolsProtocol):
             self._refusal = error
             raise  # ends the parser too
         self._in_headers = False
-        _cancel(self._header_timer)
-        self._header_timer = None
+        if self._header_timer is not None:
+            self._header_timer.cancel()
+            self._header_timer = None
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
@@ -262,12 +263,14 @@ class HttpProtocol(HttpToolsProtocol):
 
     def resume_writing(self) -> None:
         """Stop that timer."""
-        _cancel(self._write_timer)
+        if self._write_timer is not None:
+            self._write_timer.cancel()
         super().resume_writing()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Stop timers and return the place."""
-        _cancel(self._header_timer)
+        if self._header_timer is not None:
+            self._header_timer.cancel()
         self.resume_writing()
         self._places.leave(self._place)
         super().connection_lost(exc)
@@ -310,11 +313,6 @@ class HttpProtocol(HttpToolsProtocol):
         if not self.transport.is_closing():
             value = f"not whole in {self._settings.read_seconds:g} s"
             self._refuse(RequestTimeout("headers", value, "Send them at once."))
-
-
-def _cancel(timer: asyncio.TimerHandle | None) -> None:
-    if timer is not None:
-        timer.cancel()
 
 
 class _GentleTransport:
