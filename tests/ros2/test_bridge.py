@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.cloud_files import point_cloud2
+from tests.end_to_end import test_tracking
 
 from edgegrasp_bridge import bridge
 from edgegrasp_bridge.bridge import Inbox, Scene, Settings
 from edgegrasp_camera import InvalidRequest
-from edgegrasp_client import GraspClient, InvalidRequestError, Robot
+from edgegrasp_client import GraspClient, GraspTracker, InvalidRequestError, Robot
 from edgegrasp_client.conversions import PANDA_LINK8, matrix_from_quaternion
 from edgegrasp_client.options import DetectOptions
 from edgegrasp_results import ArmPlan, ArmTrajectory
@@ -120,6 +121,20 @@ def test_a_cloud_and_its_grasps_in_every_message(client, sent, make_cloud, cloud
 
 def shifted(z: float) -> np.ndarray:
     return np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, z], [0, 0, 0, 1]])
+
+
+def test_the_first_pose_follows_its_object_from_message_to_message(real_server, sent, make_cloud):
+    tracker, places = GraspTracker(max_object_size=0.3), []
+    settings = Settings(camera_frame="camera")
+    with GraspClient(real_server.grpc_address) as client:
+        for number in range(3):
+            scene = Scene(make_cloud(test_tracking.image(number)["cloud"], "base"))
+            found = bridge.detect(client, scene, settings, {}, lookup, tracker=tracker)
+            poses = sent("geometry_msgs/msg/PoseArray", bridge.pose_array(found)).poses
+            places.append(matrix(poses[0])[:3, 3])
+    np.testing.assert_allclose(
+        np.diff(places, axis=0), [(0, test_tracking.STEP, 0)] * 2, atol=0.003
+    )
 
 
 def matrix(pose: Any) -> np.ndarray:

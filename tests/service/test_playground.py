@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from tests.end_to_end.test_tracking import STEP, image
 from tests.programs import run
 
 from edgegrasp_client.conversions import read_isaac_grasps
@@ -274,6 +275,26 @@ def test_grasps_of_a_real_camera_are_seen(real_server, open_page, shared_dir, na
         page.get_by_text("Find grasps").click()
         page.locator("#warnings li").wait_for(state="detached")
         assert len(shown(page)) == 12
+
+
+def test_the_chosen_grasp_is_followed_in_the_next_image(real_server, open_page, tmp_path) -> None:
+    page = open_page(real_server.http_url)
+    shown(page)
+    for number in range(2):
+        np.save(tmp_path / f"{number}.npy", image(number)["cloud"])
+    page.set_input_files("#files", tmp_path / "0.npy")
+    page.locator("#viewpoint").fill("0.35,0,0.55")
+    with page.expect_response(f"{real_server.http_url}/v1/grasps"):
+        page.locator("#follow").check()
+    page.get_by_text("detecting, by").wait_for()
+    page.locator("#grasps button").nth(2).click()
+    before = json.loads(page.locator("#chosen_json").text_content())
+    page.set_input_files("#files", tmp_path / "1.npy")
+    page.get_by_text("detecting, by").wait_for()
+    after = json.loads(page.locator("#chosen_json").text_content())
+    assert after["id"] == before["id"]
+    y = [grasp["T_cloud_hand"][1][3] for grasp in (before, after)]
+    assert y[1] - y[0] == pytest.approx(STEP, abs=0.002)
 
 
 def test_a_server_with_tokens_is_asked_with_one(start_dummy, open_page, tmp_path: Path) -> None:

@@ -16,7 +16,15 @@ from edgegrasp_camera.arrays import Array, Float64
 from edgegrasp_camera.clouds import read_point_cloud2
 from edgegrasp_camera.depth import intrinsics_of, metres, unproject
 from edgegrasp_camera.picture import fork
-from edgegrasp_client import DepthImage, Detection, Grasp, GraspClient, object_in_scene, on_mask
+from edgegrasp_client import (
+    DepthImage,
+    Detection,
+    Grasp,
+    GraspClient,
+    GraspTracker,
+    object_in_scene,
+    on_mask,
+)
 from edgegrasp_client.conversions import (
     PANDA_JOINTS,
     FingerJoints,
@@ -55,6 +63,7 @@ class Settings:
     server: str = "127.0.0.1:50051"  # host:port (gRPC) or http://host:port
     timeout: float = 30.0  # seconds for a request
     on_message: bool = True  # detect at every cloud, image or mask, not only for an action
+    follow: bool = False  # the same grasp from message to message, of a camera that stands still
     mask_age: float = 1.0  # seconds a mask may be behind the newest image; 0: no mask is used
     target_frame: str = ""  # what answers are in; empty: the frame of the cloud or image
     camera_frame: str = ""  # where the camera of a cloud stands; empty: the cloud's own origin
@@ -192,6 +201,7 @@ def detect(
     options: Mapping[str, Any],
     lookup: Lookup,
     object_cloud: Any = None,
+    tracker: GraspTracker | None = None,
 ) -> Found:
     """Grasps of a scene, or of one object in it.
 
@@ -202,6 +212,7 @@ def detect(
         options: Of the detection; they come before what frames say.
         lookup: Transforms between frames.
         object_cloud: sensor_msgs/PointCloud2 of the object that grasps are for.
+        tracker: Made with `options`: what it remembers is followed.
 
     Raises:
         GraspClientError: As of the client.
@@ -215,7 +226,7 @@ def detect(
     if header is None:
         raise ValueError("No cloud and no depth image has come yet.")
     frame_id, stamp = header.frame_id, header.stamp
-    asked = _from_frames(scene, settings, lookup) | dict(options)
+    asked = _from_frames(scene, settings, lookup) | dict(tracker.options() if tracker else options)
     if scene.mask is not None and object_cloud is None:
         asked = dict(on_mask(image_array(scene.mask), asked))
     if asked.get("robot"):
@@ -240,6 +251,8 @@ def detect(
             for depth, camera in ((scene.depth, scene.camera), *scene.others)
         ]
         found = client.detect(depth_images=images, **cast("DetectOptions", asked))
+    if tracker is not None:
+        tracker.take(found)
     target = settings.target_frame or frame_id
     T_target_cloud = lookup(target, frame_id, stamp)
     grasps = [_moved(grasp, T_target_cloud) for grasp in found.grasps]

@@ -23,7 +23,7 @@ from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from edgegrasp_bridge import bridge
-from edgegrasp_client import GraspClient
+from edgegrasp_client import GraspClient, GraspTracker
 
 INPUTS = {  # topics: kinds of message, and fields of bridge.Scene
     "points": (PointCloud2, "cloud"),
@@ -46,6 +46,7 @@ class EdgeGraspNode(Node):
         settings, _ = self._read()
         self._client = GraspClient(settings.server, timeout=settings.timeout)
         self._inbox = bridge.Inbox()
+        self._followed, self._tracker = {}, GraspTracker()  # options, and the tracker made of them
         self._buffer = Buffer()
         self._listener = TransformListener(self._buffer, self)
         self._poses = self.create_publisher(PoseArray, "grasps", 1)
@@ -84,16 +85,21 @@ class EdgeGraspNode(Node):
                 and self.get_parameter("on_message").value
             ):
                 try:
-                    self._detect()
+                    self._detect(follow=self.get_parameter("follow").value)
                 except Exception as error:  # tf2's too: the node goes on with the next message
                     self.get_logger().warning(f"{type(error).__name__}: {error}")
 
         return take
 
-    def _detect(self, object_cloud: Any = None) -> Any:
+    def _detect(self, object_cloud: Any = None, follow: bool = False) -> Any:
         settings, options = self._read()
+        if options != self._followed:
+            self._followed, self._tracker = options, GraspTracker(**options)
+        tracker = self._tracker if follow else None
         scene = self._inbox.scene(0.0 if object_cloud is not None else settings.mask_age)
-        found = bridge.detect(self._client, scene, settings, options, self._lookup, object_cloud)
+        found = bridge.detect(
+            self._client, scene, settings, options, self._lookup, object_cloud, tracker
+        )
         for warning in found.detection.warnings:
             self.get_logger().warning(warning)
         motions = zip(self._motions, bridge.trajectories(found), strict=False)

@@ -17,7 +17,7 @@ const $ = (id) => document.getElementById(id);
 const state = {
   files: [], scene: null, answer: null, fresh: true, // answer: its grasps by score; fresh: the first of its scene
   robots: [], shapes: {}, target: {}, objects: [], // of the request; target: options; objects: what it may be
-  grippers: {}, gripper: null, chosen: null, busy: null,
+  grippers: {}, gripper: null, chosen: null, busy: null, followed: null, // followed: `previous` of the next request
 };
 const view = picture();
 
@@ -112,8 +112,19 @@ function options() {
   const base = numbers($("base").value, 16);
   if (robot() && base) found.robot = { name: robot().name, T_base_cloud: base, joints: joints() };
   if ($("debug").checked) found.debug = true;
+  if ($("follow").checked) found.previous = state.followed ?? {};
   const more = $("more").value.trim();
   return more ? { ...found, ...JSON.parse(more) } : found;
+}
+
+/** What the next image is to follow: a grasp of this answer, and its objects. */
+function previous(grasp) {
+  const { tracking, objects } = state.answer;
+  return {
+    gripper: state.answer.gripper.name, next_id: tracking.next_id,
+    grasps: [{ id: grasp.id, T_cloud_hand: grasp.T_cloud_hand.flat(), object: grasp.object }],
+    objects: objects.filter(({ surface }) => surface).map(({ number, surface, confidence }) => ({ number, surface, confidence })),
+  };
 }
 
 /** The arm that is chosen. */
@@ -155,7 +166,7 @@ async function ask() {
     const body = new FormData();
     for (const [name, value] of parts(asked)) body.append(name, value);
     const answer = await call("/v1/grasps", { method: "POST", signal: stop.signal, body });
-    if (!asked.robot) answer.grasps.sort((one, other) => other.score - one.score);
+    if (!asked.robot && !asked.previous) answer.grasps.sort((one, other) => other.score - one.score);
     [state.answer, state.gripper] = [answer, gripperOf(asked, answer.model)];
     view.showAnswer(answer, state.gripper, state.fresh);
     state.fresh = false;
@@ -273,6 +284,7 @@ function choose(row) {
   [...$("grasps").children].forEach((item, each) => item.firstChild.setAttribute("aria-pressed", each === row));
   $("chosen").hidden = !grasp;
   if (!grasp) return;
+  if (state.answer.tracking) state.followed = previous(grasp);
   const [list, { offsetTop, offsetHeight }] = [$("grasps"), $("grasps").children[row]];
   list.scrollTop = Math.min(Math.max(list.scrollTop, offsetTop + offsetHeight - list.clientHeight), offsetTop);
   $("rank").textContent = row + 1;
@@ -481,6 +493,10 @@ $("robot").addEventListener("change", () => {
   $("joints").value = robot() ? rounded(robot().home, 4) : "";
   ask();
 });
+$("follow").addEventListener("change", () => {
+  state.followed = null;
+  ask();
+});
 $("keep").addEventListener("click", () => ($("debug").checked = true) && ask());
 $("approach").addEventListener("change", ({ target }) => {
   const down = state.answer ? state.answer.up.map((value) => -value) : [0, 0, -1];
@@ -519,10 +535,10 @@ for (const kind of ["dragover", "dragleave", "drop"]) {
   });
 }
 
-/** Files of the user: nothing of the sample's camera is theirs. */
+/** Files of the user: nothing of the sample's camera is theirs, but the next image is of the same camera. */
 async function take(files) {
   if (!files.length) return;
-  for (const field of ["intrinsics", "depth_scale", "viewpoint"]) $(field).value = "";
+  if (!$("follow").checked) for (const field of ["intrinsics", "depth_scale", "viewpoint"]) $(field).value = "";
   $("sample").selectedIndex = -1;
   if (await open(files)) await ask();
 }
