@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 os.environ["OMP_NUM_THREADS"] = "1"  # two test processes and their servers share two cores
 
@@ -65,6 +66,7 @@ def running_server(
     *flags: str,
     program: Sequence[str] = ("-c", "from edgegrasp_cli.main import main; main()"),
     seconds: float = 0.0,
+    **more: Any,
 ) -> Iterator[RunningServer]:
     ports = ("--http-port", "0", "--grpc-port", "0")
     process = subprocess.Popen(
@@ -72,6 +74,7 @@ def running_server(
         stdout=subprocess.PIPE,
         text=True,
         env=os.environ | {"DUMMY_SECONDS": str(seconds)},
+        **more,
     )
     assert process.stdout is not None
     try:

@@ -1,7 +1,9 @@
 """Programs that tests run to their end."""
 
+import socket
 import subprocess
 import sys
+from contextlib import ExitStack
 from typing import Any
 
 EDGEGRASP = (sys.executable, "-c", "from edgegrasp_cli.main import main; main()")
@@ -13,3 +15,10 @@ def run(*words: object, code: int = 0, **more: Any) -> subprocess.CompletedProce
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, **more)
     assert done.returncode == code, done.stdout[-5000:] + done.stderr
     return done
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports on which nothing listens."""
+    with ExitStack() as stack:
+        made = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
+        return [one.getsockname()[1] for one in made]

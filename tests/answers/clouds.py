@@ -1,4 +1,4 @@
-"""Requests whose answers are recorded: clouds from the labelled views and from a drawn scene.
+"""Requests whose answers are recorded: clouds from the labelled views.
 
 Everything is made from files of the repository and explicit seeds, so that it is the same on
 every machine. Options are in the client's form, which the model reads as well.
@@ -25,12 +25,11 @@ LONG_FINGERS = {"name": "long-fingers", "max_opening": 0.09, "tip_z": 0.13, "con
 
 @dataclass
 class Case:
-    """One request: a cloud or depth images, what is beside it, and options."""
+    """One request: a cloud, what is beside it, and options."""
 
     options: dict[str, Any]
-    points: np.ndarray | None = None  # (N, 3), or (H, W, 3) with NaN, metres
+    points: np.ndarray  # (N, 3) metres
     beside: dict[str, np.ndarray] = field(default_factory=dict)  # normals, segment_ids, view_ids
-    depth_images: list[dict[str, Any]] | None = None
     given: dict[str, np.ndarray] = field(default_factory=dict)  # edges or hand_poses: score them
 
 
@@ -52,63 +51,6 @@ def with_table(points: np.ndarray, seed: int) -> np.ndarray:
     return np.concatenate([points, (table + noise).astype(np.float32)])
 
 
-CAMERA = {"fx": 220.0, "fy": 220.0, "cx": 79.5, "cy": 59.5}  # pixels
-T_CLOUD_CAMERA = np.array(  # looks down at the table from 0.5 m, tilted by 30 degrees
-    [
-        [1.0, 0.0, 0.0, 0.15],
-        [0.0, -np.cos(np.pi / 6), np.sin(np.pi / 6), -0.1],
-        [0.0, -np.sin(np.pi / 6), -np.cos(np.pi / 6), 0.5],
-        [0.0, 0.0, 0.0, 1.0],
-    ]
-)
-
-
-@cache
-def drawn_depth() -> np.ndarray:
-    """(120, 160) metres: two balls and a box on the table z = 0, NaN where there is no reading."""
-    row, column = np.indices((120, 160))
-    ray = np.stack(
-        [
-            (column - CAMERA["cx"]) / CAMERA["fx"],
-            (row - CAMERA["cy"]) / CAMERA["fy"],
-            np.ones(row.shape),
-        ],
-        axis=-1,
-    )
-    ray, origin = ray @ T_CLOUD_CAMERA[:3, :3].T, T_CLOUD_CAMERA[:3, 3]
-    depth = -origin[2] / ray[..., 2]
-    for center, radius in (((0.1, 0.15, 0.028), 0.028), ((0.2, 0.2, 0.032), 0.032)):
-        away = origin - center
-        a, b = (ray**2).sum(axis=-1), ray @ away
-        inside = b**2 - a * (away @ away - radius**2)
-        near = (-b - np.sqrt(np.maximum(inside, 0.0))) / a
-        depth = np.where(inside > 0.0, np.minimum(depth, near), depth)
-    low, high = np.array([0.13, 0.09, 0.0]), np.array([0.17, 0.15, 0.05])
-    walls = np.stack([(low - origin) / ray, (high - origin) / ray])
-    enter, leave = walls.min(axis=0).max(axis=-1), walls.max(axis=0).min(axis=-1)
-    depth = np.where(enter < leave, np.minimum(depth, enter), depth)
-    rng = np.random.default_rng(11)
-    depth += rng.normal(0.0, 0.0004, depth.shape)
-    depth[rng.random(depth.shape) < 0.05] = np.nan
-    return depth.astype(np.float32)
-
-
-def points_of(image: dict[str, Any]) -> np.ndarray:
-    """(H, W, 3) float32 in the cloud's frame: what a depth image stands for."""
-    depth = np.where(image["depth"] > 0, image["depth"], np.nan).astype(np.float64)
-    row, column = np.indices(depth.shape)
-    pixels, pose = image["intrinsics"], np.asarray(image["T_cloud_camera"])
-    x = (column - pixels["cx"]) / pixels["fx"] * depth
-    y = (row - pixels["cy"]) / pixels["fy"] * depth
-    points = np.stack([x, y, depth], axis=-1) @ pose[:3, :3].T + pose[:3, 3]
-    return points.astype(np.float32)
-
-
-def drawn_image(scale: float = 1.0) -> dict[str, Any]:
-    depth = drawn_depth() * np.float32(scale)
-    return {"depth": depth, "intrinsics": CAMERA, "T_cloud_camera": T_CLOUD_CAMERA}
-
-
 def seen(name: str, table_seed: int | None = None, **options: Any) -> Case:
     """A labelled view, with its camera as viewpoint and, by default, its table."""
     points = view(name)["points"]
@@ -127,12 +69,6 @@ def pile_ransac() -> Case:
     collision = {"mode": "penalise", "margin": 0.004}
     few = FEW | options
     return seen("pile_7-000013_0", 2, model="edgegrasp", collision=collision, **few)
-
-
-def depth_image() -> Case:
-    support = {"normal": (0.0, 0.0, 1.0), "offset": 0.0, "max_depth_error": 0.05}
-    options = {"model": "edgegrasp-small", "support": support, "min_score": 0.9, "seed": 9}
-    return Case(options, depth_images=[drawn_image(scale=1.015)])
 
 
 def two_views() -> Case:
@@ -204,6 +140,6 @@ def score_hand_poses() -> Case:
     return case
 
 
-MAKERS = (packed_plane, pile_ransac, depth_image, two_views, given_normals)
+MAKERS = (packed_plane, pile_ransac, two_views, given_normals)
 MAKERS += (segments_own_gripper, score_edges, score_hand_poses)
 CASES = {make.__name__: make for make in MAKERS}

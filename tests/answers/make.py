@@ -13,7 +13,7 @@ from edgegrasp_model.detector import ModelCatalogue
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.scene.cloud import CloudInput
 
-from .clouds import CASES, Case, points_of
+from .clouds import CASES, Case
 
 DATA = Path(__file__).parent / "data"
 GRASP_FIELDS = (
@@ -33,12 +33,7 @@ Record = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 def answer(case: Case, catalogue: ModelCatalogue) -> Any:
     """The detection or scoring of a case, without a server."""
-    points, options = case.points, case.options
-    if case.depth_images is not None:  # as a server reads them
-        (image,) = case.depth_images
-        points = points_of(image)
-        options = options | {"viewpoint": np.asarray(image["T_cloud_camera"])[:3, 3].tolist()}
-    cloud, asked = CloudInput(points, **case.beside), parse_options(options)
+    cloud, asked = CloudInput(case.points, **case.beside), parse_options(case.options)
     detector = catalogue.get(asked.model)
     if case.given:
         return detector.score(cloud, asked, **case.given)

@@ -16,7 +16,7 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
-from tests.programs import EDGEGRASP, run
+from tests.programs import EDGEGRASP, free_ports, run
 
 from edgegrasp_cli.mcp import grasp_tools
 from edgegrasp_client import Detection, Grasp, GraspClient
@@ -216,8 +216,7 @@ async def test_an_agent_gets_the_joints_of_a_robot(dummy_server, folder, reaches
 
 @pytest.fixture
 def http_address(dummy_server, folder: Path) -> Iterator[str]:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    (port,) = free_ports(1)
     flags = ["--server", dummy_server.grpc_address, "--folder", str(folder)]
     command = [sys.executable, *PROGRAM, *flags, "--http", f"127.0.0.1:{port}"]
     with subprocess.Popen(command) as process:

@@ -13,7 +13,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from tests.programs import EDGEGRASP, run
+from tests.programs import EDGEGRASP, free_ports, run
 
 pytest.importorskip("uvicorn", reason="the extra `open-inference` is not installed")
 
@@ -142,18 +142,9 @@ def test_what_cannot_be_served(post, cloud, changes, model, status, told) -> Non
 
 
 def test_the_command_serves_both_transports(dummy_server) -> None:
-    free = [socket.create_server(("127.0.0.1", 0)) for _ in range(2)]
-    ports = [str(one.getsockname()[1]) for one in free]
-    for one in free:
-        one.close()
-    flags = [
-        "--server",
-        dummy_server.grpc_address,
-        "--http-port",
-        ports[0],
-        "--grpc-port",
-        ports[1],
-    ]
+    ports = [str(port) for port in free_ports(2)]
+    flags = ["--server", dummy_server.grpc_address]
+    flags += ["--http-port", ports[0], "--grpc-port", ports[1]]
     with subprocess.Popen([*EDGEGRASP, "open-inference", *flags]) as process:
         try:
             with httpx.Client(transport=httpx.HTTPTransport(retries=10)) as http:

@@ -2,14 +2,13 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import psutil
 import pytest
 from benchmarks.load import OPTIONS
 from benchmarks.load import cloud as table
-from tests.programs import EDGEGRASP
+from tests.programs import EDGEGRASP, free_ports
 
 from edgegrasp_client import (
     GraspClient,
@@ -86,9 +85,7 @@ def started(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
 def served(cluster: Any, folder: Path) -> Iterator[dict[str, str]]:
     """`serve run`; addresses of both transports."""
     yaml = pytest.importorskip("yaml")
-    with ExitStack() as stack:
-        made = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(2)]
-        http, grpc = (one.getsockname()[1] for one in made)
+    http, grpc = free_ports(2)
     config = yaml.safe_load((ROOT / "docker/ray/serve.yaml").read_text())
     config["http_options"] |= {"host": "127.0.0.1", "port": http}
     config["grpc_options"]["port"] = grpc

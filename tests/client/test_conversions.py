@@ -17,7 +17,6 @@ from edgegrasp_client.conversions import (
     graspnet_frame,
     isaac_grasps,
     matrix_from_quaternion,
-    moveit_grasp,
     quaternion_from_matrix,
     read_isaac_grasps,
     to_frame,
@@ -83,45 +82,6 @@ def test_the_pandas_parent_link_is_turned_by_45_degrees_at_the_same_place() -> N
     T_link_hand = np.eye(4)
     T_link_hand[:3, :3] = Rotation.from_euler("z", -np.pi / 4).as_matrix()
     np.testing.assert_allclose(PANDA_LINK8 @ T_link_hand, np.eye(4), atol=1e-12)
-
-
-def test_a_moveit_grasp_is_laid_out_as_the_message() -> None:
-    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "table"}
-
-    def posture(*positions: float) -> dict[str, Any]:
-        point = {"positions": list(positions), "velocities": [], "accelerations": []}
-        point |= {"effort": [], "time_from_start": {"sec": 0, "nanosec": 0}}
-        names = ["panda_finger_joint1", "panda_finger_joint2"]
-        return {"header": header, "joint_names": names, "points": [point]}
-
-    def along(z: float, distance: float) -> dict[str, Any]:
-        vector = {"x": 0.0, "y": 0.0, "z": z}
-        direction = {"header": header, "vector": vector}
-        return {
-            "direction": direction,
-            "desired_distance": distance,
-            "min_distance": distance,
-        }
-
-    half = float(np.sqrt(0.5))  # a half turn about the cloud's x = y
-    message = moveit_grasp(
-        grasp(DOWN), "table", name="best", approach_distance=0.08, retreat_direction=(0, 0, 2)
-    )
-    pose = message["grasp_pose"]["pose"]
-    assert pose["position"] == pytest.approx({"x": 0.5, "y": -0.1, "z": 0.3})
-    assert pose["orientation"] == pytest.approx({"x": half, "y": half, "z": 0.0, "w": 0.0})
-    assert message == {
-        "id": "best",
-        "pre_grasp_posture": posture(0.03, 0.03),
-        "grasp_posture": posture(0.0, 0.0),
-        "grasp_pose": {"header": header, "pose": pose},
-        "grasp_quality": 0.9,
-        "pre_grasp_approach": along(-1.0, 0.08),
-        "post_grasp_retreat": along(1.0, 0.1),
-        "post_place_retreat": along(1.0, 0.1),
-        "max_contact_force": 0.0,
-        "allowed_touch_objects": [],
-    }
 
 
 @given(

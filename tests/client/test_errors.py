@@ -1,7 +1,6 @@
 """What goes wrong is the same exception over either transport, or is tried again."""
 
 import itertools
-import socket
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -10,6 +9,7 @@ import grpc
 import httpx
 import numpy as np
 import pytest
+from tests.programs import free_ports
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import (
@@ -231,18 +231,10 @@ def test_requests_of_a_stream_are_sent_once(failing, cloud) -> None:
     assert server.calls == 1
 
 
-@pytest.fixture
-def closed_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as closing:
-        return int(closing.getsockname()[1])
-
-
 @pytest.mark.usefixtures("hasty_retries")
 @pytest.mark.parametrize("scheme", ["", "http://"])
-def test_without_a_server_calls_fail_and_waiting_ends(
-    scheme: str, closed_port: int, make_client, cloud
-) -> None:
-    client = make_client(f"{scheme}127.0.0.1:{closed_port}")
+def test_without_a_server_calls_fail_and_waiting_ends(scheme: str, make_client, cloud) -> None:
+    client = make_client(f"{scheme}127.0.0.1:{free_ports(1)[0]}")
     for call in (client.models, lambda: client.detect(cloud)):
         with pytest.raises(ServerUnavailableError):
             call()

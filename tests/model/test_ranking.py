@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 import torch
 
-from edgegrasp_model.candidates.collision import FINGER_CLEARANCE
+from edgegrasp_model.candidates.collision import FINGER_CLEARANCE, collides
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import CheckpointMetadata
-from edgegrasp_model.options import parse_options
+from edgegrasp_model.options import Collision, parse_options
 from edgegrasp_model.ranking import openings
 
 from .scenes import PANDA, TINY, box_on_table, scene_of
@@ -31,6 +31,19 @@ def test_a_hand_opens_fully_where_the_far_side_is_hidden(camera, opening, hidden
     width, far_side_hidden = openings(scene, np.eye(4, dtype=np.float32)[None], PANDA)
     np.testing.assert_allclose(width, opening, atol=1e-6)
     assert far_side_hidden == hidden
+
+
+@pytest.mark.parametrize(
+    ("camera", "blocked"),
+    [((-0.6, 0.0, 0.0), True), ((0.6, 0.0, 0.0), False), (None, False)],
+    ids=["in front of the plate", "behind it, with the hand", "unknown"],
+)
+def test_a_palm_in_space_that_no_camera_saw_counts_as_colliding(camera, blocked) -> None:
+    y, z = np.meshgrid(np.arange(-0.2, 0.2, 0.004), np.arange(-0.2, 0.3, 0.004))
+    plate = np.stack([np.full_like(y, -0.1), y, z], axis=-1).reshape(-1, 3).astype(np.float32)
+    viewpoints = None if camera is None else np.array([camera], dtype=np.float32)
+    behind, hand = scene_of(plate, viewpoints=viewpoints), np.eye(4, dtype=np.float32)[None]
+    assert collides(behind, hand, PANDA, Collision()).tolist() == [blocked]
 
 
 def hopeless() -> GraspDetector:

@@ -9,7 +9,6 @@ import json
 import os
 import socket
 import struct
-import subprocess
 import sys
 import threading
 import time
@@ -425,32 +424,22 @@ main()
 """
 
 
-def test_without_file_descriptors_left_the_log_stays_short(tmp_path: Path, cloud) -> None:
-    command = [sys.executable, "-c", OUT_OF_DESCRIPTORS, "serve"]
-    with (tmp_path / "log").open("w") as log:
-        process = subprocess.Popen(
-            [*command, "--http-port", "0", "--grpc-port", "0", "--workers", "1"],
-            stdout=subprocess.PIPE,
-            stderr=log,
-            text=True,
-        )
-    try:
-        assert process.stdout is not None
-        url, address = process.stdout.readline().split()[3::2]
-        held = [connect(url) for _ in range(150)]
-        while "Too many open files" not in (tmp_path / "log").read_text():
+def test_without_file_descriptors_left_the_log_stays_short(start_dummy, tmp_path, cloud) -> None:
+    file, program = tmp_path / "log", ("-c", OUT_OF_DESCRIPTORS)
+    with (
+        file.open("w") as log,
+        start_dummy("--workers", "1", program=program, stderr=log) as server,
+    ):
+        held = [connect(server.http_url) for _ in range(150)]
+        while "Too many open files" not in file.read_text():
             time.sleep(0.05)
         for connection in held:
             connection.close()
-        assert httpx.get(f"{url}/health/live", timeout=PATIENCE).status_code == 200
-        with GraspClient(address, timeout=PATIENCE) as client:
+        assert httpx.get(f"{server.http_url}/health/live", timeout=PATIENCE).status_code == 200
+        with GraspClient(server.grpc_address, timeout=PATIENCE) as client:
             assert len(client.detect(cloud).grasps) == 10
-        process.terminate()
-        assert process.wait(PATIENCE) == 0
-    finally:
-        process.kill()
-        process.communicate()
-    lines = (tmp_path / "log").read_text().splitlines()
+        assert server.stop() == 0
+    lines = file.read_text().splitlines()
     assert len(lines) < 20
     assert not any("Traceback" in line for line in lines)
 

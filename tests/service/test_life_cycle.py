@@ -6,8 +6,6 @@ import os
 import pty
 import signal
 import socket
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -201,29 +199,16 @@ main()
 """
 
 
-def test_a_closed_terminal_stops_what_was_started_in_it() -> None:
+def test_a_closed_terminal_stops_what_was_started_in_it(start_dummy) -> None:
     terminal, inside = pty.openpty()
-    command = [sys.executable, "-c", SERVE_AT_A_TERMINAL, "serve"]
-    process = subprocess.Popen(
-        [*command, "--http-port", "0", "--grpc-port", "0"],
-        stdin=inside,
-        stdout=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    os.close(inside)
-    try:
-        assert process.stdout is not None
-        url = process.stdout.readline().split()[3]
-        process.send_signal(signal.SIGHUP)  # with the terminal there: a reload
-        with httpx.Client(base_url=url) as http:
-            while 'reloads_total{outcome="succeeded"} 1.0' not in http.get("/metrics").text:
-                threading.Event().wait(0.05)
+    there = {"program": ("-c", SERVE_AT_A_TERMINAL), "stdin": inside, "start_new_session": True}
+    with start_dummy(**there) as server, httpx.Client(base_url=server.http_url) as http:
+        os.close(inside)
+        server.process.send_signal(signal.SIGHUP)  # with the terminal there: a reload
+        while 'reloads_total{outcome="succeeded"} 1.0' not in http.get("/metrics").text:
+            threading.Event().wait(0.05)
         os.close(terminal)
-        assert process.wait(timeout=30) == 0
-    finally:
-        process.kill()
-        process.communicate()
+        assert server.process.wait(timeout=30) == 0
 
 
 async def test_sockets_of_a_folder(serve, transport: str, cloud: np.ndarray) -> None:

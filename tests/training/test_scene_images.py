@@ -20,21 +20,9 @@ from edgegrasp_training.scene_training import (
     train,
 )
 
-CUBE = """v 0 0 0
-v 0.05 0 0
-v 0.05 0.04 0
-v 0 0.04 0
-v 0 0 0.06
-v 0.05 0 0.06
-v 0.05 0.04 0.06
-v 0 0.04 0.06
-f 1 4 3 2
-f 5 6 7 8
-f 1 2 6 5
-f 2 3 7 6
-f 3 4 8 7
-f 4 1 5 8
-"""
+BLOCK = "".join(f"v {x} {y} {z}\n" for x in (0, 0.05) for y in (0, 0.04) for z in (0, 0.06))
+for quad in ("1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"):
+    BLOCK += f"f {quad}\n"
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +66,8 @@ def test_a_file_is_made_and_learned_from(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(scene_pool, "NUM_ARMS", 0)
     monkeypatch.setattr(scene_training, "HELD_OUT", 1)
     monkeypatch.setattr(scene_training, "BATCH", 4)
-    mesh = tmp_path / "cube.obj"
-    mesh.write_text(CUBE)
+    mesh = tmp_path / "block.obj"
+    mesh.write_text(BLOCK)
     generate(tmp_path / "data", [mesh], files=2, seed=1, part=0, parts=1)
     files = sorted((tmp_path / "data").glob("scenes-????.npz"))
     assert len(files) == 2
