@@ -107,19 +107,6 @@ def test_several_depth_images_are_one_cloud(camera_files, dummy_server, run, ref
     assert "Give one for each of 2 images" in " ".join(refused(*asked).split())
 
 
-def test_a_file_with_a_depth_image_and_its_camera(dummy_server, run, tmp_path) -> None:
-    depth = np.random.default_rng(0).integers(500, 700, (24, 32)).astype(np.uint16)
-    rgb = np.full((24, 32, 3), (200, 30, 30), np.uint8)
-    file, drawn = tmp_path / "scene.npz", tmp_path / "seen.jpg"
-    np.savez(file, depth=depth, intrinsics=[40.0, 40.0, 15.5, 11.5], rgb=rgb, labels=depth)
-    for flags in ((), ("--server", dummy_server.grpc_address)):
-        shown = run("detect", file, *flags, "--picture", drawn, "--objects", "off")
-        assert flags or "are not read: labels" in " ".join(shown.split())
-    with Image.open(drawn) as picture:
-        seen = np.asarray(picture.convert("RGB")).astype(int)
-    assert (np.abs(seen - (200, 30, 30)).max(axis=2) < 30).mean() > 0.4  # as the camera saw it
-
-
 def test_depth_images_that_cannot_be_read(camera_files, file, refused) -> None:
     depth, mask, *_ = camera_files
     for flags, sentence in (

@@ -367,3 +367,15 @@ def test_an_arm_that_is_not_known_is_not_planned_for(
     scene = Scene(make_cloud(cloud), joints=joints)
     with pytest.raises(ValueError, match=message):
         bridge.detect(planning, scene, Settings(), {"robot": {"name": name}}, lookup)
+
+
+def test_an_aborted_goal_says_why(sent) -> None:
+    fields = bridge.failed_result("mug", LookupError("no frame base"))
+    (each,) = sent("edgegrasp_ros2/msg/GenerateGrasps_Result", fields).results
+    assert (each.object_id, each.success) == ("mug", False)
+    assert each.message == "LookupError: no frame base"
+
+
+def test_without_a_robot_there_is_no_trajectory(client, make_cloud, cloud) -> None:
+    found = bridge.detect(client, Scene(make_cloud(cloud)), Settings(), {}, lookup)
+    assert bridge.trajectories(found) == []

@@ -1,7 +1,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 
 from edgegrasp_model.gripper import load_gripper
@@ -10,32 +9,36 @@ from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_training.examples import (
-    TriedGrasps,
+    pack_balls,
     pack_hands,
     tried_grasps,
 )
-from edgegrasp_training.views import TABLE, UP, WORKSPACE, LabelledView
+from edgegrasp_training.recipes import LENGTH_UNIT
+from edgegrasp_training.views import TABLE, UP, WORKSPACE
 
 Networks = dict[str, NetworkConfig]
 
 
-@pytest.fixture
-def balls(networks: Networks) -> NetworkConfig:
-    return networks["balls"]
+def test_packed_balls_hold_each_tried_grasp_and_its_contact(made_up_view, networks) -> None:
+    balls = networks["balls"]
+    grasps = tried_grasps(made_up_view(1), balls)
+    batch, label, weight = pack_balls(grasps, grasps.balls(), balls)
+    assert len(label) == len(grasps.label) == len(batch.contact)
+    assert (weight == 1).all()
+    contact = grasps.cloud.points[grasps.candidates.contact_index]
+    edge = contact - grasps.cloud.points[grasps.candidates.approach_index]
+    found = batch.points[batch.contact].numpy() * LENGTH_UNIT
+    np.testing.assert_allclose(found, edge @ grasps.turn.T, atol=1e-6)
+    depth = batch.depth.numpy() * LENGTH_UNIT
+    np.testing.assert_allclose(depth, grasps.candidates.depth, atol=1e-6)
+    some = pack_balls(grasps, grasps.balls()[:2], balls)
+    assert some.batch.num_balls == 2
+    assert 0 < len(some.label) < len(label)
 
 
-@pytest.fixture
-def hands(networks: Networks) -> NetworkConfig:
-    return networks["hands"]
-
-
-def grasps_of(view: LabelledView, config: NetworkConfig, *, camera: bool = True) -> TriedGrasps:
-    return tried_grasps(view, config, viewpoint_known=camera)
-
-
-def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(made_up_view, hands):
-    view = made_up_view(1)
-    grasps = grasps_of(view, hands)
+def test_packed_hands_are_what_the_detector_would_pack_and_vary(made_up_view, networks) -> None:
+    view, hands = made_up_view(1), networks["hands"]
+    grasps = tried_grasps(view, hands)
     batch, label, _ = pack_hands(grasps, grasps.balls()[:2], hands)
     rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, grasps.balls()[:2]))
     np.testing.assert_array_equal(label.numpy(), grasps.label[rows])
@@ -53,11 +56,11 @@ def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(ma
     assert (varied.points[~there] == 0).all()
 
 
-def test_a_grasp_that_stays_when_shaken_is_worth_a_little_more(made_up_view, balls) -> None:
-    view = made_up_view(1)
+def test_a_grasp_that_stays_when_shaken_is_worth_a_little_more(made_up_view, networks) -> None:
+    view, balls = made_up_view(1), networks["balls"]
     firm = np.where(view.success == 1, np.arange(len(view.success)) % 2, view.success)
-    shaken = grasps_of(replace(view, firm=firm.astype(np.int8)), balls).label
-    unknown = grasps_of(view, balls).label
+    shaken = tried_grasps(replace(view, firm=firm.astype(np.int8)), balls).label
+    unknown = tried_grasps(view, balls).label
     assert set(shaken.tolist()) == {0.0, 1.0, np.float32(0.8)}
     assert len(set(unknown.tolist())) == 2
     np.testing.assert_array_equal(unknown > 0.5, shaken > 0.5)

@@ -34,14 +34,6 @@ def test_drawn_shapes_are_closed(index: int) -> None:
     assert (np.cross(a, b) * c).sum() / 6 > 0
 
 
-def test_drawn_shapes_differ_and_stay_the_same() -> None:
-    assert len({drawn_shape(index) for index in range(NUM_DRAWN)}) == NUM_DRAWN
-    assert drawn_shape(7) == drawn_shape(7)
-    for index in (-1, NUM_DRAWN):
-        with pytest.raises(IndexError, match=f"{index} of {NUM_DRAWN}"):
-            drawn_shape(index)
-
-
 @pytest.fixture
 def shapes(tmp_path: Path) -> tuple[ObjectModel, ...]:
     return tuple(made_object(name, tmp_path / "shapes") for name in DRAWN_NAMES[:6])

@@ -1,5 +1,4 @@
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -97,14 +96,6 @@ def test_weights_of_another_network_are_no_start(make_trainer, tmp_path) -> None
     make_trainer(tmp_path / "balls", "balls", steps=1).run(ignore)
     with pytest.raises(ValueError, match="same model"):
         make_trainer(tmp_path / "on", "hands", start=tmp_path / "balls" / "tiny.safetensors")
-
-
-def test_a_view_without_labels_is_passed_over(made_up_view, make_trainer, views, tmp_path) -> None:
-    view, path = made_up_view(3), tmp_path / "packed_99_0.npz"
-    replace(view, success=np.full_like(view.success, -1)).save(path)
-    run = make_trainer(tmp_path / "run", "balls", train=[path, views[0]])
-    run.run(ignore, until=2)
-    assert run.step == 2
 
 
 def test_every_recipe_can_be_built_and_an_unknown_one_lists_them() -> None:
