@@ -31,8 +31,8 @@ def views(simulation: ClutterSimulation, rng: np.random.Generator) -> list[Depth
 
 def main(address: str = "127.0.0.1:50051", scenes: str = "1") -> None:
     """Print a line for each scene."""
-    asked = DetectorFlags(server=address)
-    with ClutterSimulation() as simulation, open_client(asked) as client:
+    detector = DetectorFlags(server=address)
+    with ClutterSimulation() as simulation, open_client(detector) as client:
         for number in range(int(scenes)):
             rng = np.random.default_rng([0, number])
             simulation.reset(("packed", "pile")[number % 2], rng, num_objects=5)

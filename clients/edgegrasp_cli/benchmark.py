@@ -11,16 +11,13 @@ import typer
 from pydantic import BaseModel, Field
 
 from edgegrasp_cli.flags import (
-    CONNECTION,
-    given_flags,
-    model_flags,
+    PlannerFlags,
     option_flags,
     parse_option_flags,
     takes_flags,
 )
 
 if TYPE_CHECKING:
-    from edgegrasp_cli.planners import PlannerChoice
     from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.results import ResultFolder
     from edgegrasp_sim.trial import Round
@@ -45,7 +42,7 @@ class Cluster(BaseModel):
     )
 
 
-class BenchmarkFlags(Cluster):
+class BenchmarkFlags(Cluster, PlannerFlags):
     """The flags of `edgegrasp benchmark`."""
 
     scene: str | None = Field(
@@ -55,9 +52,6 @@ class BenchmarkFlags(Cluster):
     protocol: str = Field(
         "edgegrasp",
         description="edgegrasp, giga, vgn, bin, table, shelf, ur5-pile, or a .toml file like them",
-    )
-    planner: str = Field(
-        "server", description="server, in-process, an installed one, or module:callable"
     )
     rounds: int | None = Field(None, description="Rounds for each seed; else the protocol's")
     seed: tuple[int, ...] = Field(
@@ -72,17 +66,6 @@ class BenchmarkFlags(Cluster):
         None,
         description="Hand to grasp with: a gripper's name or .toml file; else the Panda",
     )
-    robot: str | None = Field(
-        None,
-        description="Arm that executes the grasps with its own hand, in MuJoCo: name or .toml file",
-    )
-    server: str | None = Field(
-        None, description="host:port (gRPC) or http://host:port; else one is started"
-    )
-    weights: tuple[Path, ...] = Field((), description="Weights besides those that ship")
-    model: str = Field(
-        "", description="Weights to use: a name or a .safetensors file; empty: the default"
-    )
     output: Path | None = Field(
         None,
         description="Folder for manifest, attempts, figures, report. The same again resumes",
@@ -93,14 +76,8 @@ class BenchmarkFlags(Cluster):
     )
 
 
-@takes_flags(
-    flags=model_flags(BenchmarkFlags),
-    connection=CONNECTION,
-    options=option_flags(*DECIDED, defaults=False),
-)
-def benchmark(
-    *, flags: dict[str, Any], connection: dict[str, Any], options: dict[str, Any]
-) -> None:
+@takes_flags(options=option_flags(*DECIDED, defaults=False))
+def benchmark(*, asked: BenchmarkFlags, options: dict[str, Any]) -> None:
     """Clear simulated clutter with a planner's grasps and count the successes.
 
     GSR: successes / attempts. DR: objects removed / present. The protocol defines a round.
@@ -108,12 +85,11 @@ def benchmark(
     """
     from edgegrasp_sim.results import ResultFolder, below_gate, summarise
 
-    asked = given_flags(BenchmarkFlags, flags)
     with interruptible("benchmark", resumes=asked.output is not None):
-        config, choice = _plan(asked, connection, parse_option_flags(options))
+        config, fields = _plan(asked, parse_option_flags(options))
         print(f"engine: {config.engine}")
         folder = ResultFolder(asked.output) if asked.output is not None else None
-        done, title = run_rounds(config, choice, folder, workers=asked.workers, ray=asked.ray)
+        done, title = run_rounds(config, asked, fields, folder)
     summary = {
         "scene": config.scene.value,
         "engine": config.engine,
@@ -135,10 +111,9 @@ def benchmark(
 
 
 def _plan(
-    asked: BenchmarkFlags, connection: dict[str, Any], options: dict[str, Any]
-) -> "tuple[BenchmarkConfig, PlannerChoice]":
-    """The benchmark to run, and its planner."""
-    from edgegrasp_cli.planners import PlannerChoice
+    asked: BenchmarkFlags, options: dict[str, Any]
+) -> "tuple[BenchmarkConfig, dict[str, Any]]":
+    """The benchmark to run, and the options of its requests."""
     from edgegrasp_model.gripper import gripper_fields
     from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.objects import SceneKind
@@ -155,15 +130,6 @@ def _plan(
 
         arm, hand, fields = benchmark_arm(asked.robot, rules.camera)
         options = fields | options
-    choice = PlannerChoice(
-        asked.planner,
-        asked.model,
-        tuple(path.resolve() for path in asked.weights),
-        asked.server,
-        connection,
-        options,
-        asked.robot,
-    )
     config = BenchmarkConfig(
         SceneKind(asked.scene or rules.kind or SceneKind.PILE),
         rules.rounds if asked.rounds is None else asked.rounds,
@@ -180,7 +146,7 @@ def _plan(
             f"ray is {asked.ray!r}; the cluster cannot reach a server of this command's own: pass "
             "--server, or --planner in-process"
         )
-    return config, choice
+    return config, options
 
 
 def compare(
@@ -227,11 +193,9 @@ def interruptible(command: str, *, resumes: bool) -> Iterator[None]:
 
 def run_rounds(
     config: "BenchmarkConfig",
-    choice: "PlannerChoice",
+    asked: BenchmarkFlags,
+    options: dict[str, Any],
     folder: "ResultFolder | None",
-    *,
-    workers: int | None,
-    ray: str | None,
 ) -> "tuple[list[Round], str]":
     """Run the remaining rounds, with a progress bar; returns all, and the title of the planner."""
     from rich.console import Console
@@ -243,15 +207,15 @@ def run_rounds(
     # Fails on a wrong folder before a server is started, and prepares meshes once for all workers.
     with Console(stderr=True).status("reading objects"):
         config.object_set()
-    with open_planner(choice, config.protocol.planning) as planner:
+    with open_planner(asked, config.protocol.planning, options) as planner:
         if folder is not None:
             folder.open(manifest(config, planner.facts))
         with _progress(config, folder) as on_round:
             done = run_benchmark(
                 config,
                 planner.make,
-                workers=workers,
-                ray=ray,
+                workers=asked.workers,
+                ray=asked.ray,
                 folder=folder,
                 on_round=on_round,
             )

@@ -12,9 +12,6 @@ import typer
 
 from edgegrasp_cli.detect import DetectorFlags, open_client
 from edgegrasp_cli.flags import (
-    CONNECTION,
-    given_flags,
-    model_flags,
     option_flags,
     parse_option_flags,
     takes_flags,
@@ -36,17 +33,14 @@ ON_SUPPORT, BACKGROUND, NO_READING = (92, 112, 140), (48, 48, 52), (0, 0, 0)  # 
 CAPTION = "\nwhite: labelled objects    green: labelled plane    pink: the plane found"
 
 
-@takes_flags(
-    flags=model_flags(DetectorFlags), connection=CONNECTION, options=option_flags(*DECIDED)
-)
+@takes_flags(options=option_flags(*DECIDED))
 def benchmark_real(
     scenes: Annotated[list[Path], Option(help="Folder of scenes, .npz; may be repeated.")],
     output: Annotated[
         Path, Option(help="Folder for results.json, index.html and pictures of each scene.")
     ] = Path("results/real"),
     *,
-    flags: dict[str, Any],
-    connection: dict[str, Any],
+    asked: DetectorFlags,
     options: dict[str, Any],
 ) -> None:
     """Find grasps in scenes that real cameras saw, and judge them by the scenes' labels.
@@ -60,11 +54,10 @@ def benchmark_real(
     from edgegrasp_cli.planners import model_used
     from edgegrasp_cli.real_scenes import BEST, judge, load_scenes
 
-    asked = given_flags(DetectorFlags, flags)
     fields, loaded = parse_option_flags(options), load_scenes(scenes)
     output.mkdir(parents=True, exist_ok=True)
     done: dict[str, SceneFigures] = {}
-    with open_client(asked, connection) as client:
+    with open_client(asked) as client:
         model = model_used(client, fields.get("model", ""))
         gripper = _gripper(model.gripper, asked.grippers, fields)
         _ask(client, loaded[0], fields)  # loading and compiling take time

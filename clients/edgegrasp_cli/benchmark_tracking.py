@@ -13,7 +13,7 @@ import typer
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_cli.detect import DetectorFlags, open_client
-from edgegrasp_cli.flags import CONNECTION, given_flags, model_flags, takes_flags
+from edgegrasp_cli.flags import takes_flags
 
 if TYPE_CHECKING:
     from edgegrasp_camera.arrays import Float64
@@ -158,7 +158,7 @@ class SimulatedScene(Scene):
         self.simulation.move(self.held, place.tolist(), turn.as_quat().tolist())
 
 
-@takes_flags(flags=model_flags(DetectorFlags), connection=CONNECTION)
+@takes_flags()
 def benchmark_tracking(
     scenes: Annotated[
         list[Path] | None, Option(help="Folder of recorded still scenes, .npz; else simulated.")
@@ -175,8 +175,7 @@ def benchmark_tracking(
         "results/tracking"
     ),
     *,
-    flags: dict[str, Any],
-    connection: dict[str, Any],
+    asked: DetectorFlags,
 ) -> None:
     """Follow a grasp at 30 images a second, then execute it in simulation.
 
@@ -186,10 +185,9 @@ def benchmark_tracking(
     names = motion or (["still"] if scenes else list(MOTIONS))
     if unknown := [name for name in names if name not in MOTIONS]:
         raise ValueError(f"--motion: got {unknown[0]!r}. Choose one of {', '.join(MOTIONS)}.")
-    asked = given_flags(DetectorFlags, flags)
     clock = time.perf_counter if asked.server else time.process_time
     done: dict[str, list[Followed]] = {}
-    with open_client(asked, connection) as client:
+    with open_client(asked) as client:
         for name in names:
             moving = MOTIONS[name]
             moving = replace(moving, seconds=moving.seconds if seconds is None else seconds)

@@ -8,20 +8,16 @@ from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from edgegrasp_camera.files import pixels, sent_cloud
 from edgegrasp_camera.picture import draw_detection
 from edgegrasp_cli.flags import (
-    CONNECTION,
-    connect,
-    given_flags,
-    model_flags,
+    Connection,
     option_flags,
     parse_option_flags,
     takes_flags,
@@ -39,18 +35,19 @@ Cloud = Annotated[
 ]
 
 
-class DetectorFlags(BaseModel):
+class DetectorFlags(Connection):
     """The flags that choose a server, or a detector in this process."""
 
     server: str | None = Field(
-        None, description="host:port (gRPC) or http://host:port; else in this process"
+        default=None, description="host:port (gRPC) or http://host:port; else in this process"
     )
-    timeout: float = Field(60.0, description="Seconds to wait for a server")
     weights: tuple[Path, ...] = Field(
-        (), description="Weights file or folder besides those that ship, without a server"
+        default=(), description="Weights file or folder besides those that ship, without a server"
     )
-    grippers: tuple[Path, ...] = Field((), description="Gripper file (.toml), without a server")
-    device: str = Field("cpu", description="auto, cpu, cuda or cuda:N, without a server")
+    grippers: tuple[Path, ...] = Field(
+        default=(), description="Gripper file (.toml), without a server"
+    )
+    device: str = Field(default="cpu", description="auto, cpu, cuda or cuda:N, without a server")
 
 
 class DetectFlags(DetectorFlags):
@@ -95,9 +92,7 @@ class DetectFlags(DetectorFlags):
     )
 
 
-@takes_flags(
-    flags=model_flags(DetectFlags), connection=CONNECTION, options=option_flags("robot", "previous")
-)
+@takes_flags(options=option_flags("robot", "previous"))
 def detect(
     file: Cloud = None,
     as_document: Annotated[bool, Option("--json", help="Print JSON, as the HTTP API.")] = False,
@@ -105,8 +100,7 @@ def detect(
         Path | None, Option("--options", help="JSON file with options; flags beside it win.")
     ] = None,
     *,
-    flags: dict[str, Any],
-    connection: dict[str, Any],
+    asked: DetectFlags,
     options: dict[str, Any],
 ) -> None:
     """Find grasps in a point cloud file or a depth image, by a server or in this process.
@@ -123,7 +117,6 @@ def detect(
     """
     from rich.console import Console
 
-    asked = given_flags(DetectFlags, flags)
     fields = _options(options_file, options) | _robot_option(asked)
     _check_outputs(asked, fields)
     images = _depth_images(file, asked)
@@ -133,7 +126,7 @@ def detect(
 
         fields = dict(on_mask(pixels(asked.mask), fields))
     waiting = Console(stderr=True).status("Looking for grasps…")
-    with waiting, open_client(asked, connection) as client:
+    with waiting, open_client(asked) as client:
         detection = client.detect(file, depth_images=images, colors=colors, **fields)
     if asked.picture is not None:
         draw_detection(asked.picture, detection, sent_cloud(file, images), fields, colors)
@@ -147,8 +140,8 @@ def detect(
         _print_detection(detection)
 
 
-@takes_flags(flags=model_flags(DetectorFlags), connection=CONNECTION)
-def models(*, flags: dict[str, Any], connection: dict[str, Any]) -> None:
+@takes_flags()
+def models(*, asked: DetectorFlags) -> None:
     """List the weights that can be used, here or on a server."""
     from rich import box
     from rich.console import Console
@@ -158,8 +151,7 @@ def models(*, flags: dict[str, Any], connection: dict[str, Any]) -> None:
     architecture = Column("architecture", no_wrap=True)
     table = Table(name, architecture, "parameters", "gripper", "device", box=box.SIMPLE)
     waiting = Console(stderr=True).status("Loading weights…")
-    asked = given_flags(DetectorFlags, flags)
-    with waiting, open_client(asked, connection) as client:
+    with waiting, open_client(asked) as client:
         found = client.models()
     for row in found:
         table.add_row(
@@ -172,12 +164,10 @@ def models(*, flags: dict[str, Any], connection: dict[str, Any]) -> None:
     Console().print(table)
 
 
-def open_client(
-    asked: DetectorFlags, connection: Mapping[str, Any] = MappingProxyType({})
-) -> AbstractContextManager[Any]:
+def open_client(asked: DetectorFlags) -> AbstractContextManager[Any]:
     """A client of a server, or an OwnDetector if no server is given."""
     if asked.server:
-        return connect(asked.server, asked.timeout, **connection)
+        return asked.connect(asked.server)
     return nullcontext(OwnDetector(asked.weights, asked.grippers, asked.device))
 
 

@@ -1,49 +1,120 @@
-"""Flags shared by commands: those of pydantic models, and those for connecting to a server."""
+"""Flags of commands from pydantic models, and those for connecting to a server."""
 
 import functools
 import inspect
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args, get_origin
 
 import typer
+from pydantic import BaseModel, Field, ValidationError
 
 if TYPE_CHECKING:
-    from pydantic import BaseModel
-
     from edgegrasp_client import GraspClient
 
-Model = TypeVar("Model", bound="BaseModel")
 Flags: TypeAlias = list[inspect.Parameter]
 PLAIN = (bool, int, float, str, Path)  # types that a flag takes directly
 TOKEN_VARIABLE = "EDGEGRASP_CLIENT_TOKEN"
 
-Timeout = Annotated[float, typer.Option(help="Seconds to wait for a server.")]
+
+class Connection(BaseModel):
+    """The flags that say how to connect to a server."""
+
+    timeout: float = Field(default=60.0, description="Seconds to wait for a server")
+    token_file: Path | None = Field(
+        default=None, description=f"File with the server's token; else {TOKEN_VARIABLE}"
+    )
+    tls: bool = Field(
+        default=False, description="TLS over gRPC, trusting this machine's authorities"
+    )
+    tls_ca: Path | None = Field(
+        default=None, description="TLS, trusting the authorities in a PEM file"
+    )
+    tls_certificate: Path | None = Field(default=None, description="Client certificate, PEM")
+    tls_key: Path | None = Field(default=None, description="Key of the client certificate, PEM")
+
+    def connect(self, address: str, timeout: float | None = None) -> "GraspClient":
+        """A client of a server; raises GraspClientError."""
+        from edgegrasp_client import GraspClient, Tls
+
+        files = (self.tls_ca, self.tls_certificate, self.tls_key)
+        return GraspClient(
+            address,
+            timeout=timeout or self.timeout,
+            token=self._token(),
+            tls=Tls(*files) if self.tls or any(files) else None,
+        )
+
+    def _token(self) -> str | None:
+        if self.token_file is None:
+            return os.environ.get(TOKEN_VARIABLE) or None
+        try:
+            return self.token_file.read_text().strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ValueError(f"token file {self.token_file}: {error}") from error
+
+
+class PlannerFlags(Connection):
+    """The flags that choose a planner of the benchmark."""
+
+    planner: str = Field(
+        default="server", description="server, in-process, an installed one, or module:callable"
+    )
+    server: str | None = Field(
+        default=None, description="host:port (gRPC) or http://host:port; else one is started"
+    )
+    weights: tuple[Path, ...] = Field(default=(), description="Weights besides those that ship")
+    model: str = Field(
+        default="", description="Weights to use: a name or a .safetensors file; empty: the default"
+    )
+    robot: str | None = Field(
+        default=None,
+        description="Arm that executes the grasps with its own hand, in MuJoCo: name or .toml file",
+    )
+
+
+class Server(Connection):
+    """The flags of the server that a command is a client of."""
+
+    server: str = Field(
+        default="127.0.0.1:50051",
+        description="The grasp server: host:port (gRPC) or http://host:port",
+    )
 
 
 def takes_flags(**groups: Flags) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Add groups of flags to a command.
 
-    The command has a keyword argument for each group: a dict of the flags that were given.
+    The command has a keyword argument for each group: a dict of the flags that were given. An
+    argument that is a pydantic model is a group too, with a flag for each field.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        parameters = inspect.signature(command).parameters.values()
+        models = {
+            each.name: each.annotation
+            for each in parameters
+            if isinstance(each.annotation, type) and issubclass(each.annotation, BaseModel)
+        }
+        added = {name: model_flags(model) for name, model in models.items()} | groups
+
         @functools.wraps(command)
         def run(**given: Any) -> None:
-            for group, flags in groups.items():
+            for group, flags in added.items():
                 values = {flag.name: given.pop(flag.name) for flag in flags}
-                given[group] = {n: value for n, value in values.items() if value not in (None, [])}
+                asked = {name: value for name, value in values.items() if value not in (None, [])}
+                given[group] = _checked(models[group], asked) if group in models else asked
             command(**given)
 
         own = [
             parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-            for parameter in inspect.signature(command).parameters.values()
-            if parameter.name not in groups
+            for parameter in parameters
+            if parameter.name not in added
         ]
-        added = [flag for flags in groups.values() for flag in flags]
-        run.__signature__ = inspect.Signature([*own, *added])  # type: ignore[attr-defined]
+        run.__signature__ = inspect.Signature([*own, *chain(*added.values())])  # type: ignore[attr-defined]
         run.__annotations__ = {"return": None}  # typer reads only the signature
         return run
 
@@ -52,7 +123,7 @@ def takes_flags(**groups: Flags) -> Callable[[Callable[..., None]], Callable[...
 
 def model_flags(
     # The fields; those other than numbers, text, booleans and paths are given as JSON.
-    model: "type[BaseModel]",
+    model: type[BaseModel],
     leave_out: Sequence[str] = (),  # fields without a flag
     panel: str = "Options",  # heading of the flags in the help
     defaults: bool = True,  # whether the help shows the fields' defaults
@@ -75,10 +146,8 @@ def model_flags(
     return flags
 
 
-def given_flags(model: "type[Model]", given: Mapping[str, Any]) -> "Model":
-    """The model from the flags of `model_flags`; a ValueError names flag, value and limit."""
-    from pydantic import ValidationError
-
+def _checked(model: type[BaseModel], given: Mapping[str, Any]) -> BaseModel:
+    """The model of these fields; a ValueError names flag, value and limit."""
     try:
         return model(**given)
     except ValidationError as error:
@@ -105,54 +174,6 @@ def parse_option_flags(given: Mapping[str, Any]) -> dict[str, Any]:
     )
     parse_options(options)  # a wrong value is refused before anything starts
     return options
-
-
-def connect(
-    address: str,
-    timeout: float,
-    retry: bool = True,
-    *,
-    token_file: Annotated[
-        Path | None, typer.Option(help=f"File with the server's token; else {TOKEN_VARIABLE}.")
-    ] = None,
-    tls: Annotated[
-        bool, typer.Option("--tls", help="TLS over gRPC, trusting this machine's authorities.")
-    ] = False,
-    tls_ca: Annotated[
-        Path | None, typer.Option(help="TLS, trusting the authorities in a PEM file.")
-    ] = None,
-    tls_certificate: Annotated[Path | None, typer.Option(help="Client certificate, PEM.")] = None,
-    tls_key: Annotated[
-        Path | None, typer.Option(help="Key of the client certificate, PEM.")
-    ] = None,
-) -> "GraspClient":
-    """A client of a server, by the flags in `CONNECTION`; raises GraspClientError."""
-    from edgegrasp_client import GraspClient, Tls
-
-    files = (tls_ca, tls_certificate, tls_key)
-    return GraspClient(
-        address,
-        timeout=timeout,
-        retry=retry,
-        token=_token(token_file),
-        tls=Tls(*files) if tls or any(files) else None,
-    )
-
-
-CONNECTION: Flags = [
-    parameter
-    for parameter in inspect.signature(connect).parameters.values()
-    if parameter.kind is inspect.Parameter.KEYWORD_ONLY
-]
-
-
-def _token(file: Path | None) -> str | None:
-    if file is None:
-        return os.environ.get(TOKEN_VARIABLE) or None
-    try:
-        return file.read_text().strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"token file {file}: {error}") from error
 
 
 def _flag_type(annotation: Any) -> tuple[Any, str | None]:

@@ -20,7 +20,7 @@ from pydantic import Field
 from edgegrasp_camera import EdgeGraspError
 from edgegrasp_camera.files import pixels, sent_cloud
 from edgegrasp_camera.picture import draw_detection
-from edgegrasp_cli.flags import CONNECTION, Timeout, connect, takes_flags
+from edgegrasp_cli.flags import Server, takes_flags
 
 if TYPE_CHECKING:
     from mcp.server import MCPServer
@@ -53,18 +53,14 @@ Arm = Annotated[
 ]
 
 
-@takes_flags(connection=CONNECTION)
+@takes_flags()
 def mcp(
-    server: Annotated[
-        str, Option(help="The grasp server: host:port (gRPC) or http://host:port.")
-    ] = "127.0.0.1:50051",
-    timeout: Timeout = 60.0,
     folder: Annotated[Path, Option(help="Agents can name files below this folder.")] = Path(),
     http: Annotated[
         str | None, Option(help="HOST:PORT to serve HTTP at, under /mcp; else stdin and stdout.")
     ] = None,
     *,
-    connection: dict[str, Any],
+    asked: Server,
 ) -> None:
     """Serve grasps to language-model agents (Model Context Protocol).
 
@@ -73,7 +69,7 @@ def mcp(
     """
     if not folder.is_dir():
         raise ValueError(f"--folder: {folder} is no folder. Name one with clouds or images.")
-    with connect(server, timeout, **connection) as client:
+    with asked.connect(asked.server) as client:
         tools = grasp_tools(client, folder.resolve())
         if http is None:
             tools.run()

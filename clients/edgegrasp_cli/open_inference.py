@@ -27,7 +27,7 @@ from edgegrasp.oip.open_inference_pb2_grpc import (
     add_GRPCInferenceServiceServicer_to_server,
 )
 from edgegrasp_camera.arrays import Array
-from edgegrasp_cli.flags import CONNECTION, Timeout, connect, takes_flags
+from edgegrasp_cli.flags import Server, takes_flags
 from edgegrasp_client import GraspClient, errors
 from edgegrasp_client.requests import option_of_text, plain_options
 
@@ -62,12 +62,8 @@ Tensors = dict[str, Array]
 Option = typer.Option
 
 
-@takes_flags(connection=CONNECTION)
+@takes_flags()
 def open_inference(
-    server: Annotated[
-        str, Option(help="The grasp server: host:port (gRPC) or http://host:port.")
-    ] = "127.0.0.1:50051",
-    timeout: Timeout = 60.0,
     host: Annotated[str, Option(help="Address to listen at.")] = "127.0.0.1",
     http_port: Annotated[int, Option(help="Port of REST.")] = 8080,
     grpc_port: Annotated[int, Option(help="Port of gRPC.")] = 8081,
@@ -76,14 +72,14 @@ def open_inference(
     ] = "default",
     max_body_bytes: Annotated[int, Option(help="Largest request accepted.")] = 33_554_432,
     *,
-    connection: dict[str, Any],
+    asked: Server,
 ) -> None:
     """Answer the Open Inference Protocol v2 (KServe, Triton's clients) for a grasp server.
 
     It does not require a token: let the gateway in front of it check tokens.
     """
-    with connect(server, timeout, **connection) as client:
-        models = Models(client, name, timeout)
+    with asked.connect(asked.server) as client:
+        models = Models(client, name, asked.timeout)
         with grpc_server(models, f"{host}:{grpc_port}", max_body_bytes):
             app = http_app(models, max_body_bytes)
             uvicorn.run(app, host=host, port=http_port, log_level="warning")

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_cli.detect import OwnDetector
-from edgegrasp_cli.flags import connect
+from edgegrasp_cli.flags import PlannerFlags
 from edgegrasp_client import GraspClientError, Model, ServerUnavailableError, StartCollisionError
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.protocol import PlanningRules
@@ -26,29 +26,6 @@ SUFFIX = ".safetensors"
 MAX_DEPTH_ERROR = 0.12  # depth error for views that show the table; more than any protocol's noise
 
 
-@dataclass(frozen=True)
-class PlannerChoice:
-    """A planner as the command line names it."""
-
-    name: str  # one of SHIPPED, an installed one, or `module:callable`
-    model: str = ""  # weights by name, or a `.safetensors` file; empty: the default
-    weights: tuple[Path, ...] = ()  # files or folders besides those that ship
-    server: str | None = None  # `host:port` or `http://host:port`; None: one is started
-    connection: dict[str, Any] = field(default_factory=dict)  # arguments of `connect`
-    # Options of each request, in place of the protocol's.
-    options: dict[str, Any] = field(default_factory=dict)
-    robot: str | None = None  # that the options name: one that ships, or its file
-
-    def weights_and_model(self) -> tuple[tuple[Path, ...], str]:
-        """The weights to load, and the name to ask for; raises ValueError if a file is missing."""
-        if not self.model.endswith(SUFFIX):
-            return self.weights, self.model
-        file = Path(self.model)
-        if not file.is_file():
-            raise ValueError(f"model is {self.model}; there is no such file")
-        return (*self.weights, file), file.stem
-
-
 class ChosenPlanner(NamedTuple):
     """A factory of planners, and its description."""
 
@@ -57,41 +34,49 @@ class ChosenPlanner(NamedTuple):
 
 
 @contextmanager
-def open_planner(choice: PlannerChoice, rules: PlanningRules) -> Iterator[ChosenPlanner]:
+def open_planner(
+    choice: PlannerFlags, rules: PlanningRules, options: Mapping[str, Any]
+) -> Iterator[ChosenPlanner]:
     """Find a planner for a protocol; a server started for it runs for the duration of the context.
+
+    `options` are those of each request, in place of the protocol's.
 
     Raises:
         ValueError: no such planner, or no such file of weights.
         EdgeGraspError: weights that cannot be used.
         GraspClientError: the server does not answer.
     """
-    if choice.name not in SHIPPED:
-        make = partial(named_planner, choice.name)
+    if choice.planner not in SHIPPED:
+        make = partial(named_planner, choice.planner)
         make()  # fails here on a wrong name, not in every worker
-        yield ChosenPlanner(make, {"name": choice.name})
+        yield ChosenPlanner(make, {"name": choice.planner})
         return
-    if choice.server and choice.model.endswith(SUFFIX):
-        raise ValueError(f"model is {choice.model}; name one of the server's own weights")
-    weights, model = choice.weights_and_model()
-    asked = {"model": model, **choice.options}
+    weights, model = [path.resolve() for path in choice.weights], choice.model
+    if model.endswith(SUFFIX):
+        if choice.server:
+            raise ValueError(f"model is {model}; name one of the server's own weights")
+        if not (file := Path(model)).is_file():
+            raise ValueError(f"model is {model}; there is no such file")
+        weights, model = [*weights, file], file.stem
+    asked = {"model": model, **options}
     with _server(choice, weights) as address:
         open_client: Callable[[float], Any] = (
             partial(_OneThread, weights, choice.robot)
             if address is None
-            else partial(connect, address, **choice.connection)
+            else partial(choice.connect, address)
         )
         with closing(open_client(CONNECT_SECONDS)) as client:
             used = model_used(client, model)
-        facts: dict[str, Any] = {"name": choice.name, "options": choice.options}
+        facts: dict[str, Any] = {"name": choice.planner, "options": dict(options)}
         facts |= {"model": used.name, "digest": used.digest, "voxel_size": used.voxel_size}
         yield ChosenPlanner(partial(ClientPlanner, open_client, rules, asked), facts)
 
 
 @contextmanager
-def _server(choice: PlannerChoice, weights: Sequence[Path]) -> Iterator[str | None]:
+def _server(choice: PlannerFlags, weights: Sequence[Path]) -> Iterator[str | None]:
     """The address of the server to use, started if none is given; None: this process."""
-    if choice.name == "in-process" or choice.server:
-        yield choice.server if choice.name == "server" else None
+    if choice.planner == "in-process" or choice.server:
+        yield choice.server if choice.planner == "server" else None
         return
     from edgegrasp_client.connection import local_server
 

@@ -5,13 +5,13 @@ import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from pydantic import Field
 
 from edgegrasp_cli.benchmark import Cluster, interruptible
-from edgegrasp_cli.flags import given_flags, model_flags, takes_flags
+from edgegrasp_cli.flags import takes_flags
 from edgegrasp_training.options import GenerationOptions, TrainingOptions
 
 if TYPE_CHECKING:
@@ -28,11 +28,11 @@ class DataFlags(GenerationOptions, Cluster):
     )
 
 
-@takes_flags(flags=model_flags(DataFlags))
+@takes_flags()
 def generate_data(
     output: Annotated[Path, typer.Argument(help="Folder for the views, one file each.")],
     *,
-    flags: dict[str, Any],
+    asked: DataFlags,
 ) -> None:
     """Make labelled edge grasps: views of random clutter, grasps tried in simulation.
 
@@ -44,7 +44,6 @@ def generate_data(
     from edgegrasp_training.generation import generate, missing_scenes
     from edgegrasp_training.views import find_views, write_data_card
 
-    asked = given_flags(DataFlags, flags)
     print(f"engine: {choose_engine(asked.engine)}")
     missing = len(missing_scenes(output, asked))
     tried = held = 0
@@ -81,13 +80,13 @@ class TrainFlags(TrainingOptions):
     device: str = Field("cpu", description="cpu or cuda")
 
 
-@takes_flags(flags=model_flags(TrainFlags))
+@takes_flags()
 def train(
     data: Annotated[
         list[Path] | None, typer.Argument(help="Folders of views from generate-data.")
     ] = None,
     *,
-    flags: dict[str, Any],
+    asked: TrainFlags,
 ) -> None:
     """Train weights on labelled views.
 
@@ -98,7 +97,6 @@ def train(
 
     from edgegrasp_training.outcomes import recalibrate
 
-    asked = given_flags(TrainFlags, flags)
     if asked.outcomes is not None:
         if asked.start_from is None or data:
             raise ValueError("--outcomes: name the weights that scored by --start-from, no data.")

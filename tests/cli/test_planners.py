@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgegrasp_cli.planners import PlannerChoice, named_planner, open_planner, request_options
+from edgegrasp_cli.flags import PlannerFlags
+from edgegrasp_cli.planners import named_planner, open_planner, request_options
 from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_sim.camera import Observation
@@ -41,8 +42,8 @@ FEW = {"num_approach_points": 8, "num_candidates": 100}
 
 
 def planned(**changes: object) -> PlannedGrasp:
-    choice = PlannerChoice("in-process", options=FEW, **changes)
-    with open_planner(choice, PAPER) as made:
+    choice = PlannerFlags(planner="in-process", **changes)
+    with open_planner(choice, PAPER, FEW) as made:
         grasp = made.make()(seen_under("edgegrasp"), 3)
     assert grasp is not None
     return grasp
@@ -51,14 +52,18 @@ def planned(**changes: object) -> PlannedGrasp:
 def test_a_model_may_be_a_file_of_weights(tmp_path: Path) -> None:
     ablation = tmp_path / "no-augmentation.safetensors"
     ablation.write_bytes((WEIGHTS_FOLDER / "edgegrasp-plus.safetensors").read_bytes())
-    with open_planner(PlannerChoice("in-process", str(ablation)), PAPER) as made:
+    file = PlannerFlags(planner="in-process", model=str(ablation))
+    with open_planner(file, PAPER, {}) as made:
         assert len(made.facts["digest"]) == 64
     assert planned(model=str(ablation)).score == planned().score
-    missing = PlannerChoice("in-process", str(tmp_path / "none.safetensors"))
-    with pytest.raises(ValueError, match="no such file"), open_planner(missing, PAPER):
+    missing = PlannerFlags(planner="in-process", model=str(tmp_path / "none.safetensors"))
+    with pytest.raises(ValueError, match="no such file"), open_planner(missing, PAPER, {}):
         pass
-    elsewhere = PlannerChoice("server", str(ablation), server="127.0.0.1:1")
-    with pytest.raises(ValueError, match="server's own weights"), open_planner(elsewhere, PAPER):
+    elsewhere = PlannerFlags(model=str(ablation), server="127.0.0.1:1")
+    with (
+        pytest.raises(ValueError, match="server's own weights"),
+        open_planner(elsewhere, PAPER, {}),
+    ):
         pass
 
 
@@ -67,12 +72,12 @@ def test_a_view_in_which_the_arm_touches_the_table_is_told_from_other_errors() -
     from edgegrasp_cli.arm import benchmark_arm
 
     fields = benchmark_arm("fr3", load_protocol("edgegrasp").camera).options
-    choice = PlannerChoice("in-process", options=FEW | fields, robot="fr3")
+    choice, asked = PlannerFlags(planner="in-process", robot="fr3"), FEW | fields
     fields["robot"]["T_base_cloud"][2][3] += 0.5  # the table, up to the hand
-    with open_planner(choice, PAPER) as made, pytest.raises(StartCollides, match="support"):
+    with open_planner(choice, PAPER, asked) as made, pytest.raises(StartCollides, match="support"):
         made.make()(seen_under("edgegrasp"), 3)
     fields["robot"]["joints"] = [9.0] * 7
-    with open_planner(choice, PAPER) as made, pytest.raises(InvalidRequest, match="joint1"):
+    with open_planner(choice, PAPER, asked) as made, pytest.raises(InvalidRequest, match="joint1"):
         made.make()(seen_under("edgegrasp"), 3)
 
 
