@@ -30,7 +30,7 @@ from edgegrasp_sim.engine import ENGINES, installed
 from edgegrasp_sim.objects import CLUTTER, SceneKind
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.trial import run_round
+from edgegrasp_sim.trial import RoundDriver
 from edgegrasp_training.recipes import VOXEL_SIZE, recipe
 
 WEIGHTS = ("edgegrasp-plus", "edgegrasp-small", "edgegrasp", "vn-edgegrasp")
@@ -170,7 +170,7 @@ def simulator(kind: SceneKind) -> dict[str, dict[str, float]]:
             for pose in poses:
                 simulation.try_grasp(pose, shake=True)
             labelled = time.process_time()
-            run_round(simulation, plan, kind, protocol, seed=seed, index=0)
+            RoundDriver(simulation, kind, protocol, seed=seed, index=0).run(plan)
             end = time.process_time()
             seconds[engine].append((seen - start + labelled - begin, end - labelled))
             labels[engine] += len(poses)

@@ -25,7 +25,7 @@ from edgegrasp_sim.results import ResultFolder
 from edgegrasp_sim.scene import PACKED, PILE, REST
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.surroundings import TABLE_FRICTION
-from edgegrasp_sim.trial import MIN_SEEN, Planner, Round, run_round
+from edgegrasp_sim.trial import MIN_SEEN, Planner, Round, RoundDriver
 from edgegrasp_sim.workers import run_tasks
 
 # Makes the planner in the process that uses it; must be picklable if there are several.
@@ -172,15 +172,8 @@ class RoundRunner:
     def __call__(self, task: Task) -> Round:
         """Run the round of a seed and an index."""
         seed, index = task
-        config = self.config
-        return run_round(
-            self.simulation,
-            self.planner,
-            config.scene,
-            config.protocol,
-            seed=seed,
-            index=index,
-        )
+        where = self.simulation, self.config.scene, self.config.protocol
+        return RoundDriver(*where, seed=seed, index=index).run(self.planner)
 
     def close(self) -> None:
         """Release what simulation and planner hold."""

@@ -193,10 +193,6 @@ class Gripper:
         for _ in self.steps_to(T_world_hand, step_length=step_length):
             pass
 
-    def close(self) -> None:
-        """Drive the fingers together with full force."""
-        self.body.close_fingers()
-
 
 @cache
 def panda() -> HandModel:
@@ -258,7 +254,7 @@ def _corners(boxes: Matrix) -> Parts:
 def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: bool) -> None:
     """Close the fingers; unless `to_the_end`, only until they are shut or hold firmly."""
     opening, still_steps = gripper.opening, 0
-    gripper.close()
+    gripper.body.close_fingers()
     for _ in range(round(CLOSE_SECONDS / TIME_STEP)):
         gripper.world.step()
         before, opening = opening, gripper.opening
@@ -330,7 +326,6 @@ def _holds_when_shaken(
 
 
 def _cut_into(gripper: Gripper) -> set[int]:
-    """Ids of the bodies that the hand overlaps."""
     contacts, depth = gripper.body.contacts(), gripper.world.collision_depth
     return {each.other_uid for each in contacts if each.distance < -depth}
 

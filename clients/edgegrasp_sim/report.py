@@ -184,7 +184,6 @@ def _share(value: float | None) -> str:
 
 
 def _flat(prefix: str, value: Any) -> Iterator[Row]:
-    """Dotted names and values of nested tables."""
     if isinstance(value, dict):
         for name, part in value.items():
             yield from _flat(f"{prefix}.{name}".strip("."), part)

@@ -113,7 +113,6 @@ class Surroundings:
 
 
 def _slab(size: Matrix, top: float, x: float = MIDDLE, y: float = MIDDLE) -> Box:
-    """A box with its top at a height: a table, or a floor."""
     length, width, height = map(float, size)
     centre = (x, y, top - height / 2)
     return Box((length, width, height), centre, friction=TABLE_FRICTION, obstacle=False)
@@ -137,12 +136,7 @@ def random_bin(rng: np.random.Generator, *, small: bool = False) -> Surroundings
     half = np.array([length, width]) / 2
     outer = half + wall
     depth = wall + stand + BINS.ground
-    floor = Box(
-        (2 * float(outer[0]), 2 * float(outer[1]), depth),
-        (MIDDLE, MIDDLE, TABLE_HEIGHT - depth / 2),
-        friction=TABLE_FRICTION,
-        obstacle=False,
-    )
+    floor = _slab(np.array([*(2 * outer), depth]), TABLE_HEIGHT)
     size = np.array([OPEN_EXTENT, OPEN_EXTENT, OPEN_THICKNESS])
     boxes = [_slab(size, TABLE_HEIGHT - wall - stand), floor]
     z = TABLE_HEIGHT + height / 2

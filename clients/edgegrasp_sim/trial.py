@@ -101,27 +101,6 @@ class Round:
         return sum(attempt.success for attempt in self.attempts)
 
 
-def run_round(
-    simulation: ClutterSimulation,
-    planner: Planner,
-    scene: SceneKind,
-    protocol: BenchmarkProtocol,
-    *,
-    seed: int,
-    index: int,
-) -> Round:
-    """Run one round with a planner; see `RoundDriver`."""
-    driver = RoundDriver(simulation, scene, protocol, seed=seed, index=index)
-    while driver.end is None:
-        observation = driver.look()
-        if driver.end is not None:
-            break
-        grasp = driver.plan(planner, observation)
-        if grasp is not None:
-            driver.execute(grasp)
-    return driver.result()
-
-
 class RoundDriver:
     """A round, step by step: `look`, `plan`, `execute`, as long as `end` is None."""
 
@@ -156,6 +135,15 @@ class RoundDriver:
         wide = tuple(model.name for model in simulation.too_wide)
         self._round = Round(seed, index, names, (), 0, RoundEnd.CLEARED, too_wide=wide)
         self._update_end()
+
+    def run(self, planner: Planner) -> Round:
+        """Run the round to its end."""
+        while self.end is None:
+            observation = self.look()
+            grasp = self.plan(planner, observation) if self.end is None else None
+            if grasp is not None:
+                self.execute(grasp)
+        return self.result()
 
     def look(self) -> Observation:
         """Take the next view; the round ends if it shows almost nothing."""

@@ -107,7 +107,6 @@ def _start_process() -> None:
 
 
 def _run(made: bytes, task: Any) -> Any:
-    """Do a task in a worker."""
     return _runner(made)(task)
 
 

@@ -26,7 +26,6 @@ from edgegrasp_model.given import (
     from_hand_poses,
 )
 from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
-from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import check_reference_logits, load_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
@@ -379,13 +378,11 @@ class GraspDetector:
 
     def _score(self, prepared: Prepared, sample: Sample) -> Scored:
         """The network's logits of some candidates."""
-        scene, gripper = prepared.scene, prepared.gripper
-        assert scene is not None
+        assert prepared.scene is not None
         if len(sample.candidates) == 0:
             return Scored(sample, np.empty(0, dtype=np.float32))
         with prepared.timed("description"):
-            view = hand_views(scene.cloud, sample.candidates.T_cloud_hand, reach_of(gripper))
-            batch = self._batch(scene, sample, view, gripper)
+            batch = self._batch(prepared.scene, sample, prepared.gripper)
         with prepared.timed("network"):
             return Scored(sample, self.run(batch))
 
@@ -399,10 +396,10 @@ class GraspDetector:
         approach_index = scored.sample.candidates.approach_index[held]
         return np.asarray(prepared.scene.object_of_point[approach_index])
 
-    def _batch(self, scene: Scene, sample: Sample, view: HandView, gripper: Gripper) -> Batch:
+    def _batch(self, scene: Scene, sample: Sample, gripper: Gripper) -> Batch:
         candidates, network = sample.candidates, self.metadata.network
         if self.sees_hands:
-            return hand_batch(scene, candidates, gripper, network, view)
+            return hand_batch(scene, candidates, gripper, network)
         return BallBatch.from_cloud(
             scene.cloud.points,
             scene.cloud.normals,

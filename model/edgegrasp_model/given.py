@@ -20,7 +20,7 @@ from edgegrasp_model.candidates.edge_grasps import (
 )
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view import HandView, hand_views, reach_of
+from edgegrasp_model.hand_view import HandView, hand_views
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch, hand_batch
@@ -63,9 +63,8 @@ def evaluate(
 ) -> list[Evaluation]:
     """Evaluate the given edges or poses, in order."""
     candidates = given.candidates
-    view = hand_views(scene.cloud, candidates.T_cloud_hand, reach_of(gripper))
     if scorer.network.architecture == "hand":
-        score = scorer.probability(hand_batch(scene, candidates, gripper, scorer.network, view))
+        score = scorer.probability(hand_batch(scene, candidates, gripper, scorer.network))
     else:
         score = _score_balls(scene, candidates, scorer)
     score = score * object_probability(scene, candidates.contact_index)
@@ -190,7 +189,7 @@ def from_hand_poses(
     fingers, the one nearest to where the gripper puts its contacts. The approach point is the point
     within `crop_radius` metres of it that is nearest to the hand's approach axis.
     """
-    view = hand_views(scene.cloud, T_cloud_hand, reach_of(gripper))
+    view = hand_views(scene.cloud, T_cloud_hand, gripper)
     x, y, z = view.position.T
     between = np.flatnonzero(
         (np.abs(x) < gripper.pad_half_width)

@@ -15,7 +15,7 @@ import numpy as np
 from edgegrasp_camera.arrays import Bools, Float32, Floats, Int64
 from edgegrasp_model.candidates.edge_grasps import Candidates, support_clearance
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view import APPROACH_LENGTH, NEAR, HandView, hand_views, reach_of
+from edgegrasp_model.hand_view import APPROACH_LENGTH, NEAR, HandView
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import UP, Cloud
@@ -69,12 +69,8 @@ def describe_hands(
     around: Surroundings,  # what they look at
     candidates: Candidates,  # E candidates
     gripper: Gripper,  # fingers open to its maximum
-    # `hand_views` of the same candidates, within `reach_of` the gripper, if the caller has it
-    # already.
-    view: HandView | None = None,
-    # How many numbers the network reads; the extents, which come last, are skipped if it reads
-    # none.
-    size: int = HAND_DESCRIPTION_SIZE,
+    view: HandView,  # of the same candidates
+    size: int,  # numbers that the network reads; the extents, which come last, may be skipped
 ) -> Float32:
     """The hand-frame description of candidates, (E, HAND_DESCRIPTION_SIZE) or less the extents.
 
@@ -82,7 +78,6 @@ def describe_hands(
     of them saw is described.
     """
     cloud, up, hands = around.cloud, around.up, candidates.T_cloud_hand
-    view = view or hand_views(cloud, hands, reach_of(gripper))
     side, ends = around.mirror_sides(hands), seen_part(gripper)
     mirrored = hands[:, :3, :3].copy()
     mirrored[:, :, 0] *= side[:, None]
@@ -117,10 +112,9 @@ def points_around_fingers(
 ) -> tuple[Float32, Int64]:
     """The points around the fingers of hands (E, 4, 4); with one camera, x points to its side.
 
-    `view` are the `hand_views` of the same hands, within `reach_of` the open gripper. At most
-    `limit` points are kept of each, spread evenly over the cloud's order. Returns (E, limit, 6)
-    positions from between the fingertips in metres and normals, in hand frames, zeros behind the
-    last; and their number (E,).
+    `view` are the `hand_views` of the same hands. At most `limit` points are kept of each, spread
+    evenly over the cloud's order. Returns (E, limit, 6) positions from between the fingertips in
+    metres and normals, in hand frames, zeros behind the last; and their number (E,).
     """
     x, y = gripper.pad_half_width + BESIDE, gripper.max_opening / 2 + OUTSIDE
     palm_z = seen_part(gripper).palm_z

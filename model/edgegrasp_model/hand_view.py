@@ -14,15 +14,6 @@ NEAR = 0.006  # metres around a finger that count as near it
 APPROACH_LENGTH = 0.05  # metres of straight approach that the hand description looks at
 
 
-def reach_of(gripper: Gripper) -> Float32:
-    """Corners (2, 3), hand frame, of what an open gripper's boxes meet on a straight approach."""
-    boxes = gripper.open_boxes
-    low = boxes[:, 0].min(axis=0) - np.array([NEAR, NEAR, APPROACH_LENGTH])
-    high = boxes[:, 1].max(axis=0) + np.array([NEAR, NEAR, 2 * NEAR])
-    high[2] += gripper.max_tip_z - gripper.tip_z
-    return np.stack([low, high]).astype(np.float32)
-
-
 @dataclass(frozen=True)
 class HandView:
     """Cloud points in hand frames, without those out of reach."""
@@ -43,7 +34,12 @@ class HandView:
         return np.searchsorted(self.candidate, np.arange(self.num_candidates + 1))
 
 
-def hand_views(cloud: Cloud, T_cloud_hand: Float32, reach: Float32) -> HandView:
-    """Transform the cloud into hands' frames (E, 4, 4), keeping what is between corners (2, 3)."""
+def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandView:
+    """The cloud in hands' frames (E, 4, 4): what open hands meet on a straight approach."""
+    boxes = gripper.open_boxes
+    low = boxes[:, 0].min(axis=0) - np.array([NEAR, NEAR, APPROACH_LENGTH])
+    high = boxes[:, 1].max(axis=0) + np.array([NEAR, NEAR, 2 * NEAR])
+    high[2] += gripper.max_tip_z - gripper.tip_z
+    reach = low.astype(np.float32), high.astype(np.float32)
     hand, row, position = points_in_hand_boxes(cloud.points, T_cloud_hand, *reach)
     return HandView(hand, row, position, len(T_cloud_hand))

@@ -16,7 +16,7 @@ from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_description import seen_part
 from edgegrasp_model.hand_kernels import non_max_suppression
-from edgegrasp_model.hand_view import hand_views, reach_of
+from edgegrasp_model.hand_view import hand_views
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Outcome, Ungraspable
 from edgegrasp_model.scene.cloud import UP
@@ -134,7 +134,7 @@ def openings(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> tuple[Flo
     The opening is the visible extent between the fingers, and clearance; the gripper's maximum if
     no camera saw where the object ends on the side of a finger.
     """
-    met = met_first(hand_views(scene.cloud, T_cloud_hand, reach_of(gripper)), gripper)
+    met = met_first(hand_views(scene.cloud, T_cloud_hand, gripper), gripper)
     width = required_openings(met, gripper)
     hidden = _far_side_hidden(scene, T_cloud_hand, met, gripper)
     return np.where(hidden, np.float32(gripper.max_opening), width), hidden
@@ -209,7 +209,7 @@ def _why_ungraspable(
         hit = len(scored) > 0 or (outcome == CODE[Outcome.COLLISION]).any()
         return Ungraspable.BLOCKED if hit else None
     hands = sample.candidates.T_cloud_hand[scored]
-    met = met_first(hand_views(scene.cloud, hands, reach_of(gripper)), gripper)
+    met = met_first(hand_views(scene.cloud, hands, gripper), gripper)
     hidden = _far_side_hidden(scene, hands, met, gripper)
     return Ungraspable.HIDDEN if hidden.mean() > 0.5 else None
 

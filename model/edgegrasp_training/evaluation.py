@@ -26,7 +26,7 @@ from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.ranking import HIDDEN
 from edgegrasp_training.examples import pack_hands, tried_grasps
-from edgegrasp_training.views import find_views, load_view, scene_of, split_by_scene, table
+from edgegrasp_training.views import find_views, load_view, scene_of, table
 
 TENTHS = tuple(round(0.1 * number, 1) for number in range(11))
 EDGES = (0.0, 0.1, 0.3, 0.5, 0.8, 0.9, 0.95, 1.0)  # edges of the score ranges in a comparison
@@ -204,13 +204,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m edgegrasp_training.evaluation")
     parser.add_argument("data", type=Path, nargs="+", help="folders of views")
     parser.add_argument("--weights", type=Path, nargs="+", required=True)
-    parser.add_argument("--validation-share", type=float, help="only what `train` kept apart")
     given = parser.parse_args()
-    paths = find_views(given.data)
-    if given.validation_share is not None:
-        paths = split_by_scene(paths, given.validation_share, seed=0)[1]
-    names = list(map(str, given.weights))
-    sys.stdout.write(reliability_tables(score_views(paths, given.weights), names) + "\n")
+    scored = score_views(find_views(given.data), given.weights)
+    sys.stdout.write(reliability_tables(scored, list(map(str, given.weights))) + "\n")
 
 
 if __name__ == "__main__":

@@ -77,7 +77,7 @@ class Packed(NamedTuple):
 
 
 def tried_grasps(
-    view: LabelledView, config: NetworkConfig, *, viewpoint_known: bool = True
+    view: LabelledView, config: NetworkConfig, viewpoint_known: bool = True
 ) -> TriedGrasps:
     """Build the tried candidates of a view, with the inputs of a hand network."""
     rows = view.tried()

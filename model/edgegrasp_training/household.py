@@ -125,7 +125,6 @@ def _carton(rng: Random) -> list[Part]:
 
 
 def _tray(rng: Random) -> list[Part]:
-    """A box without a lid."""
     x, y = rng.uniform(0.06, 0.28, size=2)
     z, wall = rng.uniform(0.025, 0.12), rng.uniform(0.002, 0.006)
     return [_box((x, y, wall), (0.0, 0.0, wall / 2)), *_walls(x, y, z, wall)]
@@ -376,7 +375,6 @@ def _shell(radii: Numbers, heights: Numbers, wall: float, floor: float) -> list[
 
 
 def _placed(parts: list[Part], *moves: Float64 | tuple[float, ...]) -> list[Part]:
-    """Parts after linear maps (3, 3) and shifts (3,), one after the other."""
     for move in map(np.asarray, moves):
         if move.ndim == 2:
             parts = [(vertices @ move.T, faces) for vertices, faces in parts]
@@ -386,7 +384,6 @@ def _placed(parts: list[Part], *moves: Float64 | tuple[float, ...]) -> list[Part
 
 
 def _turn(angle: float) -> Float64:
-    """A rotation about z."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 

@@ -7,14 +7,14 @@ hundred outcomes can determine. The order of grasps stays the same.
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
 from scipy.special import logit as logit_of
 
-from edgegrasp_camera.arrays import Float64, Int64
+from edgegrasp_camera.arrays import Float64
 from edgegrasp_model.networks.checkpoint import load_checkpoint, save_checkpoint
 from edgegrasp_training.evaluation import cross_entropy
 
@@ -30,10 +30,6 @@ class Outcomes:
 
     logit: Float64  # (N,) of the score
     held: Float64  # (N,) 1 or 0
-
-    def of(self, rows: Int64) -> Self:
-        """Some of them."""
-        return replace(self, logit=self.logit[rows], held=self.held[rows])
 
 
 def read_outcomes(path: Path, digest: str = "") -> Outcomes:

@@ -147,7 +147,6 @@ def _casting(parts: Sequence[tuple[Mesh, int]]) -> o3d.t.geometry.RaycastingScen
 
 
 def _tensor(array: Array) -> Any:
-    """An array as Open3D takes it."""
     return o3d.core.Tensor(array)  # type: ignore[call-overload]
 
 

@@ -87,7 +87,6 @@ def merged(parts: Sequence[Mesh]) -> Mesh:
 
 
 def _mesh(obj: str) -> Mesh:
-    """All of an OBJ file as one mesh."""
     return merged([surface for _, surface in parse_obj(obj)])
 
 
@@ -119,7 +118,6 @@ def softened(rng: np.random.Generator, mesh: Mesh) -> Mesh:
 def _posed(
     rng: np.random.Generator, body: int, links: Sequence[tuple[int, Mesh]], client: int
 ) -> Mesh:
-    """An arm in a random pose."""
     import pybullet
 
     for joint in range(pybullet.getNumJoints(body, physicsClientId=client)):
@@ -138,7 +136,6 @@ def _posed(
 
 
 def _surface(mesh: Mesh) -> o3d.geometry.TriangleMesh:
-    """A mesh as Open3D has it."""
     return o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(mesh[0]), o3d.utility.Vector3iVector(mesh[1].astype(np.int32))
     )

@@ -302,7 +302,6 @@ def _files(data: Path) -> list[Path]:
 def _learn(
     network: SceneNet, optimiser: torch.optim.Optimizer, batch: SceneBatch
 ) -> dict[str, float]:
-    """One step; returns the parts of the loss."""
     network.train()
     # Products in bfloat16 are some three times as fast on processors that have them.
     with torch.autocast("cpu", torch.bfloat16):

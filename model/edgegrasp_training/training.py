@@ -240,8 +240,7 @@ class Trainer:
         return pack_balls(grasps, balls, network, soft_labels)
 
     def _read(self, path: Path, viewpoint_known: bool) -> TriedGrasps:
-        network = self.metadata.network
-        return tried_grasps(load_view(path), network, viewpoint_known=viewpoint_known)
+        return tried_grasps(load_view(path), self.metadata.network, viewpoint_known)
 
     def _standardise(self, known: int) -> None:
         """Fit mean and spread of the hand descriptions to the training views, but the first few."""

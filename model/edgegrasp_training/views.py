@@ -212,7 +212,6 @@ def table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> list[str]
 
 
 def _facts(views: dict[Path, LabelledView]) -> dict[str, object]:
-    """The rows of one column."""
     success = np.concatenate([view.success for view in views.values()])
     firm = np.concatenate(
         [view.firm[view.success == 1] for view in views.values() if view.firm is not None]

@@ -19,7 +19,6 @@ from edgegrasp_sim.trial import (
     Round,
     RoundEnd,
     StartCollides,
-    run_round,
 )
 
 MakeProtocol = Callable[[int], Protocol]
@@ -38,10 +37,9 @@ def run(simulation: ClutterSimulation, paper_with: MakeProtocol) -> Callable[...
         number: int,
         seed: int = 0,
         index: int = 0,
-        **more: object,
     ) -> Round:
-        rules = paper_with(number)
-        return run_round(simulation, planner, scene, rules, seed=seed, index=index, **more)
+        driver = RoundDriver(simulation, scene, paper_with(number), seed=seed, index=index)
+        return driver.run(planner)
 
     return run
 
@@ -54,7 +52,7 @@ def cubes(engine: str) -> Iterator[ClutterSimulation]:
 
 
 def test_top_down_grasps_clear_a_scene_of_cubes(cubes, paper_with) -> None:
-    done = run_round(cubes, plan, PACKED, paper_with(3), seed=0, index=0)
+    done = RoundDriver(cubes, PACKED, paper_with(3), seed=0, index=0).run(plan)
     assert done.end is RoundEnd.CLEARED
     assert done.successes == len(done.objects) == 3
     for attempt in done.attempts:
@@ -103,7 +101,7 @@ def test_scenes_and_views_do_not_depend_on_the_planner(engine, run, paper_with) 
     run(plan, PILE, 2, seed=4, index=0)
     run(keep_first, PILE, 2, seed=4, index=1)
     with ClutterSimulation(engine=engine) as other:
-        run_round(other, keep_first, PILE, paper_with(2), seed=4, index=1)
+        RoundDriver(other, PILE, paper_with(2), seed=4, index=1).run(keep_first)
     assert np.array_equal(first_clouds[0], first_clouds[2])
     with pytest.raises(ValueError, match="seed is -1"):
         run(plan, PILE, 2, seed=-1)

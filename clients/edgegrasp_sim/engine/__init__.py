@@ -4,11 +4,10 @@ Two engines implement it, a file each; nothing else knows which one runs.
 """
 
 import importlib.util
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, NamedTuple, Self, TypeAlias
+from typing import ClassVar, NamedTuple, Protocol, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,7 +126,7 @@ class ArmModel:
     home: Matrix  # where they rest, (J,) radians or metres
 
 
-class World(ABC):
+class World(Protocol):
     """A physics world; a process may have several. Bodies that are removed are gone for good."""
 
     name: ClassVar[str]  # of the engine
@@ -141,39 +140,30 @@ class World(ABC):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    @abstractmethod
     def close(self) -> None:
         """Release what it holds. Safe to call twice."""
 
-    @abstractmethod
     def reset(self) -> None:
         """Remove every body."""
 
-    @abstractmethod
     def step(self, steps: int = 1) -> None:
         """Advance the world by `steps` time steps of 1/80 s."""
 
-    @abstractmethod
     def first_hits(self, starts: Matrix, ends: Matrix) -> list[int]:
         """The body that each ray meets first, -1 for none; (R, 3) metres each, world frame."""
 
-    @abstractmethod
     def detect_collisions(self) -> None:
         """Refresh the contact points without advancing time."""
 
-    @abstractmethod
     def save_state(self) -> int:
         """Keep the present state in memory; valid for the bodies that are there now."""
 
-    @abstractmethod
     def restore_state(self, state: int) -> None:
         """Return to a kept state."""
 
-    @abstractmethod
     def remove_state(self, state: int) -> None:
         """Forget a kept state."""
 
-    @abstractmethod
     def load_urdf(
         self,
         path: Path,
@@ -186,11 +176,9 @@ class World(ABC):
     ) -> "Body":
         """Load a body with its link frame there; its inertia is that of its collision shape."""
 
-    @abstractmethod
     def add_box(self, size: Vector, centre: Vector, *, friction: float, yaw: float = 0.0) -> "Body":
         """Add a box that never moves, turned about z; `size` is its full extent in metres."""
 
-    @abstractmethod
     def add_hand(self, model: HandModel, position: Matrix) -> "Hand":
         """Add an open hand with its centre of mass there; a world may have one."""
 
@@ -198,79 +186,65 @@ class World(ABC):
         """Add an arm at its home with an open hand on it; ValueError: this engine has no arms."""
         raise ValueError(f"engine is {self.name}; an arm takes mujoco")
 
-    @abstractmethod
     def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
         """Depth (height, width) of pixels' lower left corners, metres; `far`: nothing seen."""
 
 
-class Body(ABC):
+class Body(Protocol):
     """One body of a world. Its pose is that of its centre of mass."""
 
     uid: int
 
-    @abstractmethod
     def remove(self) -> None:
         """Take the body out of its world."""
 
     @property
-    @abstractmethod
     def position(self) -> Matrix:
         """Centre of mass, world frame, metres: (3,)."""
 
     @property
-    @abstractmethod
     def quaternion_xyzw(self) -> tuple[float, float, float, float]:
         """Orientation in the world."""
 
-    @abstractmethod
     def set_pose(self, position: Vector, quaternion_xyzw: Vector) -> None:
         """Put the centre of mass there, at rest."""
 
     @property
-    @abstractmethod
     def speed(self) -> float:
         """Length of linear (m/s) and angular (rad/s) velocity taken together."""
 
     @property
-    @abstractmethod
     def bounds(self) -> Matrix:
         """Lowest and highest corner of the axis-aligned box around it: (2, 3) metres."""
 
-    @abstractmethod
     def contacts(self) -> list[Contact]:
         """The contact points found by the last step or collision detection."""
 
 
-class Hand(Body):
+class Hand(Body, Protocol):
     """A hand: a body, its palm, that is moved with limited force, and two fingers."""
 
     @property
-    @abstractmethod
     def opening(self) -> float:
         """Metres between the fingers."""
 
-    @abstractmethod
     def set_pose(self, position: Vector, quaternion_xyzw: Vector) -> None:
         """Put the hand there at once, at rest and open, and hold it there."""
 
-    @abstractmethod
     def move(self, position: Vector, quaternion_xyzw: Vector) -> None:
         """Pull the centre of mass there in the next step."""
 
-    @abstractmethod
     def close_fingers(self) -> None:
         """Drive the fingers together with full force from now on."""
 
 
-class Arm(Hand):
+class Arm(Hand, Protocol):
     """A hand on an arm: its joints move it, not its pose. Its contacts are those of all links."""
 
     substeps: ClassVar[int]  # of a time step
 
-    @abstractmethod
     def rest(self) -> None:
         """Put the arm to its home at once, at rest, its hand open."""
 
-    @abstractmethod
     def drive(self, positions: Matrix, velocities: Matrix) -> None:
         """Have the joints' controllers follow (substeps, J) in the next time step."""

@@ -163,7 +163,6 @@ def _hulls(points: Matrix) -> list[Surface]:
 
 
 def _origin(element: ElementTree.Element) -> tuple[Matrix, Rotation]:
-    """Place and turn of an element in its link."""
     origin = element.find("origin")
     if origin is None:
         return np.zeros(3), Rotation.identity()

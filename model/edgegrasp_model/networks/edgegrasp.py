@@ -63,7 +63,6 @@ class EdgeGraspNet(nn.Module):
         return torch.cat(logits).squeeze(1)[: len(grasp)]
 
     def _grasp_features(self, batch: BallBatch) -> Tensor:
-        """Features of each grasp itself, (E, 10)."""
         contact = batch.contact
         parts = (
             batch.points[contact],

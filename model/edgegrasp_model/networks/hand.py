@@ -23,7 +23,7 @@ from edgegrasp_model.hand_description import (
     describe_hands,
     points_around_fingers,
 )
-from edgegrasp_model.hand_view import HandView, hand_views, reach_of
+from edgegrasp_model.hand_view import hand_views
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.layers import (
@@ -59,12 +59,11 @@ class HandBatch:
         candidates: Candidates,
         gripper: Gripper,  # open to its maximum
         num_points: int,
-        view: HandView | None = None,
         description_size: int = HAND_DESCRIPTION_SIZE,
     ) -> Self:
         """What the hands of some candidates see, with at most `num_points` points each."""
         T_cloud_hand = candidates.T_cloud_hand
-        view = view or hand_views(around.cloud, T_cloud_hand, reach_of(gripper))
+        view = hand_views(around.cloud, T_cloud_hand, gripper)
         description = describe_hands(around, candidates, gripper, view, description_size)
         points, count = points_around_fingers(around, T_cloud_hand, gripper, view, num_points)
         return cls(torch.from_numpy(description), torch.from_numpy(points), torch.from_numpy(count))
@@ -94,13 +93,12 @@ class HandBatch:
 
 
 def hand_batch(
-    scene: Scene, candidates: Candidates, gripper: Gripper, network: NetworkConfig, view: HandView
+    scene: Scene, candidates: Candidates, gripper: Gripper, network: NetworkConfig
 ) -> HandBatch:
     """The input of the hand network for some candidates of a scene."""
     known = scene.support, scene.viewpoints, scene.at_side, scene.object_of_point, scene.depths
-    around = Surroundings(scene.cloud, UP, *known)
-    sizes = network.hand_points, view, network.description_size
-    return HandBatch.of_hands(around, candidates, gripper, *sizes)
+    sizes = network.hand_points, network.description_size
+    return HandBatch.of_hands(Surroundings(scene.cloud, UP, *known), candidates, gripper, *sizes)
 
 
 class HandNet(nn.Module):

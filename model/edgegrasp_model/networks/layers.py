@@ -118,7 +118,6 @@ def onednn_is_faster() -> bool:
 
 
 def _processor() -> str:
-    """The processor's name."""
     get = getattr(torch.cpu, "get_capabilities", None)  # newer PyTorch has it
     return "" if get is None else str(get().get("cpu_name", ""))
 
