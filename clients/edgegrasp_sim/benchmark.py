@@ -40,15 +40,12 @@ class BenchmarkConfig:
 
     scene: SceneKind  # kind of the scenes
     rounds: int  # how many for each seed
-    # With a round's number, a seed gives the round's scene, views and noise.
-    seeds: tuple[int, ...] = (0,)
+    seeds: tuple[int, ...] = (0,)  # with a round's number: scene, views, noise
     protocol: Protocol = field(default_factory=lambda: load_protocol("edgegrasp"))  # the constants
-    # Folder in the layout `<scene>/<split>/*.urdf`; the built-in set if None.
-    objects: Path | None = None
+    objects: Path | None = None  # `<scene>/<split>/*.urdf`; None: the built-in set
     split: str = "test"  # of that folder
     engine: str = ""  # to simulate with; by default see `choose_engine`, with the protocol's
-    # The fields of a gripper file; by default the Panda's hand.
-    gripper: dict[str, Any] | None = None
+    gripper: dict[str, Any] | None = None  # of a file; None: the Panda's hand
     arm: ArmModel | None = None  # what carries the hand; None: it floats
 
     def __post_init__(self) -> None:
@@ -79,8 +76,7 @@ def run_benchmark(
     workers: int | None = 1,  # how many rounds at a time, and
     ray: str | None = None,  # address of a Ray cluster to run them on: see `run_tasks`
     folder: ResultFolder | None = None,  # keeps each round as it finishes; opened by the caller
-    # Called with every round as it finishes, in any order.
-    on_round: Callable[[Round], None] | None = None,
+    on_round: Callable[[Round], None] | None = None,  # called as each finishes
 ) -> list[Round]:
     """Run the rounds that `folder` does not hold yet; all, by seed and index. See `run_tasks`."""
     digest = config.object_set().digest  # fails here on a wrong folder, not in every worker

@@ -21,21 +21,13 @@ Float = TypeVar("Float", bound=np.floating)
 class Observation:
     """The point cloud of one or several depth images, and other input of a planner."""
 
-    # (N, 3) float32, world frame, metres; order of the pixels, one image after another.
-    cloud: NDArray[np.float32]
-    # (2, 3) float32, lowest and highest corner of where grasps are looked for; not to be used where
-    # `table` is `auto`.
-    workspace: NDArray[np.float32]
+    cloud: NDArray[np.float32]  # (N, 3) world frame, metres; in the order of the pixels
+    workspace: NDArray[np.float32]  # (2, 3) corners of where grasps are looked for, unless `auto`
     table_height: float  # metres; not to be used where `table` is `auto`
     camera_positions: NDArray[np.float32]  # (V, 3) float32, every camera, world frame, metres
     view_ids: NDArray[np.int32]  # (N,) int32, which camera saw each point
-    # What the cloud contains. `known`: it is cut off above the table. `seen`: it includes the
-    # table, to correct the depth scale by, and is not cut off at the sides of the workspace.
-    # `around`: everything that the camera sees. `auto`: the same, and a planner may use nothing but
-    # the cloud and the cameras.
-    table: TableView = "known"
-    # (N,) the pixel of each point, row-major; None: several images, or cut off.
-    pixels: NDArray[np.int64] | None = None
+    table: TableView = "known"  # what the cloud contains, see `PlanningRules`
+    pixels: NDArray[np.int64] | None = None  # (N,) row-major; None: several images, or cut off
 
     @property
     def image(self) -> NDArray[np.float32]:
@@ -60,8 +52,7 @@ class ViewRange:
     radius: tuple[float, float]  # metres
     polar_angle: tuple[float, float]  # radians from world z
     azimuth: tuple[float, float]  # radians from world x
-    # The point looked at, world frame, metres.
-    target: tuple[float, float, float] = (0.15, 0.15, 0.25)
+    target: tuple[float, float, float] = (0.15, 0.15, 0.25)  # looked at, world frame, metres
 
     def sample(self, rng: np.random.Generator, views: int = 1) -> list[Matrix]:
         """Draw a pose `T_world_camera` (4, 4), and others evenly spread over a full turn."""

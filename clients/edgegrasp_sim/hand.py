@@ -60,11 +60,9 @@ class GraspResult:
     opening: float  # metres between the fingers at the end
     start_contact: bool  # whether the open hand overlapped something at its start pose
     held: SceneObject | None  # the object held, None if nothing is
-    # The object between the fingers before the hand came, None if there was none.
-    target: SceneObject | None = None
+    target: SceneObject | None = None  # between the fingers before the hand came
     cause: FailureCause | None = None  # why it failed, None if it did not
-    # Whether it was still held then; None if the hand was not shaken.
-    held_after_shaking: bool | None = None
+    held_after_shaking: bool | None = None  # None if the hand was not shaken
     touched_on_the_way: bool = False  # whether an arm overlapped anything before its pregrasp
 
     @property
@@ -77,14 +75,10 @@ def run_grasp(
     gripper: "Gripper",  # the hand to use
     T_world_hand: Matrix,  # pose of the `panda_hand` link at the grasp, (4, 4)
     objects: Mapping[int, SceneObject],  # what may be held, by the id of its body
-    # Ids of the bodies that a hand must not cut into: that fails the grasp at once.
-    obstacles: Set[int] = frozenset(),
+    obstacles: Set[int] = frozenset(),  # cutting into these bodies fails the grasp
     *,
-    # Simulate every step, so that whatever the hand pushes aside ends up right; otherwise stop once
-    # the outcome is clear.
-    to_the_end: bool,
-    # Shake a held object at the end of the retreat; this does not change `success`.
-    shake: bool = False,
+    to_the_end: bool,  # otherwise stop once the outcome is clear
+    shake: bool = False,  # a held object at the end; no change of `success`
 ) -> GraspResult:
     """Run a grasp from its start pose to the end of the retreat; the hand stays there."""
     gripper.start(T_world_hand)
@@ -110,7 +104,11 @@ def run_grasp(
     missed = gripper.opening <= MIN_OPENING
     caught = _touched(gripper, objects)
     if not missed or to_the_end:
-        held = _retreat(gripper, T_world_hand, objects, to_the_end=to_the_end)
+        watch = _Watch(gripper, objects)
+        for _ in gripper.retreat(T_world_hand):
+            if not to_the_end and watch.is_clear():
+                break
+        held = next(iter(_touched(gripper, objects)), None)
         if held is not None and gripper.opening > MIN_OPENING:
             found = result(None, held)
             if shake:
@@ -262,21 +260,6 @@ def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: 
         shut = opening <= MIN_OPENING
         if not to_the_end and (shut or (still_steps >= STILL_STEPS and _touched(gripper, objects))):
             return
-
-
-def _retreat(
-    gripper: Gripper,
-    T_world_hand: Matrix,
-    objects: Mapping[int, SceneObject],
-    *,
-    to_the_end: bool,
-) -> SceneObject | None:
-    """Retreat; unless `to_the_end`, only until it is clear what the hand holds: that, or None."""
-    watch = _Watch(gripper, objects)
-    for _ in gripper.retreat(T_world_hand):
-        if not to_the_end and watch.is_clear():
-            break
-    return next(iter(_touched(gripper, objects)), None)
 
 
 class _Watch:

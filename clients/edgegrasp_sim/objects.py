@@ -238,8 +238,7 @@ def as_obj(
     meshes: Iterable[Mesh],  # points (P, 3) and triangles (F, 3) of each
     *,
     decimals: int = 6,  # of coordinates
-    # Make each mesh an object of its own; the engine takes the convex hull of each.
-    named: bool = False,
+    named: bool = False,  # each mesh an object, of which the engine takes the hull
 ) -> str:
     """Meshes as one OBJ file."""
     lines, before = [], 1

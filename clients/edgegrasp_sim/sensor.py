@@ -49,26 +49,16 @@ class DepthNoise:
 class DepthSensor:
     """A depth camera: what `apply` does to an image, in this order."""
 
-    # Metres from the camera to the projector or second camera along the image's x; what it does not
-    # see is missing. 0: none.
-    baseline: float
-    # Pixels across the window in which depths are found; steps smaller than `EDGE` are smoothed
-    # over. 1: each pixel by itself.
-    window: int
-    # Share of the pixels beside an edge, behind it, that get the depth of its front.
-    fattening: float
-    # Share of the pixels at an edge that lie somewhere between its front and its back.
-    flying: float
+    baseline: float  # metres along x to what a projector or second camera hides; 0: none
+    window: int  # pixels of the window that smooths steps smaller than `EDGE`; 1: none
+    fattening: float  # share of the pixels behind an edge that get the depth of its front
+    flying: float  # share of the pixels at an edge that lie between its front and its back
     noise_floor: float  # standard deviation of the noise at depth 0, metres
     noise_growth: float  # what is added to that for each square metre of depth, 1 / metre
     noise_pixels: int  # pixels between independent values of the noise
-    # Standard deviation of a smooth error over the whole image, metres: a camera calibrated badly,
-    # or an uneven table.
-    warp: float
+    warp: float  # standard deviation of a smooth error over the whole image, metres
     disparity_step: float  # pixels to which disparities are rounded; 0: not rounded
-    # Degrees between a line of sight and the surface's normal at which half of the readings are
-    # missing.
-    grazing: float
+    grazing: float  # degrees off the surface's normal at which half of the readings are missing
     missing: float  # share of the image that is missing in patches
 
     def apply(self, depth: Float64, camera: Intrinsics, rng: np.random.Generator) -> Float64:

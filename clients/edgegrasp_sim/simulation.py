@@ -175,8 +175,7 @@ class ClutterSimulation:
         scene: SceneKind | str,  # `packed`, `pile`, `bin`, `table`, `bin-full` or `shelf`
         rng: np.random.Generator,  # the scene's own stream
         num_objects: int = 5,  # how many to try to place
-        # Range of the factor on the objects' size; by default the scene's own.
-        scales: tuple[float, float] | None = None,
+        scales: tuple[float, float] | None = None,  # of the factor on sizes; None: usual
         table_thickness: float = OPEN_THICKNESS,  # of packed and pile scenes, metres
     ) -> int:
         """Make a new scene at rest; returns how many objects are there."""
@@ -226,8 +225,7 @@ class ClutterSimulation:
         T_world_cameras: Sequence[Matrix],  # one for each image
         rng_noise: np.random.Generator,  # stream of the noise
         *,
-        # Standard deviation of the noise in each coordinate of each point, metres.
-        noise_std: float = NOISE_STD,
+        noise_std: float = NOISE_STD,  # of each coordinate of each point, metres
         depth_noise: DepthNoise | None = None,  # noise of the images
         sensor: DepthSensor | None = None,  # what else the camera gets wrong
         table: TableView = "known",  # what the cloud holds of the table, see `Observation`

@@ -25,6 +25,7 @@ WORKSPACE = (
 MIDDLE = SIZE / 2  # metres, x and y of the middle of every scene
 
 Span = tuple[float, float]  # least and greatest, metres
+Corners = tuple[tuple[float, float, float], tuple[float, float, float]]  # lowest, highest; metres
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +80,7 @@ class Box:
     centre: tuple[float, float, float]  # of the box
     yaw: float = 0.0  # radians about world z
     friction: float = WALL_FRICTION  # lateral
-    # Whether a hand that hits it has failed. The table is none, as in the reference.
-    obstacle: bool = True
+    obstacle: bool = True  # a hand that hits it has failed; the table is none
 
     def add_to(self, world: World) -> Body:
         """Put it there."""
@@ -92,10 +92,8 @@ class Surroundings:
     """The fixed parts of a scene, and the region of its objects."""
 
     boxes: tuple[Box, ...]  # all that never moves
-    # Lowest and highest corner of where grasps are looked for, metres.
-    workspace: tuple[tuple[float, float, float], tuple[float, float, float]]
-    # The same of where an object's centre may be; one that leaves it is taken away.
-    bounds: tuple[tuple[float, float, float], tuple[float, float, float]]
+    workspace: Corners  # of where grasps are looked for
+    bounds: Corners  # of where an object's centre may be; one that leaves it is taken away
     # Metres from the middle, along x and y, where objects are put down.
     reach: tuple[float, float] = (TABLES.reach, TABLES.reach)
 
@@ -164,8 +162,8 @@ def random_table(rng: np.random.Generator) -> Surroundings:
     table = _slab(size, TABLE_HEIGHT, *(MIDDLE + aside))
     floor = _slab(np.array([6.0, 6.0, 0.2]), TABLE_HEIGHT - over)
     boxes = [floor, table]
-    for _ in range(int(rng.integers(TABLES.large[0], TABLES.large[1] + 1))):
-        boxes.append(_large_object(rng))
+    large = int(rng.integers(TABLES.large[0], TABLES.large[1] + 1))
+    boxes += [_large_object(rng) for _ in range(large)]
     bottom = TABLE_HEIGHT + SUPPORT_CLEARANCE
     return Surroundings(
         tuple(boxes),
@@ -212,9 +210,5 @@ def _large_object(rng: np.random.Generator) -> Box:
     return Box((length, width, height), centre, yaw=float(yaw))
 
 
-def _corners(
-    low: Matrix, high: Matrix, bottom: float, top: float
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    x_low, y_low = map(float, low)
-    x_high, y_high = map(float, high)
-    return (x_low, y_low, bottom), (x_high, y_high, top)
+def _corners(low: Matrix, high: Matrix, bottom: float, top: float) -> Corners:
+    return (float(low[0]), float(low[1]), bottom), (float(high[0]), float(high[1]), top)

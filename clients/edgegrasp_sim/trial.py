@@ -88,11 +88,9 @@ class Round:
     index: int  # number of the round
     objects: tuple[str, ...]  # names of the objects that were there after the reset
     attempts: tuple[Attempt, ...]  # the grasps executed, in order
-    # How often the planner found no grasp; not counted as attempts, as in the reference.
-    no_grasp: int
+    no_grasp: int  # how often the planner found none; not counted as attempts
     end: RoundEnd  # why the round ended
-    # Names of the objects that no grasp can hold: the hand does not open that far.
-    too_wide: tuple[str, ...] = ()
+    too_wide: tuple[str, ...] = ()  # names of objects wider than the hand opens
     start_collisions: int = 0  # in how many of those the arm touched something where it started
 
     @property

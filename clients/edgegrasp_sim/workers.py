@@ -26,17 +26,11 @@ LOCAL_RAY = "local"  # address of a cluster that is started on this machine for 
 
 
 def run_tasks(
-    # called once in every process; its result is closed, if it can be, when it was made in this
-    # process
-    make_runner: MakeRunner[Task, Result],
+    make_runner: MakeRunner[Task, Result],  # called once in every process
     tasks: Sequence[Task],
     *,
-    # how many at a time; with 1 all in this process; None: as many as there are cores here, or
-    # processors in the cluster
-    workers: int | None = None,
-    # address of a Ray cluster, as `ray.init` takes it; `local` starts one on this machine. Each of
-    # its machines needs this package and the files that runners read, at the same paths.
-    ray: str | None = None,
+    workers: int | None = None,  # at a time; 1: in this process; None: all cores
+    ray: str | None = None,  # address of a cluster as of `ray.init`; `local` starts one
 ) -> Iterator[tuple[Task, Result]]:
     """Do tasks whose results depend only on the task; yields them and their results as they finish.
 

@@ -129,8 +129,7 @@ class GraspDetector:
         metadata: CheckpointMetadata,  # of the weights
         gripper: Gripper,  # that it was trained for, used if a request names none
         device: torch.device | str = "cpu",  # where the network runs
-        # The user's own, which requests may name beside the shipped ones.
-        grippers: Mapping[str, Gripper] | None = None,
+        grippers: Mapping[str, Gripper] | None = None,  # the user's own, by name
         max_voxels: int = MAX_VOXELS,  # most that a request's cloud may have
     ) -> None:
         self.max_voxels = max_voxels

@@ -43,9 +43,7 @@ class Surroundings:
     up: Float32  # (3,) away from gravity
     support: SupportPlane | None = None  # heights are measured from this plane
     viewpoints: Float32 | None = None  # (W, 3) the cameras
-    # (N,) where a side of the workspace cuts objects off: what is between the fingers there may be
-    # wider than it seems. None: nowhere.
-    at_side: Bools | None = None
+    at_side: Bools | None = None  # (N,) cut off by a side of the workspace; None: nowhere
     object_of_point: Int64 | None = None  # (N,) None: all points are of one
     depths: Sequence[DepthMap] | None = None  # what each camera saw; None: computed when needed
 

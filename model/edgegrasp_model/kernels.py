@@ -260,18 +260,6 @@ def _into_strip(
 
 
 @compiled("contract")
-def _first_of(key: Int64, wanted: int) -> int:
-    low, high = 0, len(key)
-    while low < high:
-        middle = (low + high) // 2
-        if key[middle] < wanted:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@compiled("contract")
 def _level_spread(
     columns: Float32,
     key: Int64,
@@ -290,7 +278,7 @@ def _level_spread(
         for dx in range(-1, 2):
             for dy in range(-1, 2):
                 start = middle_key[m] + (dx * sizes[1] + dy) * sizes[2] - 1
-                for j in range(_first_of(key, start), _first_of(key, start + 3)):
+                for j in range(np.searchsorted(key, start), np.searchsorted(key, start + 3)):
                     around[0, found] = columns[0, j]
                     around[1, found] = columns[1, j]
                     around[2, found] = columns[2, j]

@@ -229,39 +229,13 @@ def _extents(
         extents[e, 6], extents[e, 7] = high_z - tip, palm - low_z
 
 
-class CameraFrame(NamedTuple):
-    """A camera's view of a cloud: the directions of its depth map's cells."""
-
-    viewpoint: Float32  # (3,)
-    axes: Float32  # (3, 3) rows: across, down, toward the middle of the cloud
-    cell: float  # tangent of the angle of a cell
-
-    @classmethod
-    def toward(cls, middle: ArrayLike, viewpoint: ArrayLike, up: ArrayLike) -> Self:
-        """A camera that looks at the middle (3,) of a cloud; `up` (3,) fixes its roll."""
-        way = np.asarray(middle, dtype=np.float64) - np.asarray(viewpoint, dtype=np.float64)
-        distance = max(float(np.linalg.norm(way)), 1e-6)
-        ahead = way / distance
-        across = np.cross(ahead, np.asarray(up, dtype=np.float64))
-        if np.linalg.norm(across) < STEEP * np.linalg.norm(up):  # seen from straight above
-            across = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
-        across /= np.linalg.norm(across)
-        axes = np.stack([across, np.cross(ahead, across), ahead]).astype(np.float32)
-        return cls(np.asarray(viewpoint, dtype=np.float32), axes, CELL / distance)
-
-    def seen(self, positions: Float32) -> tuple[Int64, Float32]:
-        """The cells (N, 2) of positions (N, 3), from the middle one, and their distances."""
-        along = (positions - self.viewpoint) @ self.axes.T  # (N, 3)
-        tangents = along[:, :2] / np.maximum(along[:, 2:], np.float32(1e-6))
-        cell = np.clip(np.floor(tangents / np.float32(self.cell)), -FARTHEST, FARTHEST)
-        return cell.astype(np.int64), np.linalg.norm(along, axis=1).astype(np.float32)
-
-
 @dataclass(frozen=True)
 class DepthMap:
     """Distance of the first surface in each direction from a camera."""
 
-    frame: CameraFrame
+    viewpoint: Float32  # (3,)
+    axes: Float32  # (3, 3) rows: across, down, toward the middle of the cloud
+    cell: float  # tangent of the angle of a cell
     distance: Float32  # (2 H + 1, 2 H + 1) metres from the camera; inf where nothing was seen
 
     @classmethod
@@ -274,19 +248,28 @@ class DepthMap:
     @classmethod
     def of_cloud(cls, points: Float32, viewpoint: Float32, up: Float32) -> Self:
         """The depth map of points (N, 3), metres, from a camera; `up` fixes its roll."""
-        frame = CameraFrame.toward(points.mean(axis=0, dtype=np.float64), viewpoint, up)
-        cell, distance = frame.seen(points)
+        way = points.mean(axis=0, dtype=np.float64) - viewpoint.astype(np.float64)
+        away = max(float(np.linalg.norm(way)), 1e-6)
+        ahead = way / away
+        across = np.cross(ahead, np.asarray(up, dtype=np.float64))
+        if np.linalg.norm(across) < STEEP * np.linalg.norm(up):  # seen from straight above
+            across = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
+        across /= np.linalg.norm(across)
+        axes = np.stack([across, np.cross(ahead, across), ahead]).astype(np.float32)
+        along = (points - viewpoint) @ axes.T  # (N, 3)
+        tangents = along[:, :2] / np.maximum(along[:, 2:], np.float32(1e-6))
+        cell = np.clip(np.floor(tangents / np.float32(CELL / away)), -FARTHEST, FARTHEST)
         half = min(int(np.abs(cell).max()) + SPLAT, HALF)
         depth = np.full((2 * half + 1, 2 * half + 1), NOTHING)
-        _cover(depth, cell + half, distance)
-        return cls(frame, depth)
+        distance = np.linalg.norm(along, axis=1).astype(np.float32)
+        _cover(depth, cell.astype(np.int64) + half, distance)
+        return cls(viewpoint, axes, CELL / away, depth)
 
     def behind(self, T_cloud_hand: Float32, places: Float32) -> Float32:
         """Metres (E, S) that places (S, 3) of hands (E, 4, 4) lie behind a surface, or 0."""
-        frame = self.frame
-        turn = frame.axes @ T_cloud_hand[:, :3, :3]
-        shift = (T_cloud_hand[:, :3, 3] - frame.viewpoint) @ frame.axes.T
-        return distance_behind(self.distance, turn, shift, places, frame.cell)
+        turn = self.axes @ T_cloud_hand[:, :3, :3]
+        shift = (T_cloud_hand[:, :3, 3] - self.viewpoint) @ self.axes.T
+        return distance_behind(self.distance, turn, shift, places, self.cell)
 
 
 @compiled()

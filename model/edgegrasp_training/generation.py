@@ -50,35 +50,20 @@ BIN_APPROACH_POINTS = 24  # walls block most hands there
 # Four in ten scenes are those of the benchmark of the paper.
 _P, _H, _B, _T = SceneKind.PACKED, SceneKind.PILE, SceneKind.BIN, SceneKind.TABLE
 MIXTURE = (_P, _H, _B, _T, _B, _P, _T, _H, _B, _T)
-FURTHER_OBJECTS = {  # a scene holds one object and Poisson(this) more
-    SceneKind.PACKED: 4,
-    SceneKind.PILE: 4,
-    SceneKind.BIN: 7,
-    SceneKind.TABLE: 5,
-}
-_ABOVE, _STEEP, _ANY_SIDE = (
-    (0.0, np.radians(40)),
-    (np.radians(20), np.radians(75)),
-    (0.0, 2 * np.pi),
-)
+FURTHER_OBJECTS = {_P: 4, _H: 4, _B: 7, _T: 5}  # a scene holds one object and Poisson(this) more
+_ABOVE, _STEEP = (0.0, np.radians(40)), (np.radians(20), np.radians(75))
+_ANY_SIDE = 0.0, 2 * np.pi
 _LOW_TARGET = (MIDDLE, MIDDLE, 0.1)  # metres
-VIEWS = {
-    SceneKind.PACKED: ViewRange((0.45, 0.75), (0.0, np.radians(75)), _ANY_SIDE),
-    SceneKind.PILE: ViewRange((0.45, 0.75), (0.0, np.radians(75)), _ANY_SIDE),
-    SceneKind.BIN: ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET),
-    SceneKind.TABLE: ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET),
-}
+VIEWS = dict.fromkeys((_P, _H), ViewRange((0.45, 0.75), (0.0, np.radians(75)), _ANY_SIDE))
+VIEWS[_B] = ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET)
+VIEWS[_T] = ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET)
 # Of household objects, more from one side: a tall or wide one hides its back there.
 SIDE_VIEWS = ViewRange((0.5, 1.2), (np.radians(40), np.radians(80)), _ANY_SIDE, _LOW_TARGET)
 KEPT_DISTANCE = 0.18  # metres from the nearest hand that was tried: from its axis there,
 BEHIND_TIPS = 0.1122  # metres behind the fingertips, where the Panda's frame is
 AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
-GIVEN_SHARE = {  # of the views that are not cut off, where support and workspace are given
-    SceneKind.PACKED: 0.0,
-    SceneKind.PILE: 0.0,
-    SceneKind.BIN: 0.7,
-    SceneKind.TABLE: 0.3,
-}
+# Of the views that are not cut off, where support and workspace are given.
+GIVEN_SHARE = {_P: 0.0, _H: 0.0, _B: 0.7, _T: 0.3}
 AIMED_SHARE = 0.85  # of the views of bins and tables with grasps of the objects alone
 AIM_MARGIN = np.array([[-0.005], [0.005]])  # metres around an object
 AROUND_MARGIN = 0.006  # metres around an obstacle
@@ -113,12 +98,10 @@ class Query(NamedTuple):
 
 def generate(
     folder: Path,  # where the views go, one file each
-    # Object sets in the layout `packed/train`, `pile/train`; None: the built-in ones.
-    objects: Path | None,
+    objects: Path | None,  # `packed/train`, `pile/train`; None: built-in ones
     options: GenerationOptions,  # what to generate
     workers: int | None = 1,  # how many scenes at a time, and
-    # Address of a Ray cluster to make them on: see `run_tasks`. Views come back to `folder`.
-    ray: str | None = None,
+    ray: str | None = None,  # address of a Ray cluster, see `run_tasks`; views come back
 ) -> Iterator[tuple[int, int, int]]:
     """Generate the scenes that are missing, in any order; workers do not change the result.
 
@@ -205,21 +188,22 @@ def generate_scene(
         gripper = hand_of_scene(options.gripper, streams[HAND_STREAM])
         hand = "" if gripper is None else json.dumps(gripper)
         with ClutterSimulation(made_of, engine=options.engine, gripper=gripper) as simulation:
-            sizes = HOUSEHOLD_SCALE if household else _scales(kind)
+            low, high = PACKED_SCALE if kind.objects is SceneKind.PACKED else PILE_SCALE
+            sizes = low * WIDER_SCALES[0], high * WIDER_SCALES[1]
+            sizes = HOUSEHOLD_SCALE if household else sizes
             aside = household and kind is not SceneKind.BIN
             seen_from = SIDE_VIEWS if aside else VIEWS[kind]
             hard = _make_scene(simulation, kind, seen_from, sizes, options, streams)
             models = [model.origin or model for model in simulation.object_models]
             names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
+            made: dict[str, Any] = {"engine": simulation.world.name, "gripper": hand}
+            made |= {"objects": names, "object_digests": digests}
             for number in range(options.views_per_scene):
-                query = hard
-                if query is None or number > 0:
-                    query = ask(simulation, kind, seen_from, streams)
+                query = hard if number == 0 else None
+                query = query or ask(simulation, kind, seen_from, streams)
                 choice = streams[CHOICE_STREAM]
                 view = label(simulation, query, options, choice, hard=hard is not None)
-                engine = simulation.world.name
-                view = replace(view, engine=engine, gripper=hand)
-                views.append(replace(view, objects=names, object_digests=digests))
+                views.append(replace(view, **made))
     return views
 
 
@@ -242,12 +226,6 @@ def _make_scene(
         if hard is not None:
             return hard
     return None
-
-
-def _scales(kind: SceneKind) -> tuple[float, float]:
-    """The range of scales of a scene's objects, wider than a benchmark's."""
-    low, high = PACKED_SCALE if kind.objects is SceneKind.PACKED else PILE_SCALE
-    return low * WIDER_SCALES[0], high * WIDER_SCALES[1]
 
 
 def _hard_view(
@@ -295,15 +273,13 @@ def ask(
         **seen,
     )
     support: SupportPlane | AutoPlane = _plane(noise) if around else EXACT_PLANE
-    low, high = observation.workspace.tolist()
-    workspace: Workspace | None = Workspace(min=tuple(low), max=tuple(high))
+    low, high = map(tuple, observation.workspace.tolist())
+    workspace: Workspace | None = Workspace(min=low, max=high)
     if around and choice.random() >= GIVEN_SHARE[kind]:
         support, workspace = AutoPlane(), None
     aimed = not open_table and choice.random() < AIMED_SHARE
     objects = _objects_of(simulation) if aimed else None
-    gripper = None
-    if simulation.gripper is not None:
-        gripper = GripperGeometry.model_validate(simulation.gripper)
+    fields = simulation.gripper
     request = DetectOptions(
         num_approach_points=BIN_APPROACH_POINTS if kind is SceneKind.BIN else APPROACH_POINTS,
         seed=int(choice.integers(2**32)),
@@ -313,7 +289,7 @@ def ask(
         approach_region=objects,
         contact_region=objects,
         collision=Collision(mode="penalise"),
-        gripper=gripper,
+        gripper=None if fields is None else GripperGeometry.model_validate(fields),
     )
     return Query(observation, request)
 

@@ -106,7 +106,12 @@ class Trainer:
             self.step += 1
             progress(self.step, loss)
             if self.step % self.options.evaluate_every == 0 or self.step == self.options.steps:
-                self._after_evaluation(self.evaluate(balls_per_view=8), loss)
+                evaluation = self.evaluate(balls_per_view=8)
+                if evaluation.loss < self.best_loss:
+                    self.best_loss = evaluation.loss
+                    self._save_average(self.metadata)
+                self._log(evaluation, loss)
+                self._save_state()
         self._save_state()
 
     def evaluate(self, balls_per_view: int | None = None) -> Evaluation:
@@ -253,13 +258,6 @@ class Trainer:
         mean[:known], std[:known] = self.network.mean[:known].cpu(), self.network.std[:known].cpu()
         self.network.set_statistics(torch.from_numpy(mean), torch.from_numpy(std))
         self.average.load_state_dict(self.network.state_dict())
-
-    def _after_evaluation(self, evaluation: Evaluation, train_loss: float) -> None:
-        if evaluation.loss < self.best_loss:
-            self.best_loss = evaluation.loss
-            self._save_average(self.metadata)
-        self._log(evaluation, train_loss)
-        self._save_state()
 
     def _save_average(self, metadata: CheckpointMetadata) -> None:
         """Write the running mean of the weights, for lengths in metres."""

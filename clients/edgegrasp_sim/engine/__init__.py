@@ -96,8 +96,7 @@ class HandModel:
     palm: Parts  # in the hand's frame
     fingers: tuple[Parts, Parts]  # that at y > 0 and the other, shut, each in its own frame
     finger_base: float  # metres along the hand's z to the fingers' frames
-    # Centre of mass of the finger at y > 0, in its frame, metres.
-    finger_centre: tuple[float, float, float]
+    finger_centre: tuple[float, float, float]  # of mass of the finger at y > 0, metres
     tip: float  # fingertips as they hold something, metres along z
     centre: tuple[float, float, float]  # the palm's centre of mass, hand frame, metres
     max_opening: float  # metres between the fingers
@@ -110,8 +109,7 @@ class HandModel:
     # How far the fingers are ahead of where they are in the open hand, metres: the coefficients of
     # 1, q, ..., q^4, where q is half the opening; None: they never are.
     advance: tuple[float, ...] | None = None
-    # PyBullet's own files with palm and finger; None: its parts are boxes.
-    meshes: tuple[str, str] | None = None
+    meshes: tuple[str, str] | None = None  # PyBullet's palm and finger; None: boxes
 
 
 @dataclass(frozen=True, slots=True)

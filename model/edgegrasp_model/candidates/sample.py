@@ -89,8 +89,7 @@ class Sampler:
         gripper: Gripper,
         crop_radius: float,  # of the balls, metres
         counts: dict[str, int],  # gets the candidates left after each constraint, over all rounds
-        # add centred hands: for networks whose input depends on the hand's position
-        centre: bool = False,
+        centre: bool = False,  # add centred hands: for networks that see hands, not edges
     ) -> None:
         """Share the approach points among the objects."""
         self.scene, self.options, self.gripper = scene, options, gripper
@@ -283,8 +282,7 @@ def allowed_directions(
     direction: Floats,  # (E, 3) unit, the hands' +z
     constraint: ApproachDirection | None,
     up: ArrayLike,  # (3,) unit, in the frame of `direction`
-    # maps the constraint's directions to the frame of `direction`
-    in_frame: Callable[[ArrayLike], Floats] = np.asarray,
+    in_frame: Callable[[ArrayLike], Floats] = np.asarray,  # of the cones
 ) -> Bools:
     """Which directions (E,) the hand may move in."""
     rise = direction @ np.asarray(up)
