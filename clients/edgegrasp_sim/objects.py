@@ -303,7 +303,6 @@ def _write_builtin(folder: Path) -> None:
 
 
 def _kept_in(name: str, write: Callable[[Path], None], cache: Path | None = None) -> Path:
-    """A folder in the cache, written when it is first asked for."""
     folder = (cache or cache_folder()) / name
     if folder.is_dir():
         return folder
@@ -380,7 +379,6 @@ def _read(mesh: Path) -> Any:
 
 
 def _convex_parts(surface: Any) -> list[Any]:
-    """Convex meshes that together fill a mesh."""
     import coacd
     import trimesh
 

@@ -170,7 +170,6 @@ def _key_figures(summary: dict[str, Any]) -> list[Row]:
 
 
 def _object_rows(summary: dict[str, Any]) -> Iterator[Row]:
-    """Each object, the one removed least often first."""
     yield "object", "present", "removed", "DR %", "aimed at", "held", "GSR %"
     objects = summary["objects_by_name"].items()
     for name, row in sorted(objects, key=lambda item: item[1]["removed"] / item[1]["present"]):

@@ -306,7 +306,6 @@ def over_seeds(rate: dict[str, Any]) -> str:
 def _rate(
     successes: NDArray[np.int64], trials: NDArray[np.int64], seeds: NDArray[np.int64]
 ) -> dict[str, Any]:
-    """A rate over all rounds, and of the rounds of each seed."""
     by_seed = {
         str(seed): _share(successes[seeds == seed], trials[seeds == seed])["value"]
         for seed in np.unique(seeds)

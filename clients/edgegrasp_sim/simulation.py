@@ -263,9 +263,9 @@ class ClutterSimulation:
         seen = depth < FARTHEST * CAMERA.far
         points = points_of(depth, T_world_camera, CAMERA)
         numbers = {item.body.uid: number for number, item in enumerate(self._objects)}
-        row = np.flatnonzero(
-            np.any([_inside(points, *bounds) for bounds in self.object_bounds], axis=0)
-        )
+        around = [(low - 0.003, high + 0.003) for low, high in self.object_bounds]
+        inside = [((points > low) & (points < high)).all(axis=1) for low, high in around]
+        row = np.flatnonzero(np.any(inside, axis=0))
         # From a little before what is seen to a little behind: shapes may be filled hollows.
         sight = points[row] - T_world_camera[:3, 3]
         sight *= 0.003 / np.linalg.norm(sight, axis=1, keepdims=True)
@@ -355,12 +355,6 @@ class ClutterSimulation:
         self.surroundings = surroundings
         self._obstacles = surroundings.add_to(self.world)
         return surroundings
-
-
-def _inside(points: Matrix, low: Matrix, high: Matrix) -> NDArray[np.bool_]:
-    """Which points (N, 3) lie in a box or within 3 mm of it."""
-    inside = (points > low - 0.003) & (points < high + 0.003)
-    return np.asarray(inside.all(axis=1))
 
 
 @cache

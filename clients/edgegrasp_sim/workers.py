@@ -106,7 +106,6 @@ def _run(made: bytes, task: Any) -> Any:
 
 @lru_cache(maxsize=1)
 def _runner(made: bytes) -> Callable[[Any], Any]:
-    """What a pickled factory makes, kept for the tasks that follow."""
     runner: Callable[[Any], Any] = pickle.loads(made)()
     return runner
 

@@ -376,7 +376,6 @@ class GraspDetector:
         return self.metadata.network.architecture == "hand"
 
     def _score(self, prepared: Prepared, sample: Sample) -> Scored:
-        """The network's logits of some candidates."""
         assert prepared.scene is not None
         if len(sample.candidates) == 0:
             return Scored(sample, np.empty(0, dtype=np.float32))

@@ -78,18 +78,12 @@ def _not_zero(value: tuple[float, ...]) -> tuple[float, ...]:
 
 
 UnitVector = Annotated[Vector, AfterValidator(_of_length_one)]
-
-
 Direction = Annotated[Vector, AfterValidator(_not_zero)]
-
-
 PixelPlace = Annotated[float, Field(ge=-0.5, le=100_000.0), numeric]
 Pixel = Annotated[
     tuple[PixelPlace, PixelPlace],
     Field(description="column, row; the centre of the top left pixel is (0, 0)"),
 ]
-
-
 Matrix = Annotated[tuple[Finite, ...], Field(min_length=16, max_length=16)]  # row by row
 Places = Annotated[tuple[Finite, ...], Field(max_length=3 * MAX_SURFACE)]  # x, y, z of each
 Quaternion = Annotated[
@@ -208,8 +202,6 @@ class Segments(Strict):
 
 
 Rows = Indices | Mask | Segments
-
-
 Shape = Annotated[Box | OrientedBox | Sphere | HalfSpace | Rows, Field(discriminator="kind")]
 
 
@@ -595,10 +587,6 @@ class Previous(Strict):
         return self
 
 
-def _mode_as_object(value: object) -> object:
-    return {"mode": value} if isinstance(value, str) else value
-
-
 def _one_of_one(value: object) -> object:
     """A list of one vector becomes that vector, so both are the same request."""
     if isinstance(value, (list, tuple)) and len(value) == 1 and isinstance(value[0], (list, tuple)):
@@ -625,10 +613,6 @@ def _kind_as_object(value: object) -> object:
     return {"kind": value} if isinstance(value, str) else value
 
 
-def _gripper_form(value: object) -> str:
-    return "name" if isinstance(value, str) else "inline"
-
-
 SupportKind = Literal["auto", "ransac", "none"]
 SupportRequest = Annotated[
     Annotated[SupportPlane, Tag("plane")]
@@ -645,7 +629,7 @@ class DetectOptions(Strict):
     gripper: (
         Annotated[
             Annotated[str, Tag("name")] | Annotated[GripperGeometry, Tag("inline")],
-            Discriminator(_gripper_form),
+            Discriminator(lambda value: "name" if isinstance(value, str) else "inline"),
         ]
         | None
     ) = Field(
@@ -730,7 +714,10 @@ class DetectOptions(Strict):
     )
     collision: Annotated[
         Collision,
-        BeforeValidator(_mode_as_object, json_schema_input_type=CollisionMode | Collision),
+        BeforeValidator(
+            lambda value: {"mode": value} if isinstance(value, str) else value,
+            json_schema_input_type=CollisionMode | Collision,
+        ),
     ] = Field(
         default=Collision(), description="collision checks of the hand; a mode alone is allowed"
     )

@@ -169,12 +169,13 @@ def _numbers(field: str, values: list[Any], holes: bool) -> Array:
 # What requests hold besides arrays, checked
 
 
-def _from_base64(value: object) -> object:
-    """JSON carries bytes as base64, gRPC as they are."""
-    return base64.b64decode(value, validate=True) if isinstance(value, str) else value
-
-
-Bytes = Annotated[bytes, BeforeValidator(_from_base64, json_schema_input_type=str)]
+Bytes = Annotated[  # as they are over gRPC, in base64 in JSON
+    bytes,
+    BeforeValidator(
+        lambda sent: base64.b64decode(sent, validate=True) if isinstance(sent, str) else sent,
+        json_schema_input_type=str,
+    ),
+]
 Size = Annotated[int, Field(ge=0, lt=2**31), numeric]
 
 

@@ -82,7 +82,6 @@ def _bowl(rng: Random) -> list[Part]:
 
 
 def _cup(rng: Random) -> list[Part]:
-    """A mug with one handle, sometimes two."""
     radius, height, wall = rng.uniform(0.03, 0.05), rng.uniform(0.05, 0.12), rng.uniform(3e-3, 5e-3)
     bottom = radius * rng.uniform(0.65, 1.0)
     parts = _shell([bottom, radius], [0.0, height], wall, rng.uniform(0.004, 0.008))
@@ -105,7 +104,6 @@ def _plate(rng: Random) -> list[Part]:
 
 
 def _glass(rng: Random) -> list[Part]:
-    """A tumbler, or a bowl on a stem."""
     radius, height = rng.uniform(0.025, 0.045), rng.uniform(0.07, 0.17)
     wall = rng.uniform(0.002, 0.004)
     if rng.random() < 0.65:
@@ -198,7 +196,6 @@ def _scissors(rng: Random) -> list[Part]:
 
 
 def _clamp(rng: Random) -> list[Part]:
-    """A G-clamp, lying: a bent frame, a spindle with a bar, and a pad."""
     reach, opening = rng.uniform(0.03, 0.08), rng.uniform(0.03, 0.11)
     bar, thick = rng.uniform(0.010, 0.018), rng.uniform(0.008, 0.015)
     side = opening / 2 + bar / 2
@@ -278,7 +275,6 @@ def _ring(rng: Random) -> list[Part]:
 
 
 def _frame(rng: Random) -> list[Part]:
-    """Four bars around an opening, lying."""
     x, y = rng.uniform(0.06, 0.28, size=2)
     bar, thick = min(rng.uniform(0.006, 0.03), 0.2 * min(x, y)), rng.uniform(0.006, 0.03)
     return _walls(x, y, thick, bar)

@@ -195,7 +195,6 @@ def _shelf(scene: SceneMeshes) -> None:
 
 
 def _fill(scene: SceneMeshes, heights: "HeightMap") -> None:
-    """Objects on a table: apart, touching, or in a heap."""
     rng = scene.rng
     how = str(rng.choice(["spread", "touching", "heap"], p=[0.45, 0.3, 0.25]))
     count = _count(rng, {"spread": 6, "touching": 9, "heap": 11}[how])
@@ -229,7 +228,6 @@ def _room(scene: SceneMeshes, floor: float, label: int = OTHER) -> None:
 
 
 def _aside(yaw: float, away: float) -> Float64:
-    """A place (2,) at a distance in a direction."""
     return away * np.array([np.cos(yaw), np.sin(yaw)])
 
 
@@ -280,7 +278,6 @@ def _distractors(scene: SceneMeshes, heights: "HeightMap") -> None:
 
 
 def _cable(rng: np.random.Generator, place: Float64) -> Mesh:
-    """A long bent tube on the support."""
     heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0.0, 0.18, 50))
     step = rng.uniform(0.012, 0.03)
     way = place + np.cumsum(step * np.stack([np.cos(heading), np.sin(heading)], 1), axis=0)
@@ -302,7 +299,6 @@ def _cable(rng: np.random.Generator, place: Float64) -> Mesh:
 
 
 def _add_arm(scene: SceneMeshes, share: float = 0.25) -> None:
-    """A robot that reaches into the picture."""
     rng = scene.rng
     if scene.arms and rng.random() < share:
         points, triangles = scene.arms[int(rng.integers(len(scene.arms)))]
@@ -483,5 +479,4 @@ def _turned(rng: np.random.Generator, drawn: PoolMesh, how: str) -> PoolMesh:
 
 
 def _turn(yaw: float) -> Float64:
-    """A rotation (3, 3) about z."""
     return Rotation.from_euler("z", yaw).as_matrix()

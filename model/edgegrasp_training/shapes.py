@@ -21,7 +21,7 @@ from edgegrasp_sim.objects import (
     write_object,
     write_parts,
 )
-from edgegrasp_training.household import Part, household_mesh
+from edgegrasp_training.household import household_mesh
 
 STRETCH = 1.35  # greatest factor along an axis; its inverse is the least
 MADE_SHARE = 0.5  # of a scene's objects that are computed
@@ -66,21 +66,14 @@ def household_objects(folder: Path, count: int, rng: np.random.Generator) -> Obj
     for number in range(count):
         family, parts = household_mesh(rng)
         name = f"{family}-{number:03d}"
-        volume, middle = (
-            np.array([_volume_of(part) for part in parts]),
-            [v.mean(0) for v, _ in parts],
-        )
-        centre = np.average(middle, axis=0, weights=volume)
+        corners = [vertices[faces].transpose(1, 0, 2) for vertices, faces in parts]
+        volume = [float((np.cross(a, b) * c).sum() / 6) for a, b, c in corners]
+        centre = np.average([v.mean(0) for v, _ in parts], axis=0, weights=volume)
         size = np.square(np.ptp(np.concatenate([v for v, _ in parts]), axis=0))
         inertia = np.diag(size.sum() - size) * OBJECT_MASS / 12  # of the box around it
         path = write_parts(name, parts, parts, centre, inertia, folder)
         models.append(ObjectModel(name, path))
     return ObjectSet("household", tuple(models))
-
-
-def _volume_of(part: Part) -> float:
-    a, b, c = part[0][part[1]].transpose(1, 0, 2)
-    return float((np.cross(a, b) * c).sum() / 6)
 
 
 def stretched(model: ObjectModel, factors: tuple[float, float, float], folder: Path) -> ObjectModel:

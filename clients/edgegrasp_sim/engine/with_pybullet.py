@@ -325,7 +325,6 @@ class PybulletHand(PybulletBody, Hand):
 
 
 def _hull(client: _Client, mesh: str, quaternion_xyzw: Vector) -> int:
-    """A collision shape: the convex hull of a mesh, turned."""
     shape = client.createCollisionShape(
         pybullet.GEOM_MESH, fileName=str(_MESHES / mesh), collisionFrameOrientation=quaternion_xyzw
     )
@@ -333,7 +332,6 @@ def _hull(client: _Client, mesh: str, quaternion_xyzw: Vector) -> int:
 
 
 def _boxes(client: _Client, parts: Parts) -> int:
-    """A collision shape: the boxes around some parts."""
     shape = client.createCollisionShapeArray(
         shapeTypes=[pybullet.GEOM_BOX] * len(parts),
         halfExtents=[(np.ptp(part, axis=0) / 2).tolist() for part in parts],
@@ -345,7 +343,6 @@ def _boxes(client: _Client, parts: Parts) -> int:
 
 
 def _projection(camera: Intrinsics) -> Matrix:
-    """OpenGL's projection matrix of a pinhole camera (row-major)."""
     matrix = np.zeros((4, 4))
     matrix[0, 0] = 2.0 * camera.focal_length / camera.width
     matrix[1, 1] = 2.0 * camera.focal_length / camera.height

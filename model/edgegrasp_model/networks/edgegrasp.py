@@ -55,22 +55,14 @@ class EdgeGraspNet(nn.Module):
         f2 = F.relu(self.conv2(f1, batch))  # (P, 64)
         f3 = F.relu(self.conv3(f2, batch))  # (P, 128)
         ball = self.ball_feature(torch.cat((f1, f2, f3), dim=1), batch)  # (B, 1024)
-        grasp = torch.cat((self._grasp_features(batch), f3[batch.contact]), dim=1)  # (E, 138)
+        contact, depth = batch.contact, batch.depth.unsqueeze(1)
+        own = batch.points[contact], batch.normals[contact], depth, batch.approach, f3[contact]
+        grasp = torch.cat(own, dim=1)  # (E, 138)
         join = SharedProduct(self.join.weight, self.join.bias, ball)
         classifier, logits = PackedMlp(self.classifier), []
-        for own, ball_of_edge in in_chunks(EDGE_ROWS, grasp, batch.ball_of_edge):
-            logits.append(classifier(join(own, ball_of_edge).relu_()))  # (e, 1)
+        for rows, ball_of_edge in in_chunks(EDGE_ROWS, grasp, batch.ball_of_edge):
+            logits.append(classifier(join(rows, ball_of_edge).relu_()))  # (e, 1)
         return torch.cat(logits).squeeze(1)[: len(grasp)]
-
-    def _grasp_features(self, batch: BallBatch) -> Tensor:
-        contact = batch.contact
-        parts = (
-            batch.points[contact],
-            batch.normals[contact],
-            batch.depth.unsqueeze(1),
-            batch.approach,
-        )
-        return torch.cat(parts, dim=1)
 
 
 class PointNetConv(nn.Module):

@@ -7,7 +7,7 @@ is the same whatever else is scored with it.
 from collections.abc import Callable, MutableMapping, Sequence
 from functools import cache
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -112,14 +112,11 @@ class PackedMlp:
 @cache
 def onednn_is_faster() -> bool:
     """Whether oneDNN multiplies about twice as fast as MKL: on AMD with AVX-512."""
-    ours = torch.backends.cpu.get_cpu_capability() == "AVX512" and "AMD" in _processor()
+    get: Any = getattr(torch.cpu, "get_capabilities", dict)  # newer PyTorch has it
+    amd = "AMD" in str(get().get("cpu_name", ""))
+    ours = torch.backends.cpu.get_cpu_capability() == "AVX512" and amd
     there = torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
     return ours and there and hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
-
-
-def _processor() -> str:
-    get = getattr(torch.cpu, "get_capabilities", None)  # newer PyTorch has it
-    return "" if get is None else str(get().get("cpu_name", ""))
 
 
 def float32_inference(values: Tensor) -> bool:
