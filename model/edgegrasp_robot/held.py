@@ -52,15 +52,13 @@ def held_by(grasp: Grasp, scene: Scene, gripper: Gripper) -> Held:
     return Held(own, points[~near])
 
 
-def can_leave(held: Held, scene: Scene, way: Float64, collision: Collision) -> bool:
-    """Whether what is held can go along a straight way without meeting anything seen.
-
-    Args:
-        held: What is held.
-        scene: Where it is.
-        way: (3,) metres, cloud frame.
-        collision: Obstacles beside the cloud.
-    """
+def can_leave(
+    held: Held,
+    scene: Scene,
+    way: Float64,  # (3,) metres, cloud frame
+    collision: Collision,  # obstacles beside the cloud
+) -> bool:
+    """Whether what is held can go along a straight way without meeting anything seen."""
     if not len(held.points):
         return True
     ends = np.concatenate([held.points, held.points + way])
@@ -114,14 +112,12 @@ def load_of(
     return Load(points, T_base_cloud @ T_cloud_box, half, below)
 
 
-def places_for(place: Place, load: Load, voxels: Float64) -> Iterator[Float64]:
-    """Poses T_base_box (4, 4) in which a load may be put, the middle of a region first.
-
-    Args:
-        place: Where it is to be.
-        load: What is put down.
-        voxels: (V, 3) base frame, what is seen around it; no place where the load would hold any.
-    """
+def places_for(
+    place: Place,
+    load: Load,
+    voxels: Float64,  # (V, 3) base frame, what is seen around it
+) -> Iterator[Float64]:
+    """Poses T_base_box (4, 4) in which a load meets none of the voxels, a region's middle first."""
     for pose in _places(place, load):
         off, half = load.above_its_foot
         around = np.abs(moved(np.linalg.inv(pose), voxels) - (0.0, 0.0, off))

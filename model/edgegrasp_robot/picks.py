@@ -49,12 +49,7 @@ NO_REACH = "no grasp is within the arm's reach; see counts."
 
 
 def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
-    """The options for the detection that `plan_picks` chooses from.
-
-    Raises:
-        InvalidRequest: The joints do not match the robot, or an option cannot be combined with an
-            arm.
-    """
+    """The options for the detection that `plan_picks` chooses from; raises InvalidRequest."""
     asked = options.robot
     assert asked is not None
     count = len(robot.joint_names)
@@ -86,30 +81,18 @@ def detect_picks(
 
 
 def plan_picks(
-    detection: Detection,
-    scene: Scene | None,
-    points: object,
-    options: DetectOptions,
+    detection: Detection,  # made with the options of `with_robot`
+    scene: Scene | None,  # the detection's; None: too little is left of the cloud
+    points: object,  # (..., 3) metres, the whole cloud as it was sent; NaN: no reading
+    options: DetectOptions,  # as they were sent
     robot: Robot,
-    until: float = float("inf"),
+    until: float = float("inf"),  # when to stop, on `time.monotonic()`
 ) -> Detection:
     """Plan the arm's way to grasps, and put reachable grasps first.
 
-    Args:
-        detection: The detection made with the options of `with_robot`.
-        scene: The detection's scene; None: too little is left of the cloud.
-        points: (..., 3) metres, the whole cloud as it was sent; NaN: no reading.
-        options: As they were sent.
-        robot: The robot that they name.
-        until: When to stop, on `time.monotonic()`.
-
-    Returns:
-        The detection with `top_k` grasps: those with a trajectory, then others within reach, then
-        those there was no time for, then those out of reach; the better ones first, and at like
-        scores the nearer ones.
-
-    Raises:
-        InvalidRequest: The arm collides where the options put it.
+    Returns the detection with `top_k` grasps: those with a trajectory, then others within reach,
+    then those there was no time for, then those out of reach; the better ones first, and at like
+    scores the nearer ones. InvalidRequest: the arm collides where the options put it.
     """
     asked = options.robot
     assert asked is not None

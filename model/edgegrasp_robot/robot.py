@@ -161,12 +161,7 @@ def load_robots(files: Sequence[Path]) -> dict[str, Robot]:
 
 
 def load_robot(name_or_path: str | Path) -> Robot:
-    """Load a shipped robot by name, or a user's own by path.
-
-    Raises:
-        InvalidRobot: A file or a frame is missing, a field is wrong, or the arm touches itself at
-            its home; names the file, the field and the fix.
-    """
+    """Load a shipped robot by name, or a user's own by path; InvalidRobot: file, field and fix."""
     path = Path(name_or_path)
     if path.suffix != ".toml":
         path = ROBOT_FOLDER / f"{path.name}.toml"  # settings turn names into paths
@@ -262,15 +257,13 @@ def _kinematics(
     }
 
 
-def touching(scene: core.Scene, model: Model, joints: Float64, around: Sequence[str] = ()) -> str:
-    """The pair that touches at joints (J,), in words; the scene cannot be used afterwards.
-
-    Args:
-        scene: The robot and its surroundings.
-        model: The robot's.
-        joints: A configuration in collision.
-        around: Names of the obstacles.
-    """
+def touching(
+    scene: core.Scene,  # the robot and its surroundings
+    model: Model,
+    joints: Float64,  # a configuration in collision
+    around: Sequence[str] = (),  # names of the obstacles
+) -> str:
+    """The pair that touches at joints (J,), in words; the scene cannot be used afterwards."""
     for row, link in enumerate(model.links):
         for other in (*around, *model.links[row + 1 :]):
             scene.setCollisions(link, other, False)

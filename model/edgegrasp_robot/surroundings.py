@@ -101,29 +101,16 @@ def carrying(
 @contextmanager
 def surrounded(
     robot: Robot,
-    scene: Scene,
-    points: object,
-    asked: RobotArm,
-    boxes: Sequence[Box | OrientedBox],
+    scene: Scene,  # what the camera's cloud shows
+    points: object,  # (..., 3) metres, cloud frame: the whole cloud
+    asked: RobotArm,  # where the robot is
+    boxes: Sequence[Box | OrientedBox],  # beside the cloud, cloud frame
 ) -> Iterator[Surroundings]:
-    """Add the surroundings to the robot's scenes, and remove them afterwards.
+    """Add the surroundings to the robot's scenes, and remove them afterwards; yields them.
 
     The hand may touch them in `robot.straight`, since the detection has checked it there.
-
-    Args:
-        robot: The robot.
-        scene: What the camera's cloud shows.
-        points: (..., 3) metres, cloud frame: the whole cloud.
-        asked: Where the robot is.
-        boxes: Obstacles beside the cloud, cloud frame.
-
-    Yields:
-        What it put there.
-
-    Raises:
-        StartCollision: The start is in collision.
-        InvalidRequest: The base stands inside an object, or what no camera saw is to be avoided
-            and no camera is known.
+    InvalidRequest: the start is in collision, the base stands inside an object, or what no camera
+    saw is to be avoided and no camera is known.
     """
     joints = np.array(asked.joints)
     T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
