@@ -40,11 +40,7 @@ logger = logging.getLogger(__name__)
 
 
 class SceneKind(StrEnum):
-    """How a scene is made.
-
-    Objects stood upright one by one (packed), dropped on a heap (pile) or into a bin, some or until
-    it is full, put on a table among larger ones, or into a compartment of a shelf.
-    """
+    """How a scene is made: upright, dropped on a heap or into a bin, on a table or a shelf."""
 
     PACKED = "packed"
     PILE = "pile"

@@ -275,8 +275,8 @@ def paired_difference(
 ) -> tuple[float, tuple[float, float]] | None:
     """Second ratio of sums minus the first, and its 95 % interval; None: a run has no counts.
 
-    Scenes are resampled (bootstrap), so that differences between scenes cancel out. Counts are (2,
-    S): of each run in each scene.
+    Scenes are resampled, so that differences between them cancel out. Counts (2, S): of run and
+    scene.
     """
     above, below = np.asarray(numerators, float), np.asarray(denominators, float)
     if (below.sum(axis=1) == 0).any():

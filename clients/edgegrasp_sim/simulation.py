@@ -94,10 +94,7 @@ class ObjectPlacement:
 
 
 class ClutterSimulation:
-    """Objects in their surroundings, a depth camera and a floating hand, or one on an arm.
-
-    Equal calls after equal seeds give equal results, whatever was simulated before.
-    """
+    """Objects, a camera and a hand; equal calls after equal seeds give equal results."""
 
     def __init__(
         self,
@@ -287,8 +284,8 @@ class ClutterSimulation:
     ) -> GraspResult:
         """Simulate a grasp, (4, 4) of the `panda_hand` link, and return to the scene as it was.
 
-        `shake` also shakes a held object. Unless `to_the_end`, the try ends once its outcome is
-        clear: twice as fast, with another outcome for 1 grasp in 100.
+        Unless `to_the_end`, it ends once its outcome is clear: twice as fast, another one for 1 in
+        100.
         """
         result = self._run(T_world_hand, to_the_end=to_the_end, shake=shake)
         self._restore_rest()

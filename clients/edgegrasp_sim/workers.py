@@ -32,11 +32,7 @@ def run_tasks(
     workers: int | None = None,  # at a time; 1: in this process; None: all cores
     ray: str | None = None,  # address of a cluster as of `ray.init`; `local` starts one
 ) -> Iterator[tuple[Task, Result]]:
-    """Do tasks whose results depend only on the task; yields them and their results as they finish.
-
-    If a worker dies, another does its task again. RuntimeError: workers keep dying, or there is no
-    such Ray cluster.
-    """
+    """Do tasks that depend on nothing else, again if a worker dies; yields them with results."""
     if workers is not None and workers < 1:
         raise ValueError(f"workers is {workers}; use at least 1")
     if ray is not None:

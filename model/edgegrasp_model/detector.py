@@ -154,9 +154,8 @@ class GraspDetector:
     def detect(self, cloud: object, options: DetectOptions | None = None) -> Detection:
         """Detect grasps in a cloud; an empty list is an answer whose counts and warnings say why.
 
-        The cloud is an (N, 3) float32 or float64 array, or (H, W, 3) with NaN holes, metres; or a
-        CloudInput. Its frame is the frame of the options and of the result. InvalidRequest names a
-        field, its value and the fix.
+        The cloud, metres, is (N, 3), or (H, W, 3) with NaN holes, or a CloudInput; options and
+        result are in its frame. InvalidRequest names a field, its value and the fix.
         """
         prepared = self.prepare(cloud, options or DetectOptions())
         return self.finish(prepared, self.evaluate(prepared))
@@ -260,10 +259,9 @@ class GraspDetector:
     ) -> Scoring:
         """Score the caller's edges or hand poses, in order (the paper's grasp evaluation function).
 
-        Options describe the scene, the hand and the obstacles. Regions, approach directions, and
-        options on sampling and selection have no effect. The hand of an edge that would cut into
-        the support plane is retracted where that helps, as in `detect`; given hand poses stay as
-        they are.
+        Regions, approach directions, and options on sampling and selection have no effect. The hand
+        of an edge that would cut into the support is retracted where that helps; given poses stay
+        as they are.
         """
         if (edges is None) == (hand_poses is None):
             value = "neither edges nor hand_poses" if edges is None else "edges and hand_poses"

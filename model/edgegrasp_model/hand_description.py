@@ -70,11 +70,7 @@ def describe_hands(
     view: HandView,  # of the same candidates
     size: int,  # numbers that the network reads; the extents, which come last, may be skipped
 ) -> Float32:
-    """The hand-frame description of candidates, (E, HAND_DESCRIPTION_SIZE) or less the extents.
-
-    Counts (logarithm of 1 + n), metres and cosines. With several cameras, only the space that none
-    of them saw is described.
-    """
+    """The description (E, F) of candidates: log(1 + counts), metres and cosines."""
     cloud, up, hands = around.cloud, around.up, candidates.T_cloud_hand
     side, ends = around.mirror_sides(hands), seen_part(gripper)
     mirrored = hands[:, :3, :3].copy()

@@ -71,9 +71,7 @@ def extents_between(
 ) -> Float32:
     """Least and greatest y (E, 2) of the points between the pads of hands; (inf, -inf): none.
 
-    Points are (N, 3), and `rows` (P,) those to look at: of hand e, T_cloud_hand (E, 4, 4), the
-    places first[e] to last[e]. `pads` (2, 2) are least and greatest x and z of the pads, hand
-    frame.
+    Hand e looks at rows first[e] to last[e]; `pads` are least and greatest x and z, hand frame.
     """
     turn, shift = _to_hand(T_cloud_hand)
     extent = np.empty((len(turn), 2), dtype=np.float32)
@@ -100,12 +98,11 @@ def distance_behind(
 def non_max_suppression(
     T_cloud_tcp: Float32, order: Int64, near: float, angle: float, most: int
 ) -> tuple[Int64, Int64]:
-    """Non-maximum suppression: keep the first of each group of near duplicates, `most` at most.
+    """Keep the first of each group of near duplicates in `order` (M,), `most` at most.
 
-    Those are within `near` metres of each other, T_cloud_tcp (E, 4, 4), and `angle` radians; a hand
-    and the same hand turned by 180 degrees about its approach count as one. `order` (M,) are rows,
-    the best first. Returns the rows kept, in order, and the rows dropped as duplicates of one of
-    them.
+    Those are within `near` metres of each other, T_cloud_tcp (E, 4, 4), and `angle` radians; half a
+    turn about the approach counts as none. Returns the rows kept, in order, and the duplicates
+    dropped.
     """
     turn = np.ascontiguousarray(T_cloud_tcp[:, :3, :3])
     place = np.ascontiguousarray(T_cloud_tcp[:, :3, 3])

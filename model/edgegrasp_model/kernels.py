@@ -96,10 +96,7 @@ def columns_of(points: Float32) -> Float32:
 
 
 def compiled(*freedom: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Compile a function on its first call, and cache it on disk if possible.
-
-    `freedom` is what the compiler may change in float arithmetic, LLVM's fast-math flags.
-    """
+    """Compile on the first call, cached on disk; `freedom` is LLVM's fast-math flags."""
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": set(freedom)}
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -44,8 +44,8 @@ def select(
 ) -> tuple[Int64, NDArray[np.int8]]:
     """Order the scored candidates, drop low scores and near duplicates, keep the first top_k.
 
-    By score; but the best good grasp of each object comes before the second grasp of any. Returns
-    the rows to return, best first, and the outcome of each candidate: (E,) codes.
+    The best good grasp of each object comes before the second of any. Returns the rows to return,
+    best first, and codes (E,) of the outcomes.
     """
     hands = sample.candidates.T_cloud_hand
     T_cloud_tcp = hands @ gripper.T_hand_tcp
@@ -129,11 +129,7 @@ def grasps_in_cloud(
 
 
 def openings(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> tuple[Float32, Bools]:
-    """Opening (E,) to approach with, metres, and whether the far side is hidden (E,).
-
-    The opening is the visible extent between the fingers, and clearance; the gripper's maximum if
-    no camera saw where the object ends on the side of a finger.
-    """
+    """Opening (E,) to approach with, metres, the maximum if the far side is hidden (E,)."""
     met = met_first(hand_views(scene.cloud, T_cloud_hand, gripper), gripper)
     width = required_openings(met, gripper)
     hidden = _far_side_hidden(scene, T_cloud_hand, met, gripper)

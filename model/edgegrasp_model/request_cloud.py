@@ -60,8 +60,7 @@ def decode_cloud(
 ) -> tuple[CloudInput, DetectOptions]:
     """Decode the cloud of a request, one of SOURCES, and its per-point arrays, any of PER_POINT.
 
-    Also returns the options, in which the cameras of depth images are the viewpoints. Raises
-    InvalidRequest, PayloadTooLarge or UnsupportedMediaType.
+    Also returns the options, in which the cameras of depth images are the viewpoints.
     """
     source = _source(fields)
     if source == "depth_images":
@@ -119,9 +118,8 @@ def decode_points(points: object, max_points: int) -> Array:
 def decode_array(field: str, value: object, max_points: int) -> Array:
     """Read an array: packed numbers, an .npy or .png file, or lists.
 
-    Returns from bytes (N, 3) float32 or (N,) int32, as PACKED says; from lists int64 if all numbers
-    are whole, else float64; from a file whatever it contains. Raises InvalidRequest or
-    PayloadTooLarge.
+    From bytes (N, 3) float32 or (N,) int32, as PACKED says; from lists int64 if all numbers are
+    whole, else float64; from a file whatever it contains.
     """
     if isinstance(value, File):
         read = read_png if value.format == "png" else read_npy

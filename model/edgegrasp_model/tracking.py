@@ -89,11 +89,7 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
 
 
 def follow(scene: Scene, previous: Previous, given: bool) -> tuple[Scene, Followed]:
-    """Find the objects of an earlier answer again, and give their points their numbers.
-
-    Without a search, all points of the scene belong to one object. `given`: the caller gave the
-    objects' numbers.
-    """
+    """Find the objects of an earlier answer again; `given`: the caller gave their numbers."""
     points, number = scene.points_in_cloud, scene.object_of_point
     seen = np.flatnonzero(number >= 0)
     cloud = Surface(
@@ -220,11 +216,10 @@ class Surface(NamedTuple):
 
 
 def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
-    """An object's motion (4, 4) T_now_before, and the share of its points found at the new pose.
+    """An object's motion (4, 4) T_now_before, and the share of its points (K, 3) found there.
 
-    Iterative closest points (ICP), mostly across the surface; distances along it count only where
-    an object ends. Motions between two images are small, so it starts at the old pose. `before` (K,
-    3) are points on its surface.
+    Iterative closest points (ICP), mostly across the surface, from the old pose; distances along it
+    count only where an object ends.
     """
     T = np.eye(4)
     if len(before) < FEWEST or len(cloud.points) < FEWEST:

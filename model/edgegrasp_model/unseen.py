@@ -161,10 +161,9 @@ def visible_extents(
 ) -> Float32:
     """The visible size of the object between the fingers, and how far it extends beyond them.
 
-    Returns (E, NUM_EXTENTS) metres: beyond the inner face of each finger along the closing line,
-    first of the whole object, then of what is as wide as three pads and not behind the palm; along
-    x and along -x; ahead of the fingertips and behind the palm; the object's length, width and
-    height, the first two from the spread of its points.
+    Metres (E, NUM_EXTENTS): beyond each finger, of the whole object, then of what is as wide as
+    three pads and before the palm; along x and -x; ahead of the tips, behind the palm; length,
+    width, height.
     """
     number = np.zeros(len(points), dtype=np.int64) if number is None else number
     labels, groups = np.unique(number[contact_index], return_inverse=True)

@@ -103,11 +103,7 @@ def generate(
     workers: int | None = 1,  # how many scenes at a time, and
     ray: str | None = None,  # address of a Ray cluster, see `run_tasks`; views come back
 ) -> Iterator[tuple[int, int, int]]:
-    """Generate the scenes that are missing, in any order; workers do not change the result.
-
-    Yields the index of each finished scene, the grasps tried in it and those that held. ValueError:
-    the folder holds views of another engine.
-    """
+    """Generate the missing scenes; yields each one's index, grasps tried, and grasps that held."""
     folder.mkdir(parents=True, exist_ok=True)
     found: dict[str, Any] = {"engine": choose_engine(options.engine)}
     if options.weights is not None:  # other machines find it there too
@@ -259,8 +255,8 @@ def ask(
 ) -> Query:
     """Look at the scene, and request grasps as a benchmark does, around fewer points.
 
-    In bins, on tables and in some of the other views the cloud holds all that the camera sees, and
-    the support is given, not quite where it is, or has to be found.
+    In bins, on tables and in some other views the cloud holds all that the camera sees, and the
+    support is given, not quite where it is, or has to be found.
     """
     noise, choice = streams[NOISE_STREAM], streams[CHOICE_STREAM]
     open_table = kind in (SceneKind.PACKED, SceneKind.PILE)
@@ -405,11 +401,9 @@ def _chosen(
     rng: np.random.Generator,
     hard: bool,
 ) -> Int64:
-    """Ascending rows of the candidates to try, `total` at most.
+    """Ascending rows of the candidates to try, `total` at most, fewer if the best one is sure.
 
-    Some that a network would execute, as many whose outcome it leaves open, and the rest at
-    random, mostly collision-free. Fewer where the best one is sure to hold, unless the scene is
-    known to be hard.
+    Some that a network would execute, as many whose outcome it leaves open, the rest at random.
     """
     left = np.ones(len(sample.candidates), dtype=bool)
     guided = 0

@@ -52,9 +52,8 @@ def prepare_to_train(network: nn.Module) -> None:
 def start_from(network: nn.Module, start: nn.Module) -> int:
     """Copy a trained network's weights into one to train; a hand network may read more numbers.
 
-    Additional numbers start with weight 0, so both networks score alike. Returns how many numbers
-    of the hand description `start`, which takes lengths in metres, reads; 0 for networks of balls.
-    ValueError: the networks differ in more than that.
+    Additional numbers start with weight 0. Returns how many `start`, which takes lengths in metres,
+    reads; 0 for networks of balls. ValueError: the networks differ in more than that.
     """
     weights, known = in_units(start).state_dict(), 0
     if isinstance(network, HandNet) and isinstance(start, HandNet):

@@ -202,11 +202,7 @@ def evaluate(network: SceneNet, images: SceneImages, limit: int = 200) -> dict[s
 
 
 def fit_confidence(network: SceneNet, images: SceneImages) -> list[float]:
-    """Logistic regression from `instance_traits` to whether a found instance is an object.
-
-    An instance counts as an object if most of its pixels belong to one; `up` is known for every
-    second image.
-    """
+    """Logistic regression from `instance_traits` to whether most of an instance is an object."""
     traits, right = [], []
     for row in range(len(images)):
         image, points = images[row], image_points(images[row])

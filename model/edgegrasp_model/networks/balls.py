@@ -21,11 +21,7 @@ def nearest_in_ball(
     crop: BallCrop,
     k: int = 16,
 ) -> Int64:
-    """Rows (P, k) of `crop.ball_rows`: the k nearest in the same ball, the point itself first.
-
-    Where a ball holds fewer than k points, the own row fills the rest, which changes no maximum
-    over neighbours. Source: paper section IV (its PointNet++ graph of 16 nearest).
-    """
+    """Rows (P, k) of `crop.ball_rows`: the k nearest in the same ball, itself first (paper, IV)."""
     centre = points[np.asarray(approach_index, dtype=np.int64)[crop.ball_of_point]]
     centred = points[crop.ball_rows] - centre
     bounds = np.searchsorted(crop.ball_of_point, np.arange(len(approach_index) + 1))
@@ -34,10 +30,7 @@ def nearest_in_ball(
 
 @dataclass(frozen=True)
 class BallBatch:
-    """The input of a ball network: the balls and edge grasps of one cloud, or of several.
-
-    P ball points in `num_balls` balls, E edge grasps. Metres; every ball in the axes of its cloud.
-    """
+    """P points in `num_balls` balls of one cloud or several, E edge grasps; metres."""
 
     points: Tensor  # (P, 3) float32, centred on their own ball's approach point
     normals: Tensor  # (P, 3) float32

@@ -17,11 +17,7 @@ _LAYERS = {"conv_widths": 3, "global_widths_1": 3, "global_widths_2": 2}
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class NetworkConfig:
-    """Shape of a network; a smaller network is another config of the same class.
-
-    Widths count channels; in `vn-edgegrasp` a channel is a 3-vector. The paper's networks read
-    balls of points, `hand` the points around the fingers of each hand.
-    """
+    """Shape of a network; widths count channels, which are 3-vectors in `vn-edgegrasp`."""
 
     architecture: Architecture
     conv_widths: tuple[Count, ...] = ()  # the three graph convolutions
@@ -93,11 +89,7 @@ HAND = NetworkConfig(
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class CheckpointMetadata:
-    """Metadata of a checkpoint.
-
-    `save_checkpoint` fills in `tensors_digest` and `reference_logits`, which `load_checkpoint`
-    checks; it fills in the file's `digest`. Digests are SHA-256, in hex.
-    """
+    """Metadata of a checkpoint; saving and loading fill in and check digests, SHA-256 in hex."""
 
     name: str  # the model's name, such as `edgegrasp-plus`
     network: NetworkConfig

@@ -71,9 +71,8 @@ def import_checkpoint(
 ) -> tuple[nn.Module, CheckpointMetadata]:
     """Read a checkpoint in the authors' layout; with a `std` file it is a VN network.
 
-    The folder holds the files of one checkpoint number N. Voxel size and crop radius, metres, are
-    by default those of the authors' evaluation. Returns what `save_checkpoint` takes;
-    InvalidCheckpoint: a file is missing, is more than tensors, or does not fit.
+    Voxel size and crop radius, metres, are those of the authors' evaluation. Returns what
+    `save_checkpoint` takes; InvalidCheckpoint: a file is missing, or does not fit.
     """
     number = _checkpoint_number(directory)
     is_vn = (directory / f"std-ckpt-{number}.pt").exists()
