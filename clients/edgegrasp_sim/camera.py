@@ -76,12 +76,9 @@ EVALUATION_VIEWS = ViewRange((0.6, 0.75), (np.pi / 4, np.pi / 3), (0.0, np.pi))
 def look_at(eye: Matrix, target: Matrix) -> Matrix:
     """Pose T_world_camera (4, 4) at `eye` that looks at `target` with world z up in the image.
 
-    Camera axes: x to the right of the image, y down, z along the line of sight. Where that is
-    vertical, the image's x is the world's. Raises ValueError where eye and target coincide.
+    Camera axes: x right, y down, z along the line of sight; where that is vertical, x is world x.
     """
     sight = np.asarray(target, dtype=np.float64) - eye
-    if np.linalg.norm(sight) < 1e-9:
-        raise ValueError(f"cannot look from {eye} at {target}: choose two different points")
     right = np.cross(sight, (0.0, 0.0, 1.0))
     if np.linalg.norm(right) < 1e-9:
         right = np.array([1.0, 0.0, 0.0])

@@ -97,10 +97,6 @@ class ObjectSet:
     name: str  # what to call the set in a report
     models: tuple[ObjectModel, ...]  # at least one, in an order that is the same on every machine
 
-    def __post_init__(self) -> None:
-        if not self.models:
-            raise ValueError(f"object set {self.name!r} is empty; pass at least one object")
-
     @property
     def digest(self) -> str:
         """SHA-256 of the names, scales and files of the objects, in hex."""

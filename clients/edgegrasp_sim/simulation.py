@@ -177,8 +177,6 @@ class ClutterSimulation:
     ) -> int:
         """Make a new scene at rest; returns how many objects are there."""
         kind = SceneKind(scene)
-        if num_objects < 1:
-            raise ValueError(f"num_objects is {num_objects}; ask for at least 1")
         objects = self.object_sets.get(kind)
         if objects is None:
             raise ValueError(f"no object set for scene {kind.value!r}; pass one in `objects`")

@@ -111,8 +111,6 @@ class RoundDriver:
         seed: int,
         index: int,
     ) -> None:
-        if seed < 0 or index < 0:
-            raise ValueError(f"seed is {seed} and index {index}; pass numbers of 0 or more")
         self.simulation, self.protocol = simulation, protocol
         self._camera = random_stream(seed, index, Stream.CAMERA)
         self._noise = random_stream(seed, index, Stream.NOISE)

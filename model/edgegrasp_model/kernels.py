@@ -9,7 +9,6 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
 
@@ -17,13 +16,6 @@ ROUNDING = 1e-4  # share of a squared distance; a generous bound of float32 erro
 STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it
 JACOBI_SWEEPS = 6  # rounds of Jacobi's method for a symmetric 3 x 3 matrix; more change nothing
 DIAGONAL = 1e-12  # off-diagonal sum, as a share of the trace, at which Jacobi's method stops
-
-
-def least_spread(points: Float32 | Float64, rows: NDArray[np.integer]) -> Float32:
-    """Unit direction (M, 3), either sign, in which points (N, 3) of rows (M, K) spread least."""
-    direction = np.empty((len(rows), 3), dtype=np.float32)
-    _least_spread(points.astype(np.float32), rows.astype(np.int64), direction)
-    return direction
 
 
 def nearest_in_groups(points: Float32, bounds: Int64, k: int) -> Int64:
@@ -111,8 +103,9 @@ def compiled(*freedom: str) -> Callable[[Callable[..., Any]], Callable[..., Any]
 
 
 @compiled("contract")
-def _least_spread(points: Float32, rows: Int64, direction: Float32) -> None:
-    count = rows.shape[1]
+def least_spread(points: Float32, rows: Int64) -> Float32:
+    """Unit direction (M, 3), either sign, in which points (N, 3) of rows (M, K) spread least."""
+    count, direction = rows.shape[1], np.empty((len(rows), 3), np.float32)
     around, spread, axes = np.empty((count, 3)), np.empty((3, 3)), np.empty((3, 3))
     for m in range(len(rows)):
         for d in range(3):
@@ -139,6 +132,7 @@ def _least_spread(points: Float32, rows: Int64, direction: Float32) -> None:
             least = d if spread[d, d] < spread[least, least] else least
         for d in range(3):
             direction[m, d] = axes[d, least]
+    return direction
 
 
 @compiled("contract")

@@ -281,7 +281,8 @@ def statistical_outlier_removal(near: Neighbors) -> Bools:
 
 def estimate_normals(points: Float32, near: Neighbors) -> Float32:
     """Unit normals (N, 3) of points (N, 3), of either sign: the direction of least variance."""
-    return least_spread(points, near.row)
+    normals: Float32 = least_spread(points, near.row)
+    return normals
 
 
 def orient_normals(points: Float32, normals: Float32, viewpoint: Float32) -> Float32:
