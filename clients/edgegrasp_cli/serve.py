@@ -44,9 +44,15 @@ def serve(
     if print_config:
         print(loaded.model_dump_json(indent=2))
         return
-    from edgegrasp_service.server import run
+    from edgegrasp_service.worker.pool import launch
 
-    run(loaded)
+    nursery, control = launch(loaded)  # it loads while this process imports the rest
+    try:
+        from edgegrasp_service.server import run
+
+        run(loaded, (nursery, control))
+    finally:
+        nursery.kill()
 
 
 def view(

@@ -33,7 +33,7 @@ from edgegrasp_service.observability import LogQueue, Metrics, log_call, start_l
 from edgegrasp_service.recording import Recorder, check_outcomes
 from edgegrasp_service.security import ServerTls, load_tokens
 from edgegrasp_service.settings import UNIX, Settings
-from edgegrasp_service.worker.pool import NURSERY, WorkerPool
+from edgegrasp_service.worker.pool import Launched, WorkerPool
 from edgegrasp_service.worker.process import PIECE
 
 logger = logging.getLogger(__name__)
@@ -56,12 +56,13 @@ class Server:
         self,
         settings: Settings,
         observers: Sequence[Observer] = (),
-        nursery: Sequence[str] = NURSERY,
+        nursery: Sequence[str] = (),
+        launched: Launched | None = None,
     ) -> None:
         self._settings = settings
         self._tls = ServerTls(settings) if settings.tls_certificate else None
         self.metrics = Metrics(lambda: self.pool.models)
-        self.pool = WorkerPool(settings, nursery, self.metrics.workers_replaced.inc)
+        self.pool = WorkerPool(settings, nursery, self.metrics.workers_replaced.inc, launched)
         self._recorder: Recorder | None = None
         self.service = GraspService(
             settings,
@@ -205,8 +206,10 @@ class _LoopErrors:
             logger.error("%s (%s)", context["message"], error)
 
 
-def run(settings: Settings) -> None:
+def run(settings: Settings, launched: Launched | None = None) -> None:
     """Serve until SIGTERM or SIGINT; prints one line with both addresses when ready.
+
+    `launched` is a nursery that loads already.
 
     Raises:
         AddressInUse: A port cannot be bound.
@@ -214,12 +217,14 @@ def run(settings: Settings) -> None:
     """
     with contextlib.closing(start_logging(settings, sys.stderr)) as log:
         warn(settings)
-        asyncio.run(_serve_until_signalled(settings, log))
+        asyncio.run(_serve_until_signalled(settings, log, launched))
 
 
-async def _serve_until_signalled(settings: Settings, log: LogQueue) -> None:
+async def _serve_until_signalled(
+    settings: Settings, log: LogQueue, launched: Launched | None
+) -> None:
     stop = asyncio.Event()
-    server = Server(settings)
+    server = Server(settings, launched=launched)
     server.metrics.watch("log_lines_dropped", "log lines not written", lambda: log.dropped)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -12,7 +12,7 @@ import time
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeAlias
 
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import HarmfulRequest, InvalidSettings, WorkerLost, kind_of
@@ -47,6 +47,17 @@ RETRY_SECONDS = 1.0  # seconds after a worker or the nursery failed to start
 
 logger = logging.getLogger(__name__)
 
+Launched: TypeAlias = tuple[subprocess.Popen[bytes], socket.socket]  # and the socket to it
+
+
+def launch(settings: Settings, command: Sequence[str] = ()) -> Launched:
+    """Start the nursery, which loads meanwhile; `command` replaces NURSERY."""
+    control, theirs = socket.socketpair()
+    with theirs:
+        environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
+        command = [*(command or NURSERY), settings.model_dump_json()]
+        return subprocess.Popen(command, stdin=theirs.fileno(), env=environment), control
+
 
 class WorkerPool:
     """Runs each job in a worker process of its own."""
@@ -54,12 +65,14 @@ class WorkerPool:
     def __init__(
         self,
         settings: Settings,
-        nursery: Sequence[str] = NURSERY,
+        nursery: Sequence[str] = (),
         replaced: Callable[[], None] = lambda: None,
+        launched: Launched | None = None,
     ) -> None:
         self._settings = settings
         self._nursery_command = nursery
         self._replaced = replaced
+        self._launched = launched
         self.models: list[dict[str, Any]] = []  # facts of loaded weights; empty before `start`
         self.robots: list[dict[str, Any]] = []
         self.size = settings.workers or len(os.sched_getaffinity(0))
@@ -92,7 +105,9 @@ class WorkerPool:
         Raises:
             EdgeGraspError: Weights cannot be used.
         """
-        nursery = await _Nursery.start(self._nursery_command, self._settings)
+        launched = self._launched or launch(self._settings, self._nursery_command)
+        self._launched = None
+        nursery = await _Nursery.start(*launched)
         workers = [_Worker(nursery) for _ in range(self.size)]
         try:
             await asyncio.gather(*(worker.start() for worker in workers))
@@ -221,13 +236,8 @@ class _Nursery:
         self._crashed = defaultdict(asyncio.get_running_loop().create_future)
 
     @classmethod
-    async def start(cls, command: Sequence[str], settings: Settings) -> "_Nursery":
-        """Start it and wait until it has loaded; raises InvalidSettings on failure."""
-        control, theirs = socket.socketpair()
-        with theirs:
-            environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
-            command = [*command, settings.model_dump_json()]
-            process = subprocess.Popen(command, stdin=theirs.fileno(), env=environment)
+    async def start(cls, process: subprocess.Popen[bytes], control: socket.socket) -> "_Nursery":
+        """Wait until it has loaded; raises InvalidSettings on failure."""
         nursery = cls(process, control)
         try:
             ready = await asyncio.to_thread(receive, control.makefile("rb"))
