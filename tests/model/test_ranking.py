@@ -2,35 +2,13 @@ import numpy as np
 import pytest
 import torch
 
-from edgegrasp_model.candidates.collision import FINGER_CLEARANCE, collides
+from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import Collision, parse_options
-from edgegrasp_model.ranking import openings
 
 from .scenes import PANDA, TINY, box_on_table, scene_of
-
-
-@pytest.mark.parametrize(
-    ("camera", "opening", "hidden"),
-    [
-        ((1.0, 0.0, 0.1), 2 * (0.015 + FINGER_CLEARANCE), False),  # sees past both sides
-        ((0.0, 1.0, 0.1), PANDA.max_opening, True),  # sees the side of one finger alone
-        (None, 2 * (0.015 + FINGER_CLEARANCE), False),  # nothing is known to be hidden
-    ],
-)
-def test_a_hand_opens_fully_where_the_far_side_is_hidden(camera, opening, hidden) -> None:
-    along, height = np.meshgrid(np.arange(-0.015, 0.0155, 0.003), np.arange(0.09, 0.13, 0.003))
-    flat = np.zeros_like(along)
-    # A plate that faces the camera: across the closing direction y, or along it.
-    axes = (along, flat + 0.015, height) if camera and camera[1] else (flat, along, height)
-    points = np.stack(axes, axis=-1).reshape(-1, 3).astype(np.float32)
-    viewpoints = None if camera is None else np.array([camera], dtype=np.float32)
-    scene = scene_of(points, viewpoints=viewpoints)
-    width, far_side_hidden = openings(scene, np.eye(4, dtype=np.float32)[None], PANDA)
-    np.testing.assert_allclose(width, opening, atol=1e-6)
-    assert far_side_hidden == hidden
 
 
 @pytest.mark.parametrize(
