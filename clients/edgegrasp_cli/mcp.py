@@ -193,20 +193,14 @@ class _Tools:
 
     def edgegrasp_server_info(self) -> str:
         """The weights that the option `model` can name, the robots, and the gripper of each."""
-        names = ("name", "architecture", "gripper", "default", "device")
-        models = [[getattr(one, name) for name in names] for one in self._client.models()]
+        facts = ("name", "architecture", "gripper", "default", "device")
+        models = [{name: getattr(one, name) for name in facts} for one in self._client.models()]
+        of_arm = ("name", "gripper", "base_frame", "joint_names")
         robots = [
-            {
-                "name": robot.name,
-                "gripper": robot.gripper,
-                "base_frame": robot.base_frame,
-                "joint_names": robot.joint_names,
-                "home": _digits(robot.home, 4),
-            }
-            for robot in self._client.robots()
+            {name: getattr(one, name) for name in of_arm} | {"home": _digits(one.home, 4)}
+            for one in self._client.robots()
         ]
-        told = [dict(zip(names, model, strict=True)) for model in models]
-        return json.dumps({"models": told, "robots": robots})
+        return json.dumps({"models": models, "robots": robots})
 
     def _image(
         self, name: str, intrinsics: list[float], scale: float | None, pose: Matrix | None
