@@ -8,7 +8,7 @@ frame, except for `moveit_msgs/Grasp`, which has the end effector's parent link.
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from edgegrasp_camera.clouds import read_point_cloud2
 from edgegrasp_camera.depth import intrinsics_of, metres, unproject
 from edgegrasp_camera.picture import fork
 from edgegrasp_client import (
-    DepthImage,
     Detection,
     Grasp,
     GraspClient,
@@ -219,10 +218,9 @@ def detect(
         ValueError: There is no message to detect in, or one that cannot be read.
         InvalidRequest: A cloud or an image does not match its fields.
     """
-    header = scene.header
-    if header is None and object_cloud is not None:
+    if scene.header is None and object_cloud is not None:
         scene, object_cloud = Scene(cloud=object_cloud), None
-        header = scene.header
+    header = scene.header
     if header is None:
         raise ValueError("No cloud and no depth image has come yet.")
     frame_id, stamp = header.frame_id, header.stamp
@@ -231,18 +229,15 @@ def detect(
         asked = dict(on_mask(image_array(scene.mask), asked))
     if asked.get("robot"):
         asked["robot"] = _robot(client, asked["robot"], scene, lookup)
-    cloud: Any = scene.cloud
+    cloud, segment_ids, images = scene.cloud, None, None
     if object_cloud is not None:
         T = lookup(frame_id, object_cloud.header.frame_id, stamp)
         wanted = cloud_points(object_cloud) @ T[:3, :3].T + T[:3, 3]
         around = cloud_points(cloud) if cloud is not None else _depth_points(scene)
         cloud, segment_ids = object_in_scene(wanted, around)
         asked.setdefault("viewpoint", [0.0, 0.0, 0.0])
-        found = client.detect(cloud, segment_ids=segment_ids, **cast("DetectOptions", asked))
-    elif cloud is not None:
-        found = client.detect(cloud, **cast("DetectOptions", asked))
-    else:
-        images: list[DepthImage] = [
+    elif cloud is None:
+        images = [
             {
                 "depth": depth_array(depth),
                 "intrinsics": camera_matrix(camera),
@@ -250,7 +245,8 @@ def detect(
             }
             for depth, camera in ((scene.depth, scene.camera), *scene.others)
         ]
-        found = client.detect(depth_images=images, **cast("DetectOptions", asked))
+    given: Any = asked | {"segment_ids": segment_ids, "depth_images": images}
+    found = client.detect(cloud, **given)
     if tracker is not None:
         tracker.take(found)
     target = settings.target_frame or frame_id
