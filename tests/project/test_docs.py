@@ -1,6 +1,7 @@
 """The pages name what there is, their blocks run, and they make a site that needs no network."""
 
 import contextlib
+import hashlib
 import importlib.util
 import io
 import json
@@ -22,6 +23,7 @@ from tests.programs import EDGEGRASP, run
 
 from edgegrasp_cli.flags import TOKEN_VARIABLE
 from edgegrasp_cli.main import load_command
+from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_service.errors import STATUS, kind_of
 from edgegrasp_service.settings import Settings
@@ -188,6 +190,18 @@ def test_the_commands_of_the_start_pages_run_as_they_stand(tmp_path: Path) -> No
                 assert min(picture.size) > 300
             detected.add(shown)
     assert detected
+
+
+def test_the_results_say_which_weights_they_are_of() -> None:
+    files = {path.stem: path for path in WEIGHTS_FOLDER.glob("*.safetensors")}
+    files["scene"] = WEIGHTS_FOLDER.parent / "scene" / "network.safetensors"
+    shipped = {n: hashlib.sha256(file.read_bytes()).hexdigest()[:8] for n, file in files.items()}
+    tables = re.findall(r"(?:^\|.*\n)+(?:(?!\||#).*\n)*", PAGES["results.md"], re.MULTILINE)
+    lines = [re.search(r"^Weights: (.*)$", table, re.MULTILINE) for table in tables]
+    assert lines.count(None) == 1  # the figures of others
+    for line in (found[1] for found in lines if found):
+        for name, digest in re.findall(r"([\w-]+) `(\w{8})`", line):
+            assert shipped[name] == digest or f"{name} `{digest}` (not those shipped)" in line
 
 
 def test_the_site_is_built_without_a_warning_and_asks_nobody(tmp_path: Path) -> None:
