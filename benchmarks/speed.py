@@ -1,7 +1,7 @@
 """Measure speed: `python -m benchmarks.speed` writes speed.json.
 
 Most times are processor seconds on one thread, medians of interleaved runs: they hold on a busy
-machine too. Networks have random weights, which take as long as trained ones cost.
+machine too.
 """
 
 import argparse
@@ -20,10 +20,7 @@ from benchmarks.measuring import RESULTS, RUNS, interleaved, machine, served, wr
 from examples.your_planner import plan
 
 from edgegrasp_cli.real_scenes import load_scenes
-from edgegrasp_model.detector import GraspDetector, ModelCatalogue
-from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.networks.checkpoint import build_network
-from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
+from edgegrasp_model.detector import ModelCatalogue
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_sim.camera import EVALUATION_VIEWS, Observation, TableView
 from edgegrasp_sim.engine import ENGINES, installed
@@ -31,7 +28,6 @@ from edgegrasp_sim.objects import CLUTTER, SceneKind
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trial import RoundDriver
-from edgegrasp_training.recipes import VOXEL_SIZE, recipe
 
 WEIGHTS = ("edgegrasp-plus", "edgegrasp-small", "edgegrasp", "vn-edgegrasp")
 LABELLED_GRASPS = 240  # candidates in each scene; some hundred differ and are tried
@@ -71,10 +67,10 @@ def shipped() -> dict[str, Any]:
     Processor seconds on one thread, and seconds of the clock on two.
     """
     scenes = {str(kind): observe(kind) for kind in CLUTTER}
-    detectors = {name: detector(recipe(name).network) for name in WEIGHTS}
+    models = ModelCatalogue.load()
     runs = {
-        (name, scene): partial(ours.detect, seen.cloud, request(seen))
-        for name, ours in detectors.items()
+        (name, scene): partial(models.get(name).detect, seen.cloud, request(seen))
+        for name in WEIGHTS
         for scene, seen in scenes.items()
     }
     results: dict[str, Any] = {name: {} for name in WEIGHTS}
@@ -194,12 +190,6 @@ def observe(kind: SceneKind = SceneKind.PILE, table: TableView = "known") -> Obs
         return simulation.observe_from(views, np.random.default_rng(2), table=table)
 
 
-def detector(config: NetworkConfig) -> GraspDetector:
-    """A detector with random weights, which take as long as trained ones."""
-    metadata = CheckpointMetadata("random", config, VOXEL_SIZE, "panda")
-    return GraspDetector(build_network(config), metadata, load_gripper())
-
-
 def request(
     observation: Observation, num_approach_points: int = 32, num_candidates: int = 2000
 ) -> DetectOptions:
@@ -214,7 +204,7 @@ def request(
 
 def _sampled_poses(observation: Observation) -> np.ndarray:
     options = request(observation, num_candidates=LABELLED_GRASPS)
-    ours = detector(recipe("edgegrasp-small").network)
+    ours = ModelCatalogue.load().get("edgegrasp-small")
     prepared = ours.prepare(observation.cloud, options)
     assert prepared.scene is not None
     sample = ours.sampler(prepared).all()
