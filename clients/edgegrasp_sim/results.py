@@ -41,7 +41,11 @@ class ResultFolder:
         self.path = path
 
     def open(self, manifest: dict[str, Any]) -> None:
-        """Start a benchmark in this folder, or resume an interrupted one; ValueError: another's."""
+        """Start a benchmark in this folder, or resume an interrupted one.
+
+        Raises:
+            ValueError: The folder holds another benchmark.
+        """
         known = self.path / "manifest.json"
         manifest = json.loads(json.dumps(manifest))  # tuples become lists, as in the file
         if known.is_file():

@@ -292,7 +292,11 @@ class ClutterSimulation:
     def execute_grasp(
         self, T_world_hand: ArrayLike, motion: ArmMotion | None = None
     ) -> GraspResult:
-        """Grasp to the end: a held object leaves the scene, the others come to rest; ValueError."""
+        """Grasp to the end: a held object leaves the scene, and the others come to rest.
+
+        Raises:
+            ValueError: The pose is not rigid.
+        """
         if isinstance(self._hand, ArmGripper):
             self._hand.motion = motion
         result = self._run(T_world_hand, to_the_end=True)

@@ -450,7 +450,11 @@ class ModelCatalogue:
         grippers: Sequence[Path] = (),  # files that requests may name by their stem
         max_voxels: int = MAX_VOXELS,  # most that a request's cloud may have
     ) -> Self:
-        """Load the shipped weights, then the user's own, named as their files; EdgeGraspError."""
+        """Load the shipped weights, then the user's own; each model has the name of its file.
+
+        Raises:
+            EdgeGraspError: A file cannot be used, or no weights have the default's name.
+        """
         own = {file.stem: load_gripper(file) for file in grippers}
         files: dict[str, Path] = {}
         for source in (WEIGHTS_FOLDER, *weights):
@@ -493,7 +497,11 @@ class ModelCatalogue:
         ]
 
     def warm_up(self) -> None:
-        """Run once, so that no first request is slow; InvalidCheckpoint: a model's wrong logits."""
+        """Detect once with the default model, so that the first request is not slow.
+
+        Raises:
+            InvalidCheckpoint: A network does not give the logits that it was written with.
+        """
         rng = np.random.default_rng(0)
         box = rng.uniform(-1.0, 1.0, (2000, 3)) * (0.02, 0.03, 0.04)
         options = DetectOptions(
@@ -524,7 +532,11 @@ class ModelCatalogue:
 
 
 def choose_device(name: str = "auto") -> torch.device:
-    """The device of that name: `cpu`, `cuda`, `cuda:1`, or `auto`, a GPU if any; InvalidDevice."""
+    """The device of that name; `auto` is the first GPU if there is one, else the processor.
+
+    Raises:
+        InvalidDevice: It is no device's name, or there is no such device here.
+    """
     if not DEVICE_NAMES.fullmatch(name):
         raise InvalidDevice(name, "Use auto, cpu, cuda, or cuda:N for one GPU of several.")
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0

@@ -33,7 +33,11 @@ class Outcomes:
 
 
 def read_outcomes(path: Path, digest: str = "") -> Outcomes:
-    """The outcomes, lines of JSON, of the weights with a `digest`, or of all; ValueError: none."""
+    """The outcomes in a file of JSON lines: of the weights with this digest, or of all.
+
+    Raises:
+        ValueError: The file has none, or a line that is no outcome.
+    """
     scores, held = [], []
     for number, line in enumerate(path.read_text().splitlines(), start=1):
         try:

@@ -77,7 +77,11 @@ def household_objects(folder: Path, count: int, rng: np.random.Generator) -> Obj
 
 
 def stretched(model: ObjectModel, factors: tuple[float, float, float], folder: Path) -> ObjectModel:
-    """Describe an object of meshes anew, stretched along x, y and z; ValueError: it has others."""
+    """Write an object that is stretched along x, y and z.
+
+    Raises:
+        ValueError: It does not consist of meshes alone.
+    """
     tree = ElementTree.parse(model.urdf)
     for shape in (*tree.iter("visual"), *tree.iter("collision")):
         mesh = shape.find("geometry/mesh")

@@ -62,7 +62,11 @@ class Trainer:
         teacher: Teacher | None = None,  # scores further candidates to learn from
         start: Path | None = None,  # weights to start from; None: random ones
     ) -> None:
-        """Set up, and resume from the folder's last state if there is one; ValueError: no fit."""
+        """Set up, and resume from the folder's last state if there is one.
+
+        Raises:
+            ValueError: The options do not fit the network or the last state.
+        """
         if teacher is not None and metadata.network.architecture == "hand":
             raise ValueError(f"teacher: {metadata.name} learns from labels alone. Name none.")
         self.teacher = teacher

@@ -23,7 +23,12 @@ ENGINES = ("pybullet", "mujoco")  # the first that is installed is the default
 
 
 def choose_engine(asked: str | None = None, protocol: str = "") -> str:
-    """The engine asked for, else the protocol's if installed, else any; or raises."""
+    """The engine asked for, else the protocol's if installed, else any that is installed.
+
+    Raises:
+        ValueError: There is no engine of that name.
+        RuntimeError: It is not installed, or none is.
+    """
     for name in filter(None, (asked, protocol)):
         if name not in ENGINES:
             raise ValueError(f"engine is {name!r}; choose one of {', '.join(ENGINES)}")

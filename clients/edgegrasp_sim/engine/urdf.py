@@ -34,7 +34,12 @@ class Shape(NamedTuple):
 
 
 def read_urdf(path: Path, scale: float) -> Shape:
-    """The shape of the first link of a URDF file, `scale` times as large; ValueError: no solid."""
+    """The shape of the first link of a URDF file, `scale` times as large.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It cannot be read, or has no solid collision shape.
+    """
     if not path.is_file():
         raise FileNotFoundError(f"no object file at {path}; check the object folder")
     centre, *surfaces = _read_urdf(path, path.stat().st_mtime_ns)

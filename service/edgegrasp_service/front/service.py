@@ -125,7 +125,7 @@ class GraspService:
             WorkerLost: The worker died for another reason.
         """
         call.end_stage("read")
-        call.bytes_in = sum(map(len, job.parts))
+        call.bytes_in = job.size
         self.check_size(call.bytes_in)
         self.admission.resize(ticket, call.bytes_in)
         ticket.whole = True

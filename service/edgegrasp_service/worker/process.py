@@ -56,6 +56,11 @@ class Job:
         """The body, in one or more parts."""
         return self.pieces or (self.body,)
 
+    @property
+    def size(self) -> int:
+        """Bytes of the body."""
+        return sum(map(len, self.parts))
+
 
 @dataclass
 class Facts:
