@@ -33,7 +33,7 @@ from edgegrasp_service.observability import LogQueue, Metrics, log_call, start_l
 from edgegrasp_service.recording import Recorder, check_outcomes
 from edgegrasp_service.security import ServerTls, load_tokens
 from edgegrasp_service.settings import UNIX, Settings
-from edgegrasp_service.worker.pool import NURSERY, Launched, WorkerPool
+from edgegrasp_service.worker.pool import Launched, WorkerPool
 from edgegrasp_service.worker.process import PIECE
 
 logger = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ class Server:
         self,
         settings: Settings,
         observers: Sequence[Observer] = (),
-        nursery: Sequence[str] = NURSERY,
+        nursery: Sequence[str] = (),
         launched: Launched | None = None,
     ) -> None:
         self._settings = settings

@@ -50,12 +50,12 @@ logger = logging.getLogger(__name__)
 Launched: TypeAlias = tuple[subprocess.Popen[bytes], socket.socket]  # and the socket to it
 
 
-def launch(settings: Settings, command: Sequence[str] = NURSERY) -> Launched:
-    """Start the nursery, which loads meanwhile."""
+def launch(settings: Settings, command: Sequence[str] = ()) -> Launched:
+    """Start the nursery, which loads meanwhile; `command` replaces NURSERY."""
     control, theirs = socket.socketpair()
     with theirs:
         environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
-        command = [*command, settings.model_dump_json()]
+        command = [*(command or NURSERY), settings.model_dump_json()]
         return subprocess.Popen(command, stdin=theirs.fileno(), env=environment), control
 
 
@@ -65,7 +65,7 @@ class WorkerPool:
     def __init__(
         self,
         settings: Settings,
-        nursery: Sequence[str] = NURSERY,
+        nursery: Sequence[str] = (),
         replaced: Callable[[], None] = lambda: None,
         launched: Launched | None = None,
     ) -> None:
