@@ -215,7 +215,7 @@ def picture(maker: Maker, made: Made) -> dict[str, Float64]:
 
 
 def on_the_surface(label: NDArray[np.uint8], true: Float64, depth: Float64) -> NDArray[np.uint8]:
-    """Labels (H, W) of readings: of the surface nearby that each lies on; 0: it lies on none."""
+    """Labels (H, W) of readings: that of the nearby surface each lies on, 0 without one."""
     off = np.abs(depth - true)
     best, found = off.copy(), label.copy()
     for down in range(-WINDOW, WINDOW + 1):

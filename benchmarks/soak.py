@@ -374,7 +374,7 @@ def milliseconds(seconds: list[float]) -> dict[str, float]:
 
 
 def faults(results: dict[str, Any]) -> list[str]:
-    """What is wrong; empty: nothing."""
+    """What is wrong; empty if all is well."""
     found, attacked = [], results["attacked"]
     for name in ("alone", "attacked"):
         if results[name]["wrong"]:

@@ -161,7 +161,12 @@ def simulator(kind: SceneKind) -> dict[str, dict[str, float]]:
             camera, noise = map(np.random.default_rng, ([seed, 1], [seed, 2]))
             observation = simulation.observe_from(EVALUATION_VIEWS.sample(camera), noise)
             seen = time.process_time()
-            poses = _sampled_poses(observation)
+            options = request(observation, num_candidates=LABELLED_GRASPS)
+            ours = ModelCatalogue.load().get("edgegrasp-small")
+            prepared = ours.prepare(observation.cloud, options)
+            assert prepared.scene is not None
+            sample = ours.sampler(prepared).all()
+            poses = prepared.scene.frame.poses_in_cloud(sample.candidates.T_cloud_hand)
             begin = time.process_time()
             for pose in poses:
                 simulation.try_grasp(pose, shake=True)
@@ -200,15 +205,6 @@ def request(
         viewpoint=tuple(observation.camera_position.tolist()),
         support={"normal": (0.0, 0.0, 1.0), "offset": observation.table_height},
     )
-
-
-def _sampled_poses(observation: Observation) -> np.ndarray:
-    options = request(observation, num_candidates=LABELLED_GRASPS)
-    ours = ModelCatalogue.load().get("edgegrasp-small")
-    prepared = ours.prepare(observation.cloud, options)
-    assert prepared.scene is not None
-    sample = ours.sampler(prepared).all()
-    return prepared.scene.frame.poses_in_cloud(sample.candidates.T_cloud_hand)
 
 
 def write_table(page: Path, written: str) -> None:

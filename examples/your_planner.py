@@ -16,7 +16,7 @@ AROUND = 0.02  # metres from the highest point; points this near show where its 
 
 
 def plan(observation: Observation, seed: int) -> PlannedGrasp | None:
-    """A grasp from straight above, closing across the highest object; None: nothing is seen."""
+    """A grasp from straight above, closing across the highest object; None for an empty view."""
     cloud = observation.cloud.astype(np.float64)
     if not len(cloud):
         return None

@@ -20,12 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
 
-from edgegrasp_camera import (
-    EdgeGraspError,
-    InvalidRequest,
-    PayloadTooLarge,
-    UnsupportedMediaType,
-)
+from edgegrasp_camera import EdgeGraspError, InvalidRequest, PayloadTooLarge, UnsupportedMediaType
 from edgegrasp_camera.arrays import Array, Float64
 from edgegrasp_camera.clouds import PCL_FIELDS, CloudInput, Records, cloud_of_records, too_many
 from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of

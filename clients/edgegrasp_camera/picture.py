@@ -84,7 +84,7 @@ class View:
 
     @classmethod
     def of_image(cls, points: Floats) -> Self | None:
-        """The camera at the origin that saw an organised cloud (H, W, 3); None: none did."""
+        """The camera at the origin that saw an organised cloud (H, W, 3); None if none could."""
         rows, columns = np.nonzero(np.isfinite(points).all(axis=2) & (points[..., 2] != 0))
         if len(np.unique(rows)) < 2 or len(np.unique(columns)) < 2:
             return None
@@ -212,7 +212,12 @@ class Picture:
             pieces = fork(grasp.T_cloud_hand, grasp.width, palm_and_tip)
             self._fork(pieces, scale.to_rgba(grasp.score))
             if rank < LABELLED and len(grasps) > 1:
-                self._label(pieces[0, 0], str(rank + 1))
+                text = str(rank + 1)
+                (x, y), _ = self.view.project(pieces[0, 0])
+                box = {"boxstyle": "circle,pad=0.2", "fc": "white", "ec": OUTLINE, "lw": 0.6}
+                self._axes.text(
+                    x, y, text, fontsize=8, ha="center", va="center", bbox=box, clip_on=True
+                )
         if len(grasps) > 1:
             axes = self._figure.add_axes((0.78, 0.62 * self._foot, 0.2, 0.16 * self._foot))
             bar = self._figure.colorbar(
@@ -244,11 +249,6 @@ class Picture:
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         at = np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
         return np.where(inside, self._depth[at], np.nan)
-
-    def _label(self, place: Points, text: str) -> None:
-        (x, y), _ = self.view.project(place)
-        box = {"boxstyle": "circle,pad=0.2", "fc": "white", "ec": OUTLINE, "lw": 0.6}
-        self._axes.text(x, y, text, fontsize=8, ha="center", va="center", bbox=box, clip_on=True)
 
     def save(self, path: Path | BinaryIO) -> None:
         """Write it: a `.png` or `.jpg` file, whose folder must exist, or a PNG to a stream."""

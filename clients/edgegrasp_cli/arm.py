@@ -4,9 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from edgegrasp_robot import Robot, load_robot
+from edgegrasp_robot import load_robot
 from edgegrasp_sim.engine import ArmModel
-from edgegrasp_sim.poses import Matrix
 from edgegrasp_sim.protocol import CameraRules
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
 
@@ -29,32 +28,28 @@ def benchmark_arm(name: str, camera: CameraRules) -> BenchmarkArm:
         InvalidRobot: the file cannot be used.
     """
     robot = load_robot(name)
-    T_world_base = _beside(np.deg2rad(sum(camera.azimuth_degrees) / 2))
+    # The base stands on the table, on the camera's side; its x points to the middle of the scene.
+    azimuth = np.deg2rad(sum(camera.azimuth_degrees) / 2)
+    out = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    T_world_base = np.eye(4)
+    T_world_base[:3, 0], T_world_base[:3, 1] = -out, np.cross([0.0, 0.0, 1.0], -out)
+    T_world_base[:3, 3] = np.array([MIDDLE, MIDDLE, TABLE_HEIGHT]) + FAR * out
     asked = {
         "name": robot.name,
         "T_base_cloud": np.linalg.inv(T_world_base).tolist(),
         "joints": robot.home.tolist(),
     }
     hand = None if robot.gripper.name == "panda" else robot.hand.model_dump()
-    return BenchmarkArm(_model(robot, T_world_base), hand, {"robot": asked, "collision": LIFT})
-
-
-def _beside(azimuth: float) -> Matrix:
-    """T_world_base of a base on the table; its x points to the middle of the scene."""
-    out = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    T_world_base = np.eye(4)
-    T_world_base[:3, 0], T_world_base[:3, 1] = -out, np.cross([0.0, 0.0, 1.0], -out)
-    T_world_base[:3, 3] = np.array([MIDDLE, MIDDLE, TABLE_HEIGHT]) + FAR * out
-    return T_world_base
-
-
-def _model(robot: Robot, T_world_base: Matrix) -> ArmModel:
     T_root_base = robot.scene.forwardKinematics(robot.home, robot.base_frame)
-    return ArmModel(
-        robot.model.arm,
-        T_world_base @ np.linalg.inv(T_root_base),
-        robot.flange_frame,
-        robot.T_flange_hand,
-        robot.joint_names,
-        robot.home,
+    return BenchmarkArm(
+        ArmModel(
+            robot.model.arm,
+            T_world_base @ np.linalg.inv(T_root_base),
+            robot.flange_frame,
+            robot.T_flange_hand,
+            robot.joint_names,
+            robot.home,
+        ),
+        hand,
+        {"robot": asked, "collision": LIFT},
     )

@@ -10,12 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from pydantic import BaseModel, Field
 
-from edgegrasp_cli.flags import (
-    PlannerFlags,
-    option_flags,
-    parse_option_flags,
-    takes_flags,
-)
+from edgegrasp_cli.flags import PlannerFlags, option_flags, parse_option_flags, takes_flags
 
 if TYPE_CHECKING:
     from edgegrasp_sim.benchmark import BenchmarkConfig

@@ -11,18 +11,13 @@ import numpy as np
 import typer
 
 from edgegrasp_cli.detect import DetectorFlags, open_client
-from edgegrasp_cli.flags import (
-    option_flags,
-    parse_option_flags,
-    takes_flags,
-)
+from edgegrasp_cli.flags import option_flags, parse_option_flags, takes_flags
 from edgegrasp_model.results import SUPPORT, UNLABELLED
 
 if TYPE_CHECKING:
     from edgegrasp_camera.arrays import Int64
     from edgegrasp_camera.picture import Picture
     from edgegrasp_cli.real_scenes import RealScene, SceneFigures
-    from edgegrasp_model.gripper import Gripper
 
 Option = typer.Option
 # Options that are set by the scene or by this command.
@@ -53,13 +48,16 @@ def benchmark_real(
 
     from edgegrasp_cli.planners import model_used
     from edgegrasp_cli.real_scenes import BEST, judge, load_scenes
+    from edgegrasp_model.gripper import choose_gripper, load_gripper
+    from edgegrasp_model.options import parse_options
 
     fields, loaded = parse_option_flags(options), load_scenes(scenes)
     output.mkdir(parents=True, exist_ok=True)
     done: dict[str, SceneFigures] = {}
     with open_client(asked) as client:
         model = model_used(client, fields.get("model", ""))
-        gripper = _gripper(model.gripper, asked.grippers, fields)
+        own = {file.stem: load_gripper(file) for file in asked.grippers}
+        gripper = choose_gripper(parse_options(fields), load_gripper(model.gripper), own)
         _ask(client, loaded[0], fields)  # loading and compiling take time
         for scene in track(loaded, "scenes", console=Console(stderr=True)):
             start = time.perf_counter()
@@ -99,15 +97,6 @@ def _labels(
         if found is not None and found.debug is not None:
             return np.asarray(found.debug.labels, dtype=np.int64)
     return np.full(len(scene.points), UNLABELLED)
-
-
-def _gripper(name: str, files: Sequence[Path], options: Mapping[str, Any]) -> "Gripper":
-    """The gripper named by the options, else the model's."""
-    from edgegrasp_model.gripper import choose_gripper, load_gripper
-    from edgegrasp_model.options import parse_options
-
-    own = {file.stem: load_gripper(file) for file in files}
-    return choose_gripper(parse_options(options), load_gripper(name), own)
 
 
 def _plane(detection: Any | None) -> tuple[Any, float] | None:

@@ -16,12 +16,7 @@ from pydantic import Field
 
 from edgegrasp_camera.files import pixels, sent_cloud
 from edgegrasp_camera.picture import draw_detection
-from edgegrasp_cli.flags import (
-    Connection,
-    option_flags,
-    parse_option_flags,
-    takes_flags,
-)
+from edgegrasp_cli.flags import Connection, option_flags, parse_option_flags, takes_flags
 
 if TYPE_CHECKING:
     from edgegrasp_client import DepthImage, Model

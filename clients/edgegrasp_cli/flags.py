@@ -164,7 +164,7 @@ def option_flags(*leave_out: str, defaults: bool = True) -> Flags:
 
 
 def parse_option_flags(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The options from the flags of `option_flags`; InvalidRequest: a value is wrong."""
+    """The options from the flags of `option_flags`; raises InvalidRequest for a wrong value."""
     from edgegrasp_model.options import parse_options
     from edgegrasp_service.worker.http_bodies import options_from_query
 

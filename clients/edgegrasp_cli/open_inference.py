@@ -320,7 +320,13 @@ def http_app(models: Models, max_body_bytes: int) -> Starlette:
         return JSONResponse({"name": request.path_params["name"], "ready": True})
 
     async def infer(request: Request) -> Response:
-        body = await _body(request, max_body_bytes)
+        body = bytearray()
+        async for chunk in request.stream():
+            body += chunk
+            if len(body) > max_body_bytes:
+                raise RefusedError(
+                    "RESOURCE_EXHAUSTED", 413, f"The body is over {max_body_bytes:,} bytes."
+                )
         header = request.headers.get("inference-header-content-length")
         name = request.path_params["name"]
         if "version" in request.path_params:
@@ -345,16 +351,6 @@ def http_app(models: Models, max_body_bytes: int) -> Starlette:
             Route(f"{path}/infer", infer, methods=["POST"]),
         ]
     return Starlette(routes=routes, exception_handlers={RefusedError: refused})
-
-
-async def _body(request: Any, most: int) -> bytearray:
-    """The body of a request; raises RefusedError where it is too large."""
-    body = bytearray()
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > most:
-            raise RefusedError("RESOURCE_EXHAUSTED", 413, f"The body is over {most:,} bytes.")
-    return body
 
 
 def _http_infer(models: Models, name: str, body: bytearray, header: str | None) -> dict[str, Any]:

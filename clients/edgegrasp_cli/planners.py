@@ -74,7 +74,7 @@ def open_planner(
 
 @contextmanager
 def _server(choice: PlannerFlags, weights: Sequence[Path]) -> Iterator[str | None]:
-    """The address of the server to use, started if none is given; None: this process."""
+    """The address of the server to use, started if none is given; None for this process."""
     if choice.planner == "in-process" or choice.server:
         yield choice.server if choice.planner == "server" else None
         return

@@ -51,7 +51,7 @@ class RealScene:
 
     @property
     def object_of_point(self) -> Int64:
-        """(R,) number of the object of each point, from 1; 0: of none."""
+        """(R,) number of the object that each point is on, from 1; 0 for the background."""
         return np.maximum(self.labels.astype(np.int64) - FIRST_OBJECT + 1, 0)
 
     @property
@@ -81,7 +81,7 @@ class Segmentation:
 
 
 def compare_labels(labels: Int64, answer: Int64) -> Segmentation:
-    """Compare an answer with labels, (R,) each: the number of each pixel's object; 0: of none.
+    """Compare an answer with labels, (R,) each: each pixel's object, 0 for the background.
 
     Precision, recall and F of the overlap as in Xie et al., "Unseen Object Instance Segmentation"
     (T-RO 2021): objects found and labelled are matched one to one for the greatest sum of F.
@@ -264,7 +264,7 @@ def _meet_points(scene: RealScene, grasps: Sequence[Any], gripper: "Gripper") ->
 
 
 def _objects_held(scene: RealScene, grasps: Sequence[Any]) -> Int64:
-    """The label (E,) of the object that both points of a grasp are on; 0: of none."""
+    """The label (E,) of the object that both points of a grasp are on; 0 where there is none."""
     seen = np.isfinite(scene.points).all(axis=1)
     ends = [(grasp.approach_point, grasp.contact_point) for grasp in grasps]
     # Points of a grasp are means of small voxels, so they lie near a measured point, not on it.

@@ -23,12 +23,7 @@ from typing_extensions import Self, Unpack
 
 from edgegrasp_camera.arrays import Array
 from edgegrasp_client.connection import DEFAULT_ADDRESS, RETRIES, Tls, is_rest, retry_delay
-from edgegrasp_client.errors import (
-    DeadlineError,
-    ServerUnavailableError,
-    WorkerLostError,
-    invalid,
-)
+from edgegrasp_client.errors import DeadlineError, ServerUnavailableError, WorkerLostError, invalid
 from edgegrasp_client.over_grpc import GrpcTransport
 from edgegrasp_client.over_rest import RestTransport
 from edgegrasp_client.requests import Cloud, Request, RequestFields, StreamRequest
@@ -167,7 +162,7 @@ class AsyncGraspClient:
         return await self._transport.ready(self._seconds(timeout))
 
     async def wait_until_ready(self, timeout: float = 60.0) -> None:
-        """Wait until the server can answer; DeadlineError: not within `timeout` seconds."""
+        """Wait until the server can answer; raises DeadlineError after `timeout` seconds."""
         end = time.monotonic() + timeout
         while not await self.ready(timeout=max(POLL_SECONDS, end - time.monotonic())):
             if time.monotonic() >= end:

@@ -39,7 +39,7 @@ def is_rest(address: str) -> bool:
 
 
 def retry_delay(error: ServerUnavailableError, attempt: int) -> float | None:
-    """Seconds to wait after a failed attempt, counted from 0; None: it was the last.
+    """Seconds to wait after a failed attempt, counted from 0; None after the last one.
 
     Delays double and are randomised, so that clients refused together do not return together.
     """

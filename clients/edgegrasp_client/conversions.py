@@ -279,7 +279,7 @@ def quaternion_from_matrix(rotation: ArrayLike) -> Float64:
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Float64:
-    """The rotation (3, 3) of a quaternion x, y, z, w of any length; ValueError: of none."""
+    """The rotation (3, 3) of a quaternion x, y, z, w; raises ValueError for a zero quaternion."""
     q = np.asarray(quaternion, dtype=np.float64)
     length = np.linalg.norm(q)
     if not np.isfinite(length) or length < 1e-12:
@@ -294,15 +294,8 @@ def matrix_from_quaternion(quaternion: ArrayLike) -> Float64:
     )
 
 
-def _transform(rotation: Float64, position: ArrayLike) -> Float64:
-    """The (4, 4) transform of a rotation and a position."""
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = rotation, position
-    return result
-
-
 def _matrix(pose: ArrayLike | None) -> Float64:
-    """A (4, 4) pose in double precision; None: the identity."""
+    """A (4, 4) pose in double precision; the identity for None."""
     return np.eye(4) if pose is None else np.asarray(pose, dtype=np.float64)
 
 
@@ -359,10 +352,12 @@ def _isaac_grasp(name: str, fields: Any) -> IsaacGrasp:
     try:  # 1e-05, without a point, is text to YAML: numbers are converted here
         x, y, z = fields["orientation"]["xyz"]
         rotation = matrix_from_quaternion([x, y, z, fields["orientation"]["w"]])
+        T_object_gripper = np.eye(4)
+        T_object_gripper[:3, :3], T_object_gripper[:3, 3] = rotation, fields["position"]
         return IsaacGrasp(
             name=str(name),
             confidence=float(fields["confidence"]),
-            T_object_gripper=_transform(rotation, fields["position"]),
+            T_object_gripper=T_object_gripper,
             cspace_position=_joint_positions(fields.get("cspace_position")),
             pregrasp_cspace_position=_joint_positions(fields.get("pregrasp_cspace_position")),
         )

@@ -240,14 +240,10 @@ def fill(message: Message, value: object, path: str) -> None:
         elif field.message_type is not None:
             fill(getattr(message, name), part, here)
         else:
-            _set(message, name, part, here)
-
-
-def _set(message: Message, name: str, value: object, path: str) -> None:
-    try:
-        setattr(message, name, value)
-    except (TypeError, ValueError) as error:
-        raise invalid(path, repr(value)[:80], f"{error}.") from None
+            try:
+                setattr(message, name, part)
+            except (TypeError, ValueError) as error:
+                raise invalid(here, repr(part)[:80], f"{error}.") from None
 
 
 def _extend(container: Any, values: object, path: str, messages: bool) -> None:

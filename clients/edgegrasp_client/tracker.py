@@ -26,7 +26,7 @@ class GraspTracker:
 
     Args:
         search_every: Images after which others are looked for.
-        **options: As of `GraspClient.detect`; `previous` and `seed` are the tracker's.
+        **options: Those of `GraspClient.detect`; the tracker sets `previous` and `seed`.
     """
 
     def __init__(self, search_every: int = 30, **options: Unpack[DetectOptions]) -> None:

@@ -179,10 +179,27 @@ def prepare_mesh(mesh: Path, cache: Path | None = None) -> Path:
     `cache` keeps objects by the digest of their file and of how they are prepared. ValueError: it
     is no solid mesh; RuntimeError: coacd or trimesh is not installed.
     """
-    _require_packages()
+    try:
+        import coacd  # noqa: F401
+        import trimesh  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise RuntimeError(
+            f"{error.name} is not installed, and meshes need it: pip install 'edgegrasp[meshes]'"
+        ) from None
 
     def write(folder: Path) -> None:
-        logger.info("%s: %d convex parts", mesh.name, _write_object(mesh, folder))
+        import trimesh
+
+        surface = _read(mesh)
+        sides = np.sort(surface.bounding_box_oriented.primitive.extents)
+        surface.apply_scale(min(SHORTEST_SIDE / sides[0], LONGEST_SIDE / sides[2]))
+        surface.apply_translation(-surface.bounds.mean(axis=0))
+        parts = _convex_parts(surface)
+        solid: Any = trimesh.util.concatenate(parts)
+        solid.density = OBJECT_MASS / solid.volume
+        visible, hulls = ([(m.vertices, m.faces) for m in meshes] for meshes in ([surface], parts))
+        write_parts("object", visible, hulls, solid.center_mass, solid.moment_inertia, folder)
+        logger.info("%s: %d convex parts", mesh.name, len(parts))
 
     return _kept_in(_digest(mesh), write, cache) / "object.urdf"
 
@@ -309,16 +326,6 @@ def _kept_in(name: str, write: Callable[[Path], None], cache: Path | None = None
     return folder
 
 
-def _require_packages() -> None:
-    try:
-        import coacd  # noqa: F401
-        import trimesh  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise RuntimeError(
-            f"{error.name} is not installed, and meshes need it: pip install 'edgegrasp[meshes]'"
-        ) from None
-
-
 def _digest(mesh: Path) -> str:
     """SHA-256 of a mesh and of everything that decides how it is prepared."""
     recipe = {
@@ -335,22 +342,6 @@ def _digest(mesh: Path) -> str:
     digest = hashlib.sha256(json.dumps(recipe, sort_keys=True).encode())
     digest.update(mesh.read_bytes())
     return digest.hexdigest()
-
-
-def _write_object(mesh: Path, folder: Path) -> int:
-    """Write URDF, visual and collision meshes into a folder; returns the number of convex parts."""
-    import trimesh
-
-    surface = _read(mesh)
-    sides = np.sort(surface.bounding_box_oriented.primitive.extents)
-    surface.apply_scale(min(SHORTEST_SIDE / sides[0], LONGEST_SIDE / sides[2]))
-    surface.apply_translation(-surface.bounds.mean(axis=0))
-    parts = _convex_parts(surface)
-    solid: Any = trimesh.util.concatenate(parts)
-    solid.density = OBJECT_MASS / solid.volume
-    visible, hulls = ([(m.vertices, m.faces) for m in meshes] for meshes in ([surface], parts))
-    write_parts("object", visible, hulls, solid.center_mass, solid.moment_inertia, folder)
-    return len(parts)
 
 
 def _read(mesh: Path) -> Any:

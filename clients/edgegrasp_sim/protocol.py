@@ -29,7 +29,7 @@ class SceneRules:
 
     num_objects: tuple[int, ...]  # how many objects to try to place, in turn from round to round
     packed_scale: Range  # range of the factor on the objects' size in packed scenes and on tables
-    pile_scale: Range  # the same for piles and bins
+    pile_scale: Range  # range of that factor in piles and bins
     table_thickness: float = OPEN_THICKNESS  # of packed and pile scenes, metres
 
     def scale(self, kind: SceneKind) -> Range:
@@ -155,5 +155,5 @@ def protocol_names() -> list[str]:
 
 
 def protocol_from(table: dict[str, Any]) -> Protocol:
-    """Build a protocol from the tables of TOML or a manifest; ValueError: a constant is wrong."""
+    """Build a protocol from the tables of TOML or a manifest; raises ValueError."""
     return TypeAdapter(Protocol).validate_python(table)

@@ -63,7 +63,7 @@ class Replay:
         self.simulation.close()
 
     def find(self, seed: int, index: int, attempt: int = 0) -> Round:
-        """A recorded round that has an attempt of this number; ValueError: there is none."""
+        """A recorded round that has an attempt of this number; raises ValueError without one."""
         done = self.rounds.get((seed, index))
         if done is None:
             known = ", ".join(f"{s}/{i}" for s, i in list(self.rounds)[:10])

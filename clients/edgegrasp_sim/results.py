@@ -68,14 +68,14 @@ class ResultFolder:
         return self._file(seed, index).is_file()
 
     def rounds(self) -> list[Round]:
-        """The finished rounds, by seed and index; FileNotFoundError: there is no benchmark."""
+        """The finished rounds, by seed and index; raises FileNotFoundError without a benchmark."""
         self.manifest()
         files = (self.path / "rounds").glob("*.json")
         rounds = [ROUND.validate_json(file.read_bytes()) for file in files]
         return sorted(rounds, key=lambda item: (item.seed, item.index))
 
     def manifest(self) -> dict[str, Any]:
-        """What was run; FileNotFoundError: there is no benchmark in this folder."""
+        """The manifest of the benchmark in this folder; raises FileNotFoundError without one."""
         file = self.path / "manifest.json"
         if not file.is_file():
             raise FileNotFoundError(f"{self.path} contains no benchmark: manifest.json is missing")
@@ -277,7 +277,7 @@ def wilson(successes: int, trials: int) -> tuple[float, float] | None:
 def paired_difference(
     numerators: ArrayLike, denominators: ArrayLike, rng: np.random.Generator
 ) -> tuple[float, tuple[float, float]] | None:
-    """Second ratio of sums minus the first, and its 95 % interval; None: a run has no counts.
+    """Second ratio of sums minus the first, and its 95 % interval; None if a run has no counts.
 
     Scenes are resampled, so that differences between them cancel out. Counts (2, S): of run and
     scene.

@@ -10,13 +10,7 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_sim.engine import TIME_STEP, Body, World
 from edgegrasp_sim.objects import OBJECT_FRICTION, OBJECT_MASS, ObjectModel, ObjectSet
 from edgegrasp_sim.poses import Matrix
-from edgegrasp_sim.surroundings import (
-    MIDDLE,
-    SIZE,
-    TABLE_HEIGHT,
-    Box,
-    Surroundings,
-)
+from edgegrasp_sim.surroundings import MIDDLE, SIZE, TABLE_HEIGHT, Box, Surroundings
 
 PACKED_SCALE = (0.7, 0.8)
 PILE_SCALE = (0.8, 1.0)
@@ -48,7 +42,7 @@ class Pour:
 
     drop_height: float = 0.08  # metres above the walls
     margin: float = 0.25  # of a bin's length and width, along each side, where nothing is dropped
-    full_margin: float = 0.12  # the same of a bin that gets full
+    full_margin: float = 0.12  # that of a bin that gets full
     seconds: float = 0.5  # given to each object to come to rest
     at_once: int = 4  # objects poured into a bin that gets full before it is looked at
     covered: float = 0.85  # share of its floor that objects hide from above when it is full

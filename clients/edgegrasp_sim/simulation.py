@@ -11,15 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_camera.picture import lit
 from edgegrasp_sim.arm import ArmGripper, ArmMotion
-from edgegrasp_sim.camera import (
-    CAMERA,
-    FARTHEST,
-    Observation,
-    TableView,
-    crop,
-    points_of,
-    seen_box,
-)
+from edgegrasp_sim.camera import CAMERA, FARTHEST, Observation, TableView, crop, points_of, seen_box
 from edgegrasp_sim.engine import ArmModel, make_world
 from edgegrasp_sim.engine.urdf import least_width, read_urdf
 from edgegrasp_sim.hand import GraspResult, Gripper, hand_of, panda, run_grasp
@@ -267,7 +259,7 @@ class ClutterSimulation:
         painted = np.full((len(points), 3), WOOD)
         for part in np.array_split(row, len(row) // 10_000 + 1):
             ahead = sight[np.searchsorted(row, part)]
-            for reach in (2.0, 30.0):  # then all that lies there
+            for reach in (2.0, 30.0):  # then everything behind the surface
                 hits = self.world.first_hits(points[part] - reach * ahead, points[part] + ahead)
                 found = np.array([numbers.get(uid, -1) for uid in hits])
                 painted[part[found >= 0]] = PAINTS[found[found >= 0] % len(PAINTS)]

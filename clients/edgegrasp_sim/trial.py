@@ -175,7 +175,7 @@ class RoundDriver:
         return grasp
 
     def execute(self, grasp: PlannedGrasp) -> Attempt:
-        """Execute a grasp planned in the last view; ValueError: its pose is not rigid."""
+        """Execute a grasp planned in the last view; raises ValueError unless its pose is rigid."""
         result = self.simulation.execute_grasp(grasp.T_world_hand, grasp.motion)
         attempt = Attempt(
             cause=result.cause,

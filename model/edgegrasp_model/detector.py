@@ -41,11 +41,7 @@ from edgegrasp_model.ranking import (
     select,
 )
 from edgegrasp_model.results import NoGrasp, Pace
-from edgegrasp_model.scene.cloud import (
-    CheckedCloud,
-    check_cloud,
-    seen_from_origin,
-)
+from edgegrasp_model.scene.cloud import CheckedCloud, check_cloud, seen_from_origin
 from edgegrasp_model.scene.scene import (
     MAX_VOXELS,
     Scene,
@@ -374,11 +370,26 @@ class GraspDetector:
         return self.metadata.network.architecture == "hand"
 
     def _score(self, prepared: Prepared, sample: Sample) -> Scored:
+        """The logits of the candidates of a sample."""
         assert prepared.scene is not None
         if len(sample.candidates) == 0:
             return Scored(sample, np.empty(0, dtype=np.float32))
         with prepared.timed("description"):
-            batch = self._batch(prepared.scene, sample, prepared.gripper)
+            scene, candidates, network = prepared.scene, sample.candidates, self.metadata.network
+            batch: Batch
+            if self.sees_hands:
+                batch = hand_batch(scene, candidates, prepared.gripper, network)
+            else:
+                batch = BallBatch.from_cloud(
+                    scene.cloud.points,
+                    scene.cloud.normals,
+                    sample.approach_index,
+                    sample.crop,
+                    candidates.pair,
+                    candidates.approach,
+                    candidates.depth,
+                    network.k,
+                )
         with prepared.timed("network"):
             return Scored(sample, self.run(batch))
 
@@ -391,21 +402,6 @@ class GraspDetector:
             held &= scored.sample.collision_free
         approach_index = scored.sample.candidates.approach_index[held]
         return np.asarray(prepared.scene.object_of_point[approach_index])
-
-    def _batch(self, scene: Scene, sample: Sample, gripper: Gripper) -> Batch:
-        candidates, network = sample.candidates, self.metadata.network
-        if self.sees_hands:
-            return hand_batch(scene, candidates, gripper, network)
-        return BallBatch.from_cloud(
-            scene.cloud.points,
-            scene.cloud.normals,
-            sample.approach_index,
-            sample.crop,
-            candidates.pair,
-            candidates.approach,
-            candidates.depth,
-            network.k,
-        )
 
 
 def _with_viewpoint(
@@ -472,7 +468,7 @@ class ModelCatalogue:
         return sorted(self._detectors)
 
     def get(self, name: str = "") -> GraspDetector:
-        """The detector of that name; the default for an empty name; UnknownModel: there is none."""
+        """The detector of that name, or the default for an empty name; raises UnknownModel."""
         try:
             return self._detectors[name or self.default]
         except KeyError:

@@ -6,12 +6,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edgegrasp_camera.arrays import Bools, Float32, Floats, Int64
-from edgegrasp_model.candidates.collision import CollisionCheck, clearances, collides
+from edgegrasp_model.candidates.collision import (
+    CollisionCheck,
+    HandView,
+    clearances,
+    collides,
+    hand_views,
+)
 from edgegrasp_model.candidates.edge_grasps import (
     EDGE_MARGIN,
     MIN_DEPTH,
     MIN_EDGE,
-    BallCrop,
     Candidates,
     crop_balls,
     edge_grasps,
@@ -20,7 +25,6 @@ from edgegrasp_model.candidates.edge_grasps import (
 )
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view import HandView, hand_views
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch, hand_batch
@@ -95,7 +99,10 @@ def _score_balls(scene: Scene, candidates: Candidates, scorer: Scorer) -> Floats
         crop = crop_balls(points, some, scorer.crop_radius)
         rows = np.flatnonzero(np.isin(candidates.approach_index, some))
         here = candidates.take(rows)
-        contact = _contact_rows(here, some, crop, len(points))
+        size = len(points)
+        keys = crop.ball_of_point * size + crop.ball_rows  # ascending
+        ball = np.searchsorted(some, here.approach_index)
+        contact = np.searchsorted(keys, ball * size + here.contact_index).astype(np.int64)
         score[rows] = scorer.probability(
             BallBatch.from_cloud(
                 points, normals, some, crop, contact, here.approach, here.depth, scorer.network.k
@@ -104,15 +111,8 @@ def _score_balls(scene: Scene, candidates: Candidates, scorer: Scorer) -> Floats
     return score
 
 
-def _contact_rows(candidates: Candidates, balls: Int64, crop: BallCrop, size: int) -> Int64:
-    """Rows (E,) of the crop with the candidates' contacts, each in its own ball."""
-    keys = crop.ball_of_point * size + crop.ball_rows  # ascending
-    ball = np.searchsorted(balls, candidates.approach_index)
-    return np.searchsorted(keys, ball * size + candidates.contact_index).astype(np.int64)
-
-
 def check_edges(edges: object, rows: int) -> Int64:
-    """Check (M, 2) rows of the cloud as sent; InvalidRequest: wrong type, shape or range."""
+    """Check (M, 2) rows of the cloud as sent; raises InvalidRequest for type, shape and range."""
     fix = "Send integers of shape (M, 2): rows of the cloud, approach and contact point each."
     if not isinstance(edges, np.ndarray):
         raise InvalidRequest("edges", f"a {type(edges).__name__}", fix)
@@ -127,7 +127,7 @@ def check_edges(edges: object, rows: int) -> Int64:
 
 
 def check_hand_poses(poses: object) -> Float32:
-    """Check (M, 4, 4) poses T_cloud_hand; InvalidRequest: wrong type or shape, or not rigid."""
+    """Check (M, 4, 4) poses T_cloud_hand; raises InvalidRequest unless they are rigid."""
     fix = "Send floats of shape (M, 4, 4): T_cloud_hand."
     if not isinstance(poses, np.ndarray):
         raise InvalidRequest("hand_poses", f"a {type(poses).__name__}", fix)

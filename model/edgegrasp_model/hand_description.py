@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from edgegrasp_camera.arrays import Bools, Float32, Floats, Int64
+from edgegrasp_model.candidates.collision import APPROACH_LENGTH, NEAR, HandView
 from edgegrasp_model.candidates.edge_grasps import Candidates, support_clearance
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view import APPROACH_LENGTH, NEAR, HandView
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import UP, Cloud
@@ -80,11 +80,20 @@ def describe_hands(
     if depths is None:
         depths = DepthMap.of_each(cloud.points, around.viewpoints, up)
     unseen = unseen_space(depths, hands, seen.first_met, ends)
+    toward = np.zeros((len(mirrored), 3), dtype=np.float32)
+    if around.viewpoint is not None:
+        toward = around.viewpoint - hands[:, :3, 3]
+        toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
+    ups = np.broadcast_to(up / np.linalg.norm(up), toward.shape)
+    length, swing = gripper.tip_z - gripper.palm_z, gripper.max_tip_z - gripper.tip_z
+    thick = max(high[1] for _, high in gripper.finger_boxes)
+    measures = gripper.max_opening, length, gripper.pad_half_width, thick, swing  # of a finger
     columns = [
         *seen.hits.T,
         *seen.between.T,
         seen.cut_off,
-        *_directions(hands, mirrored, around.viewpoint, up),
+        *np.einsum("ed,edk->ke", toward, mirrored),  # 0 where the camera is unknown
+        *np.einsum("ed,edk->ke", ups, mirrored),
         *unseen.parts,
         *_stance(around, candidates, gripper),
         # Older networks read only the first numbers, so new ones are appended here.
@@ -93,7 +102,7 @@ def describe_hands(
         *unseen.beyond,
         unseen.free,
         *seen.runs.T,
-        *np.tile(_measures(gripper), (len(candidates), 1)).T,
+        *np.tile(measures, (len(candidates), 1)).T,
     ]
     if size > len(columns):
         of_object = cloud.points, around.object_of_point, candidates.contact_index
@@ -141,13 +150,6 @@ def without_support(description: Floats) -> Floats:
     return unknown
 
 
-def _measures(gripper: Gripper) -> list[float]:
-    """Opening, length, half width and thickness of a finger, and how far it swings; metres."""
-    length, swing = gripper.tip_z - gripper.palm_z, gripper.max_tip_z - gripper.tip_z
-    thick = max(high[1] for _, high in gripper.finger_boxes)
-    return [gripper.max_opening, length, gripper.pad_half_width, thick, swing]
-
-
 class _Seen(NamedTuple):
     """What E hands see of the cloud. Counts n are given as log(1 + n)."""
 
@@ -191,18 +193,6 @@ def _look(
     cut = np.zeros(len(normals), dtype=bool) if at_side is None else at_side
     _look_from_each(view.bounds, view.row, view.columns, normals, mirrored, side, cut, hand, seen)
     return seen
-
-
-def _directions(
-    T_cloud_hand: Float32, mirrored: Float32, viewpoint: Float32 | None, up: Float32
-) -> list[Float32]:
-    """Directions of the camera and of up on axes (E, 3, 3); 0 for an unknown camera."""
-    toward = np.zeros((len(mirrored), 3), dtype=np.float32)
-    if viewpoint is not None:
-        toward = viewpoint - T_cloud_hand[:, :3, 3]
-        toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
-    ups = np.broadcast_to(up / np.linalg.norm(up), toward.shape)
-    return [*np.einsum("ed,edk->ke", toward, mirrored), *np.einsum("ed,edk->ke", ups, mirrored)]
 
 
 def _stance(around: Surroundings, candidates: Candidates, gripper: Gripper) -> list[Float32]:

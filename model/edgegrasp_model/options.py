@@ -763,7 +763,7 @@ class DetectOptions(Strict):
 
 
 def parse_options(fields: object) -> DetectOptions:
-    """Build options from decoded JSON; InvalidRequest: a field is unknown or its value wrong."""
+    """Build options from decoded JSON; raises InvalidRequest, which names the field."""
     return parse(DetectOptions, fields, "options", DetectOptions.model_fields)
 
 

@@ -10,13 +10,17 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Floats, Int64
-from edgegrasp_model.candidates.collision import clearances, met_first, required_openings
+from edgegrasp_model.candidates.collision import (
+    clearances,
+    hand_views,
+    met_first,
+    required_openings,
+)
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_description import seen_part
 from edgegrasp_model.hand_kernels import non_max_suppression
-from edgegrasp_model.hand_view import hand_views
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Outcome, Ungraspable
 from edgegrasp_model.scene.cloud import UP

@@ -10,13 +10,7 @@ from dataclasses import replace
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    Field,
-    SkipValidation,
-    StrictBool,
-)
+from pydantic import AfterValidator, BeforeValidator, Field, SkipValidation, StrictBool
 
 from edgegrasp_camera.arrays import Array
 from edgegrasp_camera.clouds import CloudInput, read_point_cloud2, too_many
@@ -62,7 +56,13 @@ def decode_cloud(
 
     Also returns the options, in which the cameras of depth images are the viewpoints.
     """
-    source = _source(fields)
+    sources = [name for name in SOURCES if fields.get(name) is not None]
+    if not sources:
+        fix = "Send points in metres, point_cloud2, depth_images or a file."
+        raise InvalidRequest("cloud", "nothing", fix)
+    if len(sources) > 1:
+        raise InvalidRequest(sources[1], f"a cloud beside {sources[0]}", "Send one cloud.")
+    (source,) = sources
     if source == "depth_images":
         if options.viewpoint is not None:
             fix = "Leave it out: the viewpoints are the cameras of depth_images."
@@ -89,17 +89,6 @@ def decode_cloud(
             raise InvalidRequest(name, "an array beside the one in the cloud", "Send it once.")
         arrays[name] = decode_array(name, fields[name], max_points)
     return replace(cloud, **arrays), options
-
-
-def _source(fields: Mapping[str, Any]) -> str:
-    """The one of SOURCES that a request has."""
-    sources = [name for name in SOURCES if fields.get(name) is not None]
-    if not sources:
-        fix = "Send points in metres, point_cloud2, depth_images or a file."
-        raise InvalidRequest("cloud", "nothing", fix)
-    if len(sources) > 1:
-        raise InvalidRequest(sources[1], f"a cloud beside {sources[0]}", "Send one cloud.")
-    return sources[0]
 
 
 # Points and arrays beside them
@@ -202,11 +191,6 @@ FocalLength = Annotated[float, Field(gt=0.0, le=FARTHEST), numeric]
 PoseRow = tuple[Finite, Finite, Finite, Finite]
 
 
-def _by_name(value: object) -> object:
-    """Intrinsics by name, from four numbers or a matrix."""
-    return intrinsics_of(value)._asdict() if isinstance(value, list) else value
-
-
 class Intrinsics(Strict):
     """A pinhole camera without distortion; the centre of the top left pixel is (0, 0)."""
 
@@ -222,7 +206,8 @@ class CameraView(Strict):
     intrinsics: Annotated[
         Intrinsics,
         BeforeValidator(
-            _by_name, json_schema_input_type=Intrinsics | list[float] | list[list[float]]
+            lambda sent: intrinsics_of(sent)._asdict() if isinstance(sent, list) else sent,
+            json_schema_input_type=Intrinsics | list[float] | list[list[float]],
         ),
     ] = Field(description="by name, or fx, fy, cx, cy, or the 3 x 3 matrix")
     T_cloud_camera: Annotated[tuple[PoseRow, PoseRow, PoseRow, PoseRow], AfterValidator(rigid)] = (

@@ -50,7 +50,7 @@ class Following(StrEnum):
 
 
 class Pace(NamedTuple):
-    """Least processor time of a detection, seconds; 0: not measured."""
+    """Least processor time of a detection, seconds; 0 where it is not measured."""
 
     point: float = 0.0  # for each point of the cloud
     voxel: float = 0.0  # for each voxel in which grasps are searched

@@ -8,7 +8,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
+from edgegrasp_camera.arrays import Bools, Float32, Int64
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import distance_behind
 from edgegrasp_model.kernels import compiled
@@ -167,12 +167,19 @@ def visible_extents(
     """
     number = np.zeros(len(points), dtype=np.int64) if number is None else number
     labels, groups = np.unique(number[contact_index], return_inverse=True)
+    vertical = np.asarray(up, dtype=np.float64) / np.linalg.norm(np.asarray(up, dtype=np.float64))
     parts, sizes = [], np.zeros((len(labels), 3), dtype=np.float32)
     for row, label in enumerate(labels):
         part = points[number == label]
         part = part[:: -(-len(part) // EXTENT_POINTS)]
         parts.append(part)
-        sizes[row] = _size(part.astype(np.float64), np.asarray(up, dtype=np.float64))
+        exact = part.astype(np.float64)
+        height = exact @ vertical
+        flat = exact - exact.mean(axis=0) - (height - height.mean())[:, None] * vertical
+        spread = np.linalg.eigvalsh(flat.T @ flat / len(flat))  # ascending; the first is along up
+        # Length and width of a box whose surface spreads as the points do, and their height.
+        sizes[row, :2] = np.sqrt(12.0 * np.maximum(spread[:0:-1], 0.0))
+        sizes[row, 2] = np.ptp(height)
     extents = np.zeros((len(T_cloud_hand), NUM_EXTENTS), dtype=np.float32)
     if len(labels) == 0:
         return extents
@@ -184,15 +191,6 @@ def visible_extents(
     extents[:, -3:] = sizes[group]
     extents = np.clip(extents, -FARTHEST_EXTENT, FARTHEST_EXTENT)
     return extents
-
-
-def _size(points: Float64, up: Float64) -> list[float]:
-    """Length and width of a box whose surface spreads as points (P, 3) do, and their height."""
-    up = up / np.linalg.norm(up)
-    height = points @ up
-    flat = points - points.mean(axis=0) - (height - height.mean())[:, None] * up
-    spread = np.linalg.eigvalsh(flat.T @ flat / len(points))  # ascending; the first is along up
-    return [*np.sqrt(12.0 * np.maximum(spread[:0:-1], 0.0)).tolist(), float(np.ptp(height))]
 
 
 @compiled("contract")

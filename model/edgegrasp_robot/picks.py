@@ -22,14 +22,7 @@ from edgegrasp_model.scene.scene import Scene
 from edgegrasp_results import ArmPlan, ArmTrajectory, DetectedObject, Detection, Grasp
 from edgegrasp_robot.held import Held, can_leave, held_by, load_of, places_for
 from edgegrasp_robot.robot import GROUP, Robot
-from edgegrasp_robot.surroundings import (
-    HELD,
-    Load,
-    Surroundings,
-    carrying,
-    moved,
-    surrounded,
-)
+from edgegrasp_robot.surroundings import HELD, Load, Surroundings, carrying, moved, surrounded
 
 TRIED = 200  # most grasps that are tried with the arm, in their order
 PLACES = 6  # in a region, that the arm may be asked for with one grasp

@@ -149,7 +149,7 @@ class Scored(NamedTuple):
 
 
 def score_views(paths: list[Path], weights: list[Path]) -> Scored:
-    """Score the labelled grasps of views; ValueError: the weights are not of hand networks."""
+    """Score the labelled grasps of views; raises ValueError unless all are hand networks."""
     networks = [load_checkpoint(path) for path in weights]
     if any(metadata.network.architecture != "hand" for _, metadata in networks):
         raise ValueError("weights: hand networks are compared, such as edgegrasp-plus. Name those.")

@@ -47,23 +47,28 @@ SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM, HAND_STR
 HOUSEHOLD_STREAM = 6
 APPROACH_POINTS = 12  # few balls with many labels each are the cheapest to train on
 BIN_APPROACH_POINTS = 24  # walls block most hands there
+PACKED, PILE, BIN, TABLE = SceneKind.PACKED, SceneKind.PILE, SceneKind.BIN, SceneKind.TABLE
 # Four in ten scenes are those of the benchmark of the paper.
-_P, _H, _B, _T = SceneKind.PACKED, SceneKind.PILE, SceneKind.BIN, SceneKind.TABLE
-MIXTURE = (_P, _H, _B, _T, _B, _P, _T, _H, _B, _T)
-FURTHER_OBJECTS = {_P: 4, _H: 4, _B: 7, _T: 5}  # a scene holds one object and Poisson(this) more
+MIXTURE = (PACKED, PILE, BIN, TABLE, BIN, PACKED, TABLE, PILE, BIN, TABLE)
+FURTHER_OBJECTS = {
+    PACKED: 4,
+    PILE: 4,
+    BIN: 7,
+    TABLE: 5,
+}  # a scene holds one object and Poisson(this) more
 _ABOVE, _STEEP = (0.0, np.radians(40)), (np.radians(20), np.radians(75))
 _ANY_SIDE = 0.0, 2 * np.pi
 _LOW_TARGET = (MIDDLE, MIDDLE, 0.1)  # metres
-VIEWS = dict.fromkeys((_P, _H), ViewRange((0.45, 0.75), (0.0, np.radians(75)), _ANY_SIDE))
-VIEWS[_B] = ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET)
-VIEWS[_T] = ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET)
+VIEWS = dict.fromkeys((PACKED, PILE), ViewRange((0.45, 0.75), (0.0, np.radians(75)), _ANY_SIDE))
+VIEWS[BIN] = ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET)
+VIEWS[TABLE] = ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET)
 # Of household objects, more from one side: a tall or wide one hides its back there.
 SIDE_VIEWS = ViewRange((0.5, 1.2), (np.radians(40), np.radians(80)), _ANY_SIDE, _LOW_TARGET)
 KEPT_DISTANCE = 0.18  # metres from the nearest hand that was tried: from its axis there,
 BEHIND_TIPS = 0.1122  # metres behind the fingertips, where the Panda's frame is
 AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
 # Of the views that are not cut off, where support and workspace are given.
-GIVEN_SHARE = {_P: 0.0, _H: 0.0, _B: 0.7, _T: 0.3}
+GIVEN_SHARE = {PACKED: 0.0, PILE: 0.0, BIN: 0.7, TABLE: 0.3}
 AIMED_SHARE = 0.85  # of the views of bins and tables with grasps of the objects alone
 AIM_MARGIN = np.array([[-0.005], [0.005]])  # metres around an object
 AROUND_MARGIN = 0.006  # metres around an obstacle
@@ -169,7 +174,7 @@ def generate_scene(
     # Some scenes are made of the other kind's objects, where there are any.
     source = kind.objects
     if streams[SCENE_STREAM].random() < OTHER_OBJECTS:
-        other = SceneKind.PILE if source is SceneKind.PACKED else SceneKind.PACKED
+        other = PILE if source is PACKED else PACKED
         source = other if other in sets else source
     views = []
     with TemporaryDirectory() as shapes:
@@ -184,10 +189,10 @@ def generate_scene(
         gripper = hand_of_scene(options.gripper, streams[HAND_STREAM])
         hand = "" if gripper is None else json.dumps(gripper)
         with ClutterSimulation(made_of, engine=options.engine, gripper=gripper) as simulation:
-            low, high = PACKED_SCALE if kind.objects is SceneKind.PACKED else PILE_SCALE
+            low, high = PACKED_SCALE if kind.objects is PACKED else PILE_SCALE
             sizes = low * WIDER_SCALES[0], high * WIDER_SCALES[1]
             sizes = HOUSEHOLD_SCALE if household else sizes
-            aside = household and kind is not SceneKind.BIN
+            aside = household and kind is not BIN
             seen_from = SIDE_VIEWS if aside else VIEWS[kind]
             hard = _make_scene(simulation, kind, seen_from, sizes, options, streams)
             models = [model.origin or model for model in simulation.object_models]
@@ -259,7 +264,7 @@ def ask(
     support is given, not quite where it is, or has to be found.
     """
     noise, choice = streams[NOISE_STREAM], streams[CHOICE_STREAM]
-    open_table = kind in (SceneKind.PACKED, SceneKind.PILE)
+    open_table = kind in (PACKED, PILE)
     around = not open_table or noise.random() < AROUND_SHARE
     seen = _noise(noise)
     observation = simulation.observe_from(
@@ -277,7 +282,7 @@ def ask(
     objects = _objects_of(simulation) if aimed else None
     fields = simulation.gripper
     request = DetectOptions(
-        num_approach_points=BIN_APPROACH_POINTS if kind is SceneKind.BIN else APPROACH_POINTS,
+        num_approach_points=BIN_APPROACH_POINTS if kind is BIN else APPROACH_POINTS,
         seed=int(choice.integers(2**32)),
         viewpoint=tuple(observation.camera_position.tolist()),
         support=support,
@@ -335,7 +340,9 @@ def label(
     observation = query.observation
     found = choose_grasps(query, options, rng, hard=hard)
     if found is None:
-        return _empty(observation)
+        nothing, rows = np.empty((0, 3), dtype=np.float32), np.empty(0, dtype=np.int64)
+        camera, success = observation.camera_position, rows.astype(np.int8)
+        return LabelledView(nothing, nothing, camera, rows, rows, None, success)
     selected, scene, candidates = found
     T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
@@ -427,9 +434,3 @@ def _chosen(
     left[free] = False
     left[hit[: round((1.0 - FREE_SHARE) * count)]] = False
     return np.flatnonzero(~left)
-
-
-def _empty(observation: Observation) -> LabelledView:
-    nothing, rows = np.empty((0, 3), dtype=np.float32), np.empty(0, dtype=np.int64)
-    camera, success = observation.camera_position, rows.astype(np.int8)
-    return LabelledView(nothing, nothing, camera, rows, rows, None, success)

@@ -191,7 +191,9 @@ def _scissors(rng: Random) -> list[Part]:
         eye = _wedges(_oval(1.0, 8) * rod + (loop, 0.0), np.linspace(0, 2 * np.pi, COARSE + 1))
         long = np.diag([rng.uniform(1.0, 1.5), 1.0, 1.0])
         eye = _placed(eye, long, (-shank - loop, side * 0.3 * loop, thick / 2))
-        parts += _placed([flat, *eye], _turn(side * spread / 2), (0.0, 0.0, side * thick / 2))
+        c, s = np.cos(side * spread / 2), np.sin(side * spread / 2)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        parts += _placed([flat, *eye], turn, (0.0, 0.0, side * thick / 2))
     return [*parts, _solid([0.005, 0.005], [-thick, 2 * thick])]
 
 
@@ -377,11 +379,6 @@ def _placed(parts: list[Part], *moves: Float64 | tuple[float, ...]) -> list[Part
         else:
             parts = [(vertices + move, faces) for vertices, faces in parts]
     return parts
-
-
-def _turn(angle: float) -> Float64:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 @lru_cache(maxsize=64)

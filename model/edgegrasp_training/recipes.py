@@ -34,7 +34,7 @@ RECIPES: dict[str, NetworkConfig] = {
 
 
 def recipe(name: str) -> CheckpointMetadata:
-    """The metadata of a new network of that name; ValueError: there is no such recipe."""
+    """The metadata of a new network of that name; raises ValueError for an unknown one."""
     if name not in RECIPES:
         raise ValueError(f"model: got {name!r}. Use one of: {', '.join(RECIPES)}.")
     return CheckpointMetadata(name, RECIPES[name], VOXEL_SIZE, GRIPPER)

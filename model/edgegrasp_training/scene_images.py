@@ -88,7 +88,7 @@ def generate(
 
 
 def make_image(rng: np.random.Generator, scene: SceneMeshes, pose: Float64) -> SceneImage | None:
-    """What a depth camera at `pose` (T_world_camera) sees; None: too near, or no object in view."""
+    """The image of a depth camera at `pose` (T_world_camera); None if too near or empty."""
     focal = WIDTH / 2 / np.tan(np.radians(rng.uniform(35, 80)) / 2)
     camera = Intrinsics(WIDTH, HEIGHT, focal, WIDTH / 2, HEIGHT / 2, 0.1, 13.0)
     depth, label, steep = _cast(_casting_of(scene), scene.parts, camera, pose)

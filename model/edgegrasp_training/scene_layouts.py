@@ -1,8 +1,8 @@
 """The scenes that the `scene` network's training images show.
 
 A scene is a set of meshes: objects on a table, on the floor, in a bin, in a tray or on shelves, and
-what else stands around. Objects are put down geometrically, each as low as what lies there already
-lets it: no physics engine could make as many scenes in the time.
+what else stands around. Objects are put down geometrically, each as low as those
+below let it: no physics engine could make as many scenes in the time.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ class SceneMeshes:
 
     rng: np.random.Generator  # of all that is drawn
     pool: Sequence[PoolMesh]  # objects to draw from
-    arms: Sequence[Mesh]  # the same of robots
+    arms: Sequence[Mesh]  # robot arms to draw from
     parts: list[tuple[Mesh, int]] = field(default_factory=list)  # and the label of each
     centres: list[Float64] = field(default_factory=list)  # of the objects
     elevation: tuple[float, float] = (0.25, 1.5)  # radians above level, of the camera
@@ -399,7 +399,7 @@ class HeightMap:
 
 def _lay_objects(
     scene: SceneMeshes,
-    heights: HeightMap,  # what lies there; its origin is `origin` of the scene
+    heights: HeightMap,  # of the surface so far; its origin is `origin` of the scene
     count: int,  # how many are tried
     how: str,
     origin: Sequence[float] = (0.0, 0.0, 0.0),  # (3,) metres
@@ -435,7 +435,7 @@ def _lowest_place(
     around: float,
     ceiling: float,
 ) -> Float64 | None:
-    """The shift (3,) that puts an object's points lowest, of some tried; None: it fits nowhere."""
+    """The shift (3,), of some tried, that puts an object's points lowest; None if none fits."""
     best: tuple[float, Float64] | None = None
     for _ in range(1 if how == "heap" else 10):
         place = rng.uniform(-room, room)

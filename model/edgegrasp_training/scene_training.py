@@ -279,16 +279,13 @@ def train(
             averaged = mean.module
             assert isinstance(averaged, SceneNet)
             losses = f"train {_text(running)} held {_text(evaluate(averaged, held))}"
-            _save(averaged, fit_confidence(averaged, held), run / "scene.safetensors")
+            weights = {name: value.contiguous() for name, value in averaged.state_dict().items()}
+            partial = run / "scene.partial"
+            confidence = json.dumps(fit_confidence(averaged, held))
+            save_file(weights, partial, {"confidence": confidence})
+            partial.replace(run / "scene.safetensors")
             with (run / "log.txt").open("a") as log:
                 log.write(f"{step} {now - begin:.0f}s images {len(images)} {losses}\n")
-
-
-def _save(network: SceneNet, confidence: list[float], path: Path) -> None:
-    weights = {name: value.contiguous() for name, value in network.state_dict().items()}
-    partial = path.with_suffix(".partial")
-    save_file(weights, partial, {"confidence": json.dumps(confidence)})
-    partial.replace(path)
 
 
 def _files(data: Path) -> list[Path]:

@@ -7,12 +7,7 @@ import numpy as np
 import torch
 
 from edgegrasp_camera.arrays import Int64
-from edgegrasp_model.candidates.edge_grasps import (
-    Candidates,
-    crop_balls,
-    edge_grasps,
-    retract,
-)
+from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls, edge_grasps, retract
 from edgegrasp_model.candidates.outline import outline_grasps, outlines
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.scene.cloud import Cloud

@@ -92,7 +92,13 @@ class Trainer:
         self.seconds = 0.0  # spent in training steps
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).is_file():
-            self._resume()
+            state: dict[str, Any] = torch.load(
+                self.folder / STATE_FILE, weights_only=True, map_location=self.device
+            )
+            for name in STATEFUL:
+                getattr(self, name).load_state_dict(state[name])
+            for name in COUNTERS:
+                setattr(self, name, state[name])
         else:
             self._standardise(known)
 
@@ -289,12 +295,3 @@ class Trainer:
         partial = self.folder / (STATE_FILE + ".partial")
         torch.save(state, partial)
         partial.replace(self.folder / STATE_FILE)
-
-    def _resume(self) -> None:
-        state: dict[str, Any] = torch.load(
-            self.folder / STATE_FILE, weights_only=True, map_location=self.device
-        )
-        for name in STATEFUL:
-            getattr(self, name).load_state_dict(state[name])
-        for name in COUNTERS:
-            setattr(self, name, state[name])

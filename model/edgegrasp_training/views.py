@@ -155,7 +155,7 @@ def different(paths: Iterable[Path], name: Literal["engine", "gripper"]) -> set[
 
 
 def find_views(folders: list[Path]) -> list[Path]:
-    """All view files of some folders, sorted by name; FileNotFoundError: there is none."""
+    """All view files of some folders, sorted by name; raises FileNotFoundError without any."""
     paths = [path for folder in folders for path in folder.glob("*.npz")]
     if not paths:
         names = ", ".join(str(folder) for folder in folders)

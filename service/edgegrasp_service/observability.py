@@ -69,14 +69,6 @@ class Call:
         """Record the end of a stage, which began when the previous one ended."""
         self.stages[name] = time.monotonic() - self.start - sum(self.stages.values())
 
-    def end(self) -> None:
-        """Record its end and its code."""
-        self.seconds = time.monotonic() - self.start
-        if self.transport == "http":
-            self.code = self.code or "499"  # the caller disconnected; nginx's code
-        else:
-            self.code = "OK" if self.problem is None else self.problem.code
-
 
 @lru_cache(1024)
 def network_of(address: str) -> str:

@@ -68,7 +68,7 @@ class Tokens:
 
 
 def load_tokens(settings: Settings) -> Tokens:
-    """The tokens in the files that the settings name; InvalidSettings: they cannot be used."""
+    """The tokens in the files that the settings name; raises InvalidSettings for a bad file."""
     tokens = _read_tokens("token_file", settings.token_file)
     return Tokens(tokens + _read_tokens("admin_token_file", settings.admin_token_file))
 
@@ -105,7 +105,7 @@ def _digest(token: str) -> bytes:
 
 
 class ServerTls:
-    """TLS of both transports; InvalidSettings: a file cannot be read, or does not match its key."""
+    """TLS of both transports; raises InvalidSettings for files that do not belong together."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings

@@ -77,10 +77,6 @@ class Server:
         if settings.outcomes_file is not None:
             check_outcomes(settings.outcomes_file)
         self.reloader = Reloader(self.service, self._tls, self.metrics.reloaded)
-        self._watch()
-        self.http_url = self.grpc_address = ""  # once ports are open: http://host:port, host:port
-
-    def _watch(self) -> None:
         service, admission, pool = self.service, self.service.admission, self.pool
         watch = self.metrics.watch
         watch("ready", "1: requests are answered", lambda: service.ready)
@@ -90,6 +86,7 @@ class Server:
         watch("queue_depth", waiting, lambda: max(0, admission.tickets - pool.busy))
         watch("held_bytes", "bytes of bodies in the server", lambda: admission.held_bytes)
         watch("workers", "worker processes", lambda: len(pool.pids))
+        self.http_url = self.grpc_address = ""  # once ports are open: http://host:port, host:port
 
     async def serve(
         self,
@@ -131,7 +128,11 @@ class Server:
                 await stopped
             finally:
                 load_task.cancel()
-                await self._drain(grpc_server)
+                self.service.stopping.set()  # new requests are refused, accepted ones answered
+                await grpc_server.set_serving(False)
+                notice = min(NOTICE_SECONDS, self._settings.grace_seconds)
+                await asyncio.sleep(notice)
+                await self.service.drain(self._settings.grace_seconds - notice)
                 http_server.should_exit = True
                 await asyncio.gather(http_task, grpc_server.stop(CLOSE_SECONDS))
                 stopped.cancel()
@@ -146,14 +147,6 @@ class Server:
         if not self.service.stopping.is_set():
             await grpc_server.set_serving(True)
             ready()
-
-    async def _drain(self, grpc_server: GrpcServer) -> None:
-        """Refuse new requests; wait until accepted ones are answered or the grace period ends."""
-        self.service.stopping.set()
-        await grpc_server.set_serving(False)
-        notice = min(NOTICE_SECONDS, self._settings.grace_seconds)
-        await asyncio.sleep(notice)
-        await self.service.drain(self._settings.grace_seconds - notice)
 
     def _http_server(self, places: Places) -> "_HttpServer":
         tls = self._tls
@@ -274,7 +267,9 @@ def _listen(host: str, port: int) -> socket.socket:
     if host.startswith(UNIX):
         family, place = socket.AF_UNIX, f"{host.removeprefix(UNIX)}/http.sock"
         address = place
-        _remove_unused(place)
+        with socket.socket(socket.AF_UNIX) as trying:  # a stale socket goes
+            if trying.connect_ex(place) == errno.ECONNREFUSED:
+                Path(place).unlink(missing_ok=True)
     try:
         listening = socket.create_server(address, family=family, backlog=BACKLOG)
     except OSError as error:
@@ -286,13 +281,6 @@ def _listen(host: str, port: int) -> socket.socket:
         # What nobody reads stays in this process, which counts it, and not in the kernel.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, PIECE)
     return listening
-
-
-def _remove_unused(path: str) -> None:
-    """Remove a stale Unix domain socket, but not one that a server listens on."""
-    with socket.socket(socket.AF_UNIX) as trying:
-        if trying.connect_ex(path) == errno.ECONNREFUSED:
-            Path(path).unlink(missing_ok=True)
 
 
 def _url(scheme: str, listening: socket.socket) -> str:

@@ -7,13 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edgegrasp_cli.real_scenes import (
-    SceneFigures,
-    compare_labels,
-    judge,
-    load_scene,
-    renumbered,
-)
+from edgegrasp_cli.real_scenes import SceneFigures, compare_labels, judge, load_scene, renumbered
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_results import Grasp
 

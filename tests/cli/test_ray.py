@@ -19,12 +19,7 @@ from benchmarks.load import OPTIONS
 from benchmarks.load import cloud as table
 from tests.programs import EDGEGRASP, free_ports
 
-from edgegrasp_client import (
-    GraspClient,
-    GraspClientError,
-    InvalidRequestError,
-    UnknownModelError,
-)
+from edgegrasp_client import GraspClient, GraspClientError, InvalidRequestError, UnknownModelError
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import load_catalogue

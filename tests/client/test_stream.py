@@ -5,12 +5,7 @@ from collections.abc import AsyncIterator, Iterator
 
 import pytest
 
-from edgegrasp_client import (
-    AsyncGraspClient,
-    GraspClient,
-    InvalidRequestError,
-    StreamRequest,
-)
+from edgegrasp_client import AsyncGraspClient, GraspClient, InvalidRequestError, StreamRequest
 
 
 def test_answers_are_those_of_single_requests(client, cloud) -> None:

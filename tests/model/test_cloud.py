@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.scene.cloud import (
-    CloudInput,
-    check_cloud,
-    seen_from_origin,
-)
+from edgegrasp_model.scene.cloud import CloudInput, check_cloud, seen_from_origin
 
 GOOD = np.random.default_rng(0).uniform(0.0, 0.3, (12, 3)).astype(np.float32)
 

@@ -7,9 +7,7 @@ import torch
 
 from edgegrasp_model.candidates.edge_grasps import Candidates, edge_grasps
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_description import (
-    Surroundings,
-)
+from edgegrasp_model.hand_description import Surroundings
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import HAND, NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch

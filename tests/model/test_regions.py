@@ -7,12 +7,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import (
-    Indices,
-    Mask,
-    Region,
-    Segments,
-)
+from edgegrasp_model.options import Indices, Mask, Region, Segments
 from edgegrasp_model.scene.cloud import CheckedCloud, CloudInput, check_cloud, voxelise
 from edgegrasp_model.scene.regions import check_region, inside_region
 

@@ -8,16 +8,7 @@ from edgegrasp_model.results import SUPPORT
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Detection
 
-from .rendered import (
-    BACKGROUND,
-    box,
-    boxes_on_table,
-    camera,
-    render,
-    seen_box,
-    table,
-    to_world,
-)
+from .rendered import BACKGROUND, box, boxes_on_table, camera, render, seen_box, table, to_world
 from .scenes import detector
 
 ORIGIN = (0.0, 0.0, 0.0)

@@ -8,10 +8,7 @@ from edgegrasp_model.options import parse_options
 from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_model.scene.scene import build_scene, select_points
 from edgegrasp_model.scene.segment import FIXED, Segmentation
-from edgegrasp_model.scene.support import (
-    Seen,
-    choose_support,
-)
+from edgegrasp_model.scene.support import Seen, choose_support
 
 CAMERA = np.array([0.0, -0.5, 0.4])
 PLANE = {"normal": (0.0, 0.0, 1.0), "offset": 0.05, "max_depth_error": 0.12}

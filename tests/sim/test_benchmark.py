@@ -10,12 +10,7 @@ from pathlib import Path
 import pytest
 from examples.your_planner import plan
 
-from edgegrasp_sim.benchmark import (
-    BenchmarkConfig,
-    RoundRunner,
-    manifest,
-    run_benchmark,
-)
+from edgegrasp_sim.benchmark import BenchmarkConfig, RoundRunner, manifest, run_benchmark
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.results import ResultFolder, attempts_digest

@@ -1,10 +1,7 @@
 import numpy as np
 import pytest
 
-from edgegrasp_sim.camera import (
-    look_at,
-    points_of,
-)
+from edgegrasp_sim.camera import look_at, points_of
 from edgegrasp_sim.engine import Intrinsics, World
 
 CENTRE = np.array([0.15, 0.12, 0.10])

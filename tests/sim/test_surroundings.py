@@ -7,13 +7,7 @@ from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.hand import FINGERTIP, FailureCause
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
-from edgegrasp_sim.surroundings import (
-    MIDDLE,
-    OPEN_TABLE,
-    TABLE_HEIGHT,
-    Box,
-    Surroundings,
-)
+from edgegrasp_sim.surroundings import MIDDLE, OPEN_TABLE, TABLE_HEIGHT, Box, Surroundings
 
 ABOVE = look_at(np.array([MIDDLE, MIDDLE, 0.9]), np.array([MIDDLE, MIDDLE, 0.1]))  # T_world_camera
 

@@ -13,14 +13,7 @@ from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol
 from edgegrasp_sim.results import summarise
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.trial import (
-    PlannedGrasp,
-    Planner,
-    Round,
-    RoundDriver,
-    RoundEnd,
-    StartCollides,
-)
+from edgegrasp_sim.trial import PlannedGrasp, Planner, Round, RoundDriver, RoundEnd, StartCollides
 
 MakeProtocol = Callable[[int], Protocol]
 PACKED, PILE, *_ = SceneKind

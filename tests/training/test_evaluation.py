@@ -8,11 +8,7 @@ from scipy.special import expit
 
 from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
-from edgegrasp_training.evaluation import (
-    evaluate_scores,
-    reliability,
-    score_views,
-)
+from edgegrasp_training.evaluation import evaluate_scores, reliability, score_views
 
 
 def test_the_temperature_undoes_overconfidence() -> None:

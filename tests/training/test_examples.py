@@ -8,11 +8,7 @@ from edgegrasp_model.hand_description import Surroundings
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.scene.scene import near_workspace_side
-from edgegrasp_training.examples import (
-    pack_balls,
-    pack_hands,
-    tried_grasps,
-)
+from edgegrasp_training.examples import pack_balls, pack_hands, tried_grasps
 from edgegrasp_training.recipes import LENGTH_UNIT
 from edgegrasp_training.views import TABLE, UP, WORKSPACE
 

@@ -8,10 +8,7 @@ import torch
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_training.options import TrainingOptions
-from edgegrasp_training.recipes import (
-    RECIPES,
-    recipe,
-)
+from edgegrasp_training.recipes import RECIPES, recipe
 from edgegrasp_training.training import Trainer
 from edgegrasp_training.views import find_views, split_by_scene
 

@@ -8,12 +8,7 @@ import pytest
 
 from edgegrasp_model.gripper import gripper_fields, load_gripper
 from edgegrasp_sim.objects import CLUTTER, ObjectSet
-from edgegrasp_training.views import (
-    find_views,
-    load_view,
-    scene_of,
-    split_by_scene,
-)
+from edgegrasp_training.views import find_views, load_view, scene_of, split_by_scene
 
 SAMPLE = Path(__file__).parents[2] / "examples" / "labelled_views"
 

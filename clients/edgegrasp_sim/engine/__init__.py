@@ -186,7 +186,7 @@ class World(Protocol):
         """Add an open hand with its centre of mass there; a world may have one."""
 
     def add_arm(self, arm: ArmModel, model: HandModel) -> "Arm":
-        """Add an arm at its home with an open hand on it; ValueError: this engine has no arms."""
+        """Add an arm at its home with an open hand; raises ValueError if the engine has no arms."""
         raise ValueError(f"engine is {self.name}; an arm takes mujoco")
 
     def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:

@@ -28,7 +28,7 @@ from edgegrasp_sim.engine import (
     Vector,
     World,
 )
-from edgegrasp_sim.engine.urdf import Surface, read_urdf
+from edgegrasp_sim.engine.urdf import read_urdf
 from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
 
 SUBSTEPS = 4  # of 3.125 ms in each time step
@@ -184,7 +184,15 @@ class MujocoWorld(World):
         corners = np.concatenate([hull.points for hull in shape.hulls])
         _weigh(body, mass, corners)
         for number, surface in enumerate(shape.visible):
-            self._add_surface(body, f"{body.name} visible {number}", surface)
+            name = f"{body.name} visible {number}"  # which the camera sees, and nothing touches
+            self.spec.add_mesh(
+                name=name,
+                uservert=surface.points.ravel(),
+                userface=surface.faces.ravel().astype(np.int32),
+                inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+            )
+            kind = mujoco.mjtGeom.mjGEOM_MESH
+            body.add_geom(type=kind, meshname=name, contype=0, conaffinity=0, group=_VISIBLE)
         for number, hull in enumerate(shape.hulls):
             self._add_hull(body, f"{body.name} {number}", hull.points, friction=(friction, 0, 0))
         added = MujocoBody(self, body, corners)
@@ -302,17 +310,6 @@ class MujocoWorld(World):
         self._bodies += 1
         self._changed = True
         return self.spec.worldbody.add_body(name=name, pos=position, quat=(w, x, y, z))
-
-    def _add_surface(self, body: Any, name: str, surface: Surface) -> None:
-        """Add what the camera sees, which touches nothing."""
-        self.spec.add_mesh(
-            name=name,
-            uservert=surface.points.ravel(),
-            userface=surface.faces.ravel().astype(np.int32),
-            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
-        )
-        kind = mujoco.mjtGeom.mjGEOM_MESH
-        body.add_geom(type=kind, meshname=name, contype=0, conaffinity=0, group=_VISIBLE)
 
     def _add_hull(self, body: Any, name: str, points: Matrix, **contact: Any) -> None:
         """Add the convex hull of points (P, 3) for contacts."""

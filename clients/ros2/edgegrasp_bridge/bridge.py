@@ -16,14 +16,7 @@ from edgegrasp_camera.arrays import Array, Float64
 from edgegrasp_camera.clouds import read_point_cloud2
 from edgegrasp_camera.depth import intrinsics_of, metres, unproject
 from edgegrasp_camera.picture import fork
-from edgegrasp_client import (
-    Detection,
-    Grasp,
-    GraspClient,
-    GraspTracker,
-    object_in_scene,
-    on_mask,
-)
+from edgegrasp_client import Detection, Grasp, GraspClient, GraspTracker, object_in_scene, on_mask
 from edgegrasp_client.conversions import (
     PANDA_JOINTS,
     FingerJoints,
@@ -115,7 +108,7 @@ class Scene(NamedTuple):
 
     @property
     def header(self) -> Any:
-        """That of the message that the points are from; None: there is none yet."""
+        """The header of the message that the points come from; None before the first one."""
         source = self.cloud if self.cloud is not None else self.depth
         return None if source is None else source.header
 
@@ -214,7 +207,7 @@ def detect(
         tracker: Made with `options`: what it remembers is followed.
 
     Raises:
-        GraspClientError: As of the client.
+        GraspClientError: The server is unavailable or refuses the request.
         ValueError: There is no message to detect in, or one that cannot be read.
         InvalidRequest: A cloud or an image does not match its fields.
     """
@@ -285,7 +278,7 @@ def marker_array(found: Found) -> Message:
 
 
 def trajectories(found: Found) -> list[Message]:
-    """The motion to the best pick and on, as trajectory_msgs/JointTrajectory; empty: none."""
+    """The motion to the best pick and on, as trajectory_msgs/JointTrajectory; empty without one."""
     pick = found.detection.best_pick
     motion = None if pick is None or pick.arm is None else pick.arm.trajectory
     return [] if motion is None else joint_trajectories(motion)
@@ -364,7 +357,7 @@ def depth_array(image: Any) -> Array:
 
 
 def image_array(image: Any) -> Array:
-    """The values of a sensor_msgs/Image: (H, W), or (H, W, C); ValueError: of another encoding."""
+    """The values (H, W) or (H, W, C) of a sensor_msgs/Image; raises ValueError for its encoding."""
     if image.encoding not in ENCODINGS:
         known = ", ".join(ENCODINGS)
         raise ValueError(f"encoding: got {image.encoding!r}. Send one of: {known}.")
@@ -392,7 +385,7 @@ def camera_matrix(camera: Any) -> Float64:
 
 
 def cloud_points(cloud: Any) -> Float64:
-    """Points (N, 3) of a sensor_msgs/PointCloud2, NaN for holes; InvalidRequest: it is broken."""
+    """Points (N, 3) of a sensor_msgs/PointCloud2, NaN for holes; raises InvalidRequest."""
     points = read_point_cloud2(cloud).points
     return np.asarray(points, dtype=np.float64).reshape(-1, 3)
 

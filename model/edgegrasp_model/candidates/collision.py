@@ -1,10 +1,12 @@
-"""Collision checks of the hand, its clearance, and the opening that its fingers need."""
+"""The points near a hand, its collisions and clearance, and the opening its fingers need."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
 from edgegrasp_model.candidates.edge_grasps import support_clearance
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import (
@@ -13,14 +15,15 @@ from edgegrasp_model.hand_kernels import (
     points_in_hand_boxes,
     signed_distance_to_boxes,
 )
-from edgegrasp_model.hand_view import HandView
-from edgegrasp_model.options import Collision, SupportPlane
+from edgegrasp_model.options import Collision
 from edgegrasp_model.scene.cloud import UP, Cloud
 from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.segment import FIXED
 from edgegrasp_model.unseen import enters_unseen
 
+NEAR = 0.006  # metres around a finger that count as near it
+APPROACH_LENGTH = 0.05  # metres of straight approach that the hand description looks at
 FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
 MIN_FIXED = 8  # voxels of background between the fingers that keep them from closing
 TOUCH = 1e-6  # metres between the support plane and a hand that was retracted from it
@@ -46,11 +49,31 @@ def collides(
 
 def hits(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
     """Which open hands collide with the cloud, the support plane or an obstacle.  # (E,)."""
-    hit = hits_cloud(scene.cloud, T_cloud_hand, gripper, request)
+    boxes = gripper.open_boxes + request.margin * np.array([[-1.0], [1.0]])  # (B, 2, 3)
+    behind, lift = request.approach_length, 0.0  # metres along the hand's z, and straight up
+    if request.retreat_direction == "up":
+        lift = request.retreat_length
+    else:
+        behind = max(behind, request.retreat_length)
+    swept = boxes.copy()
+    swept[:, 0, 2] -= behind
+    hit = any_point_in_boxes(scene.cloud.points, T_cloud_hand, swept)
+    if lift > 0:
+        free = np.flatnonzero(~hit)
+        hit[free] = any_point_on_way(scene.cloud.points, T_cloud_hand[free], boxes, lift * UP)
     if scene.support is not None:
-        hit |= hits_support(T_cloud_hand, scene.support, gripper, request)
+        normal = np.asarray(scene.support.normal)
+        height = support_clearance(T_cloud_hand, scene.support, gripper)
+        rise = -T_cloud_hand[:, :3, 2] @ normal  # per metre of way back
+        lowest = np.minimum(height, height + behind * rise)
+        lowest = np.minimum(lowest, height + lift * (UP @ normal))
+        hit |= np.asarray(lowest < request.margin - TOUCH)
     if scene.obstacles is not None:
-        hit |= hits_obstacles(T_cloud_hand, scene.obstacles, gripper, request)
+        solid = _hits_any(SolidBoxes.of_hands(T_cloud_hand, swept), scene.obstacles, None)
+        if lift > 0:
+            way = lift * UP.astype(np.float64)
+            solid |= _hits_any(SolidBoxes.of_hands(T_cloud_hand, boxes), scene.obstacles, way)
+        hit |= solid.reshape(len(hit), len(boxes)).any(axis=1)
     return hit
 
 
@@ -67,44 +90,6 @@ def closes_on_background(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) 
     return np.bincount(hand, minlength=len(T_cloud_hand)) >= MIN_FIXED
 
 
-def hits_cloud(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
-    """Which open hands contain a point of the cloud.  # (E,)."""
-    boxes = inflated_boxes(gripper, request)
-    swept = swept_boxes(boxes, request)
-    hit = any_point_in_boxes(cloud.points, T_cloud_hand, swept)
-    if request.retreat_direction == "up" and request.retreat_length > 0:
-        free = np.flatnonzero(~hit)
-        way = request.retreat_length * UP
-        hit[free] = any_point_on_way(cloud.points, T_cloud_hand[free], boxes, way)
-    return hit
-
-
-def hits_support(
-    T_cloud_hand: Float32, support: SupportPlane, gripper: Gripper, request: Collision
-) -> Bools:
-    """Which hands come closer to the support plane than the margin.  # (E,)."""
-    normal = np.asarray(support.normal)
-    height = support_clearance(T_cloud_hand, support, gripper)
-    rise = -T_cloud_hand[:, :3, 2] @ normal  # per metre of way back
-    lowest = np.minimum(height, height + approach_sweep_length(request) * rise)
-    if request.retreat_direction == "up":
-        lowest = np.minimum(lowest, height + request.retreat_length * (UP @ normal))
-    return np.asarray(lowest < request.margin - TOUCH)
-
-
-def hits_obstacles(
-    T_cloud_hand: Float32, obstacles: SolidBoxes, gripper: Gripper, request: Collision
-) -> Bools:
-    """Which open hands overlap a box.  # (E,)."""
-    grown = inflated_boxes(gripper, request)
-    at_rest = SolidBoxes.of_hands(T_cloud_hand, swept_boxes(grown, request))
-    hit = _hits_any(at_rest, obstacles, None)
-    if request.retreat_direction == "up" and request.retreat_length > 0:
-        hands = SolidBoxes.of_hands(T_cloud_hand, grown)
-        hit |= _hits_any(hands, obstacles, request.retreat_length * UP.astype(np.float64))
-    return np.asarray(hit.reshape(len(T_cloud_hand), len(grown)).any(axis=1))
-
-
 def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
     """Metres (E,) from open hands (E, 4, 4) at the grasp to the nearest point, support or obstacle.
 
@@ -117,25 +102,6 @@ def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32
     if scene.obstacles is not None:
         nearest = _nearest_obstacle(scene.obstacles, T_cloud_hand, boxes, nearest)
     return nearest.astype(np.float32)
-
-
-def approach_sweep_length(request: Collision) -> float:
-    """Metres behind the grasp that the straight approach or retreat sweeps."""
-    out = request.retreat_length if request.retreat_direction == "back" else 0.0
-    return max(request.approach_length, out)
-
-
-def inflated_boxes(gripper: Gripper, request: Collision) -> Float64:
-    """Boxes (B, 2, 3) of the open hand with the margin around them."""
-    margin = request.margin * np.array([[-1.0], [1.0]])
-    return np.asarray(gripper.open_boxes + margin)
-
-
-def swept_boxes(boxes: Float64, request: Collision) -> Float64:
-    """Boxes (B, 2, 3) extended over the straight approach and retreat along the hand's z."""
-    swept = boxes.copy()
-    swept[:, 0, 2] -= approach_sweep_length(request)
-    return swept
 
 
 def _nearest_obstacle(
@@ -166,6 +132,37 @@ def _hits_any(boxes: SolidBoxes, obstacles: SolidBoxes, sweep: Float64 | None) -
         moved = None if sweep is None else np.tile(sweep, (len(near), 1))
         hit[near] = separation(boxes.take(near), theirs, moved) < 0
     return hit
+
+
+@dataclass(frozen=True)
+class HandView:
+    """Cloud points in hand frames, without those out of reach."""
+
+    candidate: Int64  # (P,) ascending
+    row: Int64  # (P,) row of the cloud
+    position: Float32  # (P, 3) in the hand frame
+    num_candidates: int
+
+    @cached_property
+    def columns(self) -> Float32:
+        """The positions as rows x, y, z (3, P), which is many times faster to process."""
+        return np.ascontiguousarray(self.position.T)
+
+    @cached_property
+    def bounds(self) -> Int64:
+        """Where the points of each hand begin, and the last's end: (E + 1,)."""
+        return np.searchsorted(self.candidate, np.arange(self.num_candidates + 1))
+
+
+def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandView:
+    """The points of a cloud that open hands (E, 4, 4) meet on a straight approach, or nearly."""
+    boxes = gripper.open_boxes
+    low = boxes[:, 0].min(axis=0) - np.array([NEAR, NEAR, APPROACH_LENGTH])
+    high = boxes[:, 1].max(axis=0) + np.array([NEAR, NEAR, 2 * NEAR])
+    high[2] += gripper.max_tip_z - gripper.tip_z
+    reach = low.astype(np.float32), high.astype(np.float32)
+    hand, row, position = points_in_hand_boxes(cloud.points, T_cloud_hand, *reach)
+    return HandView(hand, row, position, len(T_cloud_hand))
 
 
 def required_openings(met: Float32, gripper: Gripper) -> Float32:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgegrasp_camera.arrays import Bools, Float32, Int64
+from edgegrasp_model.candidates.collision import APPROACH_LENGTH
 from edgegrasp_model.candidates.edge_grasps import (
     EDGE_MARGIN,
     MIN_EDGE,
@@ -20,7 +21,6 @@ from edgegrasp_model.candidates.edge_grasps import (
 )
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import free_way
-from edgegrasp_model.hand_view import APPROACH_LENGTH
 from edgegrasp_model.kernels import extents_across, level_spread
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import UP, unit
@@ -99,7 +99,10 @@ def outline_grasps(
     edge = np.einsum("md,mkd->km", apart, frame[contact, 1:])
     between = (np.abs(edge[0]) < gripper.pad_half_width) & (edge[2] > -DROP)
     row = np.flatnonzero(between & (edge[1] > MIN_EDGE) & (edge[1] < gripper.max_opening))
-    extent = _extents(points, crop, pair[row], frame[contact[row]], gripper)
+    first, last = crop.bounds(crop.ball_of_point[pair[row]])
+    strip = np.array([gripper.pad_half_width, gripper.max_opening, DROP, GAP], dtype=np.float32)
+    # How far the surface extends between the pads from each contact, outward and inward: (M, 2).
+    extent = extents_across(points, crop.ball_rows, first, last, frame[contact[row]], strip)
     width = extent[:, 1] - extent[:, 0]
     held = (extent[:, 0] > -MIN_EDGE) & (width < gripper.max_opening - 2 * EDGE_MARGIN)
     held &= edge[1][row] < extent[:, 1] + MIN_EDGE  # the approach point lies on the same surface
@@ -116,15 +119,6 @@ def outline_grasps(
     depth = np.maximum(edge[2][row], 0.0)
     hands = Candidates(pair[row], approach[row], contact, -z, depth, pose)
     return _inserted(points, hands, support, gripper, margin)
-
-
-def _extents(
-    points: Float32, crop: BallCrop, pair: Int64, frame: Float32, gripper: Gripper
-) -> Float32:
-    """How far the surface at contacts (M,) extends between the pads, outward and inward (M, 2)."""
-    first, last = crop.bounds(crop.ball_of_point[pair])
-    strip = np.array([gripper.pad_half_width, gripper.max_opening, DROP, GAP], dtype=np.float32)
-    return extents_across(points, crop.ball_rows, first, last, frame, strip)
 
 
 def _inserted(

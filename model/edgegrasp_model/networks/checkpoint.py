@@ -62,7 +62,17 @@ def load_checkpoint(
             "Give a complete file written by `edgegrasp train` or `edgegrasp import-checkpoint`."
         ) from error
     metadata = replace(_read_metadata(path, text), digest=digest)
-    _check_tensors(path, tensors, metadata.tensors_digest)
+    for name, tensor in tensors.items():
+        if not tensor.isfinite().all():
+            raise InvalidCheckpoint(
+                f"checkpoint: got {path}, whose {name} holds NaN or infinity. Restore the file "
+                "from a copy, or train again."
+            )
+    if metadata.tensors_digest and _digest(tensors) != metadata.tensors_digest:
+        raise InvalidCheckpoint(
+            f"checkpoint: got {path}, whose weights are not those it was written with. Restore the "
+            "file from a copy."
+        )
     network = build_network(metadata.network)
     try:
         network.load_state_dict(tensors)
@@ -105,20 +115,6 @@ def _digest(tensors: Mapping[str, Tensor]) -> str:
         digest.update(name.encode())
         digest.update(tensors[name].numpy().tobytes())
     return digest.hexdigest()
-
-
-def _check_tensors(path: Path, tensors: Mapping[str, Tensor], expected: str) -> None:
-    for name, tensor in tensors.items():
-        if not tensor.isfinite().all():
-            raise InvalidCheckpoint(
-                f"checkpoint: got {path}, whose {name} holds NaN or infinity. Restore the file "
-                "from a copy, or train again."
-            )
-    if expected and _digest(tensors) != expected:
-        raise InvalidCheckpoint(
-            f"checkpoint: got {path}, whose weights are not those it was written with. Restore the "
-            "file from a copy."
-        )
 
 
 def _read_metadata(path: Path, text: str | None) -> CheckpointMetadata:

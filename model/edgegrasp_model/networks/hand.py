@@ -15,6 +15,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from edgegrasp_camera.arrays import Float32, Int64
+from edgegrasp_model.candidates.collision import hand_views
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_description import (
@@ -23,7 +24,6 @@ from edgegrasp_model.hand_description import (
     describe_hands,
     points_around_fingers,
 )
-from edgegrasp_model.hand_view import hand_views
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.layers import (
@@ -129,11 +129,9 @@ class HandNet(nn.Module):
         known = batch.description[:, : self.config.description_size]
         description = (known - self.mean) / self.std  # (E, F)
         encoder = PackedMlp(self.point_encoder)
-        chunks = [
-            _around(encoder, points, count)
-            for points, count in in_chunks(CHUNK, batch.points, batch.point_count)
-        ]
-        around = torch.cat(chunks)[: len(description)]  # (E, 2 C)
+        chunks = in_chunks(CHUNK, batch.points, batch.point_count)
+        around = torch.cat([_around(encoder, *chunk) for chunk in chunks])
+        around = around[: len(description)]  # (E, 2 C)
         seen = torch.cat((description, around), dim=1)
         if left_out is not None:
             draws = torch.rand(seen.shape, generator=left_out, device=left_out.device)

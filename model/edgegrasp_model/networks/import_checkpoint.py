@@ -74,7 +74,17 @@ def import_checkpoint(
     Voxel size and crop radius, metres, are those of the authors' evaluation. Returns what
     `save_checkpoint` takes; InvalidCheckpoint: a file is missing, or does not fit.
     """
-    number = _checkpoint_number(directory)
+    numbers = [
+        int(match[1])
+        for path in directory.glob("local_emd_model-ckpt-*.pt")
+        if (match := re.fullmatch(r"local_emd_model-ckpt-(\d+)\.pt", path.name))
+    ]
+    if len(numbers) != 1:
+        raise InvalidCheckpoint(
+            f"directory: got {directory} with {len(numbers)} files local_emd_model-ckpt-N.pt. "
+            "Give a directory with the files of exactly one checkpoint."
+        )
+    number = numbers[0]
     is_vn = (directory / f"std-ckpt-{number}.pt").exists()
     config = replace(VN_EDGEGRASP if is_vn else EDGEGRASP, crop_radius=crop_radius)
     theirs = {
@@ -100,20 +110,6 @@ def import_checkpoint(
         training={"source": "imported from the authors' layout", "checkpoint": number},
     )
     return network.eval(), metadata
-
-
-def _checkpoint_number(directory: Path) -> int:
-    numbers = [
-        int(match[1])
-        for path in directory.glob("local_emd_model-ckpt-*.pt")
-        if (match := re.fullmatch(r"local_emd_model-ckpt-(\d+)\.pt", path.name))
-    ]
-    if len(numbers) != 1:
-        raise InvalidCheckpoint(
-            f"directory: got {directory} with {len(numbers)} files local_emd_model-ckpt-N.pt. "
-            "Give a directory with the files of exactly one checkpoint."
-        )
-    return numbers[0]
 
 
 def _load_weights(path: Path) -> dict[str, Tensor]:

@@ -10,13 +10,7 @@ from scipy import ndimage
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import (
-    AutoPlane,
-    DetectOptions,
-    Region,
-    SupportPlane,
-    Workspace,
-)
+from edgegrasp_model.options import AutoPlane, DetectOptions, Region, SupportPlane, Workspace
 from edgegrasp_model.results import OBSTACLE, SUPPORT, UNLABELLED
 from edgegrasp_model.scene.cloud import (
     UP,
@@ -50,12 +44,7 @@ from edgegrasp_model.scene.segment import (
     with_risen,
     without_long,
 )
-from edgegrasp_model.scene.support import (
-    Seen,
-    Support,
-    choose_support,
-    correct_depth_scale,
-)
+from edgegrasp_model.scene.support import Seen, Support, choose_support, correct_depth_scale
 from edgegrasp_model.unseen import DepthMap
 
 MIN_POINTS = 4  # fewer are too few for a surface

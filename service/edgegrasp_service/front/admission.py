@@ -102,7 +102,7 @@ class Admission:
             self._leave(ticket)
 
     def _give_up(self, holder: str) -> bool:
-        """Refuse the client's latest request that no worker has started; false: there is none."""
+        """Refuse the latest request of a client that is not being worked on; false without one."""
         for ticket in reversed(self._tickets):
             if ticket.client == holder and not ticket.at_work:
                 held = sum(one.client == holder for one in self._tickets)
@@ -121,7 +121,7 @@ class Admission:
             self._wake()
 
     def hold(self, size: int) -> bool:
-        """Reserve bytes of no request, or free them (negative); returns whether they fit."""
+        """Reserve bytes outside of requests, or free them (negative); returns whether they fit."""
         if size > 0 and self.held_bytes + size > self._max_bytes:
             return False
         self.held_bytes += size

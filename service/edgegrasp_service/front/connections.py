@@ -66,7 +66,7 @@ T = TypeVar("T")
 
 @dataclass(eq=False)
 class Place:
-    """One of the places below."""
+    """A slot of `Places`."""
 
     owner: str
     lose: Callable[[], None]  # called on eviction

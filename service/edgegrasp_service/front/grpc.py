@@ -17,7 +17,6 @@ from typing import Any, NoReturn
 import grpc
 from google.protobuf import any as any_message
 from google.protobuf import duration
-from google.protobuf.any_pb2 import Any as AnyMessage
 from google.protobuf.message import DecodeError
 from google.protobuf.wrappers_pb2 import BytesValue
 from google.rpc.error_details_pb2 import (  # type: ignore[import-untyped]
@@ -191,8 +190,10 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
         metadata = context.invocation_metadata() or ()
         headers = {name: value for name, value in metadata if isinstance(value, str)}
         method, behave = self._behaviours.get(path, ("other", _unimplemented))
-        request_id, peer = headers.get(REQUEST_ID_HEADER, ""), _address(context.peer())
-        call = Call("grpc", method, request_id, peer)
+        # A peer is e.g. ipv4:127.0.0.1:5000, or ipv6:[::1]:5000 with encoded brackets.
+        _, _, peer = urllib.parse.unquote(context.peer()).partition(":")
+        address = peer.rpartition(":")[0].strip("[]")
+        call = Call("grpc", method, headers.get(REQUEST_ID_HEADER, ""), address)
         call.long = method in ("DetectGraspsStream", "HealthWatch", "Reflection")
         with self._service.observe(call):
             if (remaining := context.time_remaining()) is not None:
@@ -250,7 +251,13 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
                     waiting: set[asyncio.Task[Any]] = {ahead[0]} if ahead else set()
                     if reading and len(ahead) < service.settings.max_stream_requests:
                         waiting |= {reading, stopping}
-                    await _first_of(waiting, None if ahead else STREAM_IDLE_SECONDS)
+                    timeout = None if ahead else STREAM_IDLE_SECONDS
+                    done, _ = await asyncio.wait(
+                        waiting, timeout=timeout, return_when=asyncio.FIRST_COMPLETED
+                    )
+                    if not done:
+                        value = f"no message in {timeout:.0f} s"
+                        raise RequestTimeout("request", value, "Open another stream.")
                     if ahead and ahead[0].done():
                         response = ahead.popleft().result()
                         await send(service.settings, context.write(response), len(response))
@@ -338,16 +345,23 @@ def _serialized(message: Any) -> bytes:
     return data
 
 
-def _address(peer: str) -> str:
-    """The address in e.g. "ipv4:127.0.0.1:5000" or "ipv6:[::1]:5000", whose [ and ] are encoded."""
-    return urllib.parse.unquote(peer).partition(":")[2].rpartition(":")[0].strip("[]")
-
-
 async def _abort(call: Call, context: Any, problem: Problem) -> NoReturn:
     """End a call with an error: our ErrorDetail, google.rpc's details and the request id."""
     call.problem = problem
     code = grpc.StatusCode[problem.code]
-    status = Status(code=code.value[0], message=problem.detail, details=_details(problem))
+    reason = problem.kind.upper().replace("-", "_")
+    details: list[Any] = [ErrorInfo(reason=reason, domain=DOMAIN)]
+    if problem.retry_after is not None:
+        delay = duration.from_milliseconds(int(problem.retry_after * 1000))
+        details.append(RetryInfo(retry_delay=delay))
+    if problem.field:
+        violation = BadRequest.FieldViolation(field=problem.field, description=problem.detail)
+        details.append(BadRequest(field_violations=[violation]))
+    status = Status(
+        code=code.value[0],
+        message=problem.detail,
+        details=[any_message.pack(detail) for detail in details],
+    )
     trailing = (
         (ERROR_METADATA, error_detail(problem).SerializeToString()),
         (STATUS_METADATA, status.SerializeToString()),
@@ -363,27 +377,7 @@ def error_detail(problem: Problem) -> grasp_pb2.ErrorDetail:
     return grasp_pb2.ErrorDetail(**{name: getattr(problem, name) for name in names})
 
 
-def _details(problem: Problem) -> list[AnyMessage]:
-    reason = problem.kind.upper().replace("-", "_")
-    details: list[Any] = [ErrorInfo(reason=reason, domain=DOMAIN)]
-    if problem.retry_after is not None:
-        delay = duration.from_milliseconds(int(problem.retry_after * 1000))
-        details.append(RetryInfo(retry_delay=delay))
-    if problem.field:
-        violation = BadRequest.FieldViolation(field=problem.field, description=problem.detail)
-        details.append(BadRequest(field_violations=[violation]))
-    return [any_message.pack(detail) for detail in details]
-
-
 # Streams
-
-
-async def _first_of(tasks: set[asyncio.Task[Any]], timeout: float | None) -> None:
-    """Wait until one is done; raises RequestTimeout."""
-    done, _ = await asyncio.wait(tasks, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
-    if not done:
-        value = f"no message in {timeout:.0f} s"
-        raise RequestTimeout("request", value, "Open another stream.")
 
 
 async def _next_request(context: Any) -> dict[str, Any] | None:

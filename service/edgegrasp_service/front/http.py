@@ -7,10 +7,9 @@ import logging
 import math
 import mimetypes
 import re
-from collections.abc import AsyncIterator, Coroutine
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any
 
 import fastapi_offline
 from fastapi.encoders import jsonable_encoder
@@ -42,7 +41,7 @@ from edgegrasp_service.front.connections import (
 )
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics
-from edgegrasp_service.worker.process import PIECE, Answer, Job, Method
+from edgegrasp_service.worker.process import PIECE, Job, Method
 
 logger = logging.getLogger(__name__)
 
@@ -267,12 +266,20 @@ class _Work:
         call.limit(requested_timeout(headers))
         size = int(headers.get("content-length", service.settings.max_body_bytes))
         async with service.admit(call, size) as ticket:
-            job = self._read_job(scope, headers, receive)
-            answer = await _unless_gone(receive, service.answer(call, ticket, await job))
+            job = await self._read_job(scope, headers, receive)
+            answering = asyncio.create_task(service.answer(call, ticket, job))
+            leaving = asyncio.create_task(_gone(receive))
+            try:
+                await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
+                if not answering.done():
+                    raise Cancelled("The client left.")
+                answer = answering.result()
+            finally:
+                leaving.cancel()
+                answering.cancel()
+            response = Response(answer.body, media_type="application/json")
             if answer.error is not None:
                 response = _problem_response(call, answer.error)
-            else:
-                response = Response(answer.body, media_type="application/json")
             sending = _send_slowly(response, send)
             await connections.send(service.settings, sending, call.bytes_out)
 
@@ -305,20 +312,6 @@ async def _send_slowly(response: Response, send: Send) -> None:
         piece = response.body[place : place + PIECE]
         await send({"type": "http.response.body", "body": piece, "more_body": True})
     await send({"type": "http.response.body"})
-
-
-async def _unless_gone(receive: Receive, work: Coroutine[Any, Any, Answer]) -> Answer:
-    """Await work, but cancel it and raise Cancelled when the client disconnects."""
-    working = asyncio.create_task(work)
-    gone = asyncio.create_task(_gone(receive))
-    try:
-        await asyncio.wait({working, gone}, return_when=asyncio.FIRST_COMPLETED)
-        if not working.done():
-            raise Cancelled("The client left.")
-        return working.result()
-    finally:
-        gone.cancel()
-        working.cancel()
 
 
 async def _gone(receive: Receive) -> None:

@@ -87,7 +87,11 @@ class GraspService:
             raise
         finally:
             self.in_flight -= 1
-            call.end()
+            call.seconds = time.monotonic() - call.start
+            if call.transport == "http":
+                call.code = call.code or "499"  # the caller disconnected; nginx's code
+            else:
+                call.code = "OK" if call.problem is None else call.problem.code
             loop = asyncio.get_running_loop()
             for observer in self._observers:
                 loop.call_soon(observer, call)  # once the answer is being sent

@@ -8,6 +8,7 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,17 +18,12 @@ from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
 from edgegrasp_model.options import DetectOptions, parse, parse_options
 from edgegrasp_model.request_cloud import GIVEN, decode_array, decode_cloud
 from edgegrasp_model.scene.cloud import CloudInput
-from edgegrasp_results import Detection, Scoring
+from edgegrasp_results import Detection
 from edgegrasp_service import recording
-from edgegrasp_service.errors import (
-    DeadlineExceeded,
-    PayloadTooLarge,
-    UnsupportedMediaType,
-    report,
-)
+from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, UnsupportedMediaType, report
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import http_bodies, messages
-from edgegrasp_service.worker.process import Answer, Facts, Job, limited_memory
+from edgegrasp_service.worker.process import Answer, Facts, Job, Transport, limited_memory
 
 if TYPE_CHECKING:
     from edgegrasp_model.detector import ModelCatalogue
@@ -35,11 +31,12 @@ if TYPE_CHECKING:
 
 # Memory for reading a request: numbers take about 12 times as much in Python as in JSON.
 DECODE_BYTES, DECODE_FACTOR = 512 * 2**20, 24
+ENCODINGS: dict[Transport, Any] = {"http": http_bodies, "grpc": messages}
 TO_ENCODE = 0.1  # share of a request's time that is kept for writing its answer
 
 
 def load_catalogue(settings: Settings) -> "ModelCatalogue":
-    """Load the detectors of the settings and warm them up; EdgeGraspError: one cannot be used."""
+    """Load the detectors of the settings and warm them up; raises EdgeGraspError for a bad file."""
     # Torch takes seconds to import, and some tests do without it.
     from edgegrasp_model.detector import ModelCatalogue, choose_device
 
@@ -73,13 +70,15 @@ def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
     Raises:
         MemoryError: Out of memory; the process should be replaced.
     """
-    work = _Work(job, catalogue, settings)
+    work = _Work(job, catalogue, settings, time.monotonic() + job.remaining)
     try:
         return Answer(work.answer(), work.facts)
     except EdgeGraspError as error:
         problem = report(error)
     except Exception as error:
-        if _out_of_memory(error):
+        # PyTorch raises an error of its own for each kind of device.
+        torch_error = type(error).__name__ == "OutOfMemoryError"
+        if isinstance(error, MemoryError) or torch_error or "can't allocate memory" in str(error):
             raise MemoryError(str(error)) from None
         problem = report(error)
         work.facts.traceback = traceback.format_exc()
@@ -88,51 +87,63 @@ def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
     return Answer(b"", work.facts, problem)
 
 
+@dataclass
 class _Work:
     """One job while it is being answered."""
 
-    def __init__(self, job: Job, catalogue: "ModelCatalogue", settings: Settings) -> None:
-        self.facts = Facts()
-        self.options: DetectOptions | None = None  # known once they are parsed
-        self._job = job
-        self._encoding: Any = messages if job.transport == "grpc" else http_bodies
-        self._catalogue = catalogue
-        self._settings = settings
-        self._deadline = time.monotonic() + job.remaining
+    job: Job
+    catalogue: "ModelCatalogue"
+    settings: Settings
+    deadline: float  # by time.monotonic
+    facts: Facts = field(default_factory=Facts)
+    options: DetectOptions | None = None  # known once they are parsed
 
     def answer(self) -> bytes:
         """The body of the answer; may raise any error."""
-        if self._job.method == "Beat":
+        if self.job.method == "Beat":
             return b"{}"
-        if self._job.method == "RecordOutcome":
+        if self.job.method == "RecordOutcome":
             self._record_outcome()
             return b"{}"
-        result = self._detect() if self._job.method == "DetectGrasps" else self._score()
+        with self._stage("decode"):
+            detector, cloud, options, given = self._decode()
+        result: Any
+        if self.job.method == "DetectGrasps":
+            result = self._detect(detector, cloud, options)
+            self.facts.grasps = len(result.grasps)
+        else:
+            with self._stage("score"):
+                result = detector.score(cloud, options, **given)
+            self.facts.grasps = len(result.evaluations)
         self.facts.model = result.model
         self.facts.counts = dict(result.counts)
         with self._stage("encode"):
-            body: bytes = self._encoding.write(result)
+            body: bytes = ENCODINGS[self.job.transport].write(result)
         return body
 
     def _record_outcome(self) -> None:
-        kind, path = self._job.content_type, self._settings.outcomes_file
+        kind, path = self.job.content_type, self.settings.outcomes_file
         if not kind.lower().startswith(http_bodies.JSON):  # foreign web pages cannot send it
             fix = f"Send {http_bodies.JSON}."
             raise UnsupportedMediaType("Content-Type", repr(kind[:40]), fix)
         assert path is not None
-        fields = http_bodies.read_json("body", self._job.body)
-        recording.append_outcome(parse(recording.TriedGrasp, fields, "body"), self._catalogue, path)
+        fields = http_bodies.read_json("body", self.job.body)
+        recording.append_outcome(parse(recording.TriedGrasp, fields, "body"), self.catalogue, path)
 
-    def _detect(self) -> Detection:
-        with self._stage("decode"):
-            detector, cloud, options, _ = self._decode()
-        robot = None if options.robot is None else self._robot(options.robot.name)
-        if robot is not None:
+    def _detect(self, detector: Any, cloud: CloudInput, options: DetectOptions) -> Detection:
+        """Detect, and plan an arm's motions where the request names a robot."""
+        asked, robot = options, None
+        if asked.robot is not None:
             from edgegrasp_robot import plan_picks, with_robot
 
-            asked, options = options, with_robot(options, robot)
+            robots, name = load_robots(self.settings), asked.robot.name
+            if name not in robots:
+                fix = f"Use one of: {', '.join(robots)}." if robots else "Set the setting `robots`."
+                raise InvalidRequest("options.robot.name", repr(name), fix)
+            robot = robots[name]
+            options = with_robot(options, robot)
         with self._stage("prepare"):
-            most = self._within_deadline(self._settings.max_voxels, self._catalogue.pace.voxel)
+            most = self._within_deadline(self.settings.max_voxels, self.catalogue.pace.voxel)
             prepared = detector.prepare(cloud, options, most)
             self.facts.counts = dict(prepared.counts)
         with self._stage("network"):
@@ -140,39 +151,22 @@ class _Work:
         with self._stage("finish"):
             detection: Detection = detector.finish(prepared, logits)
         if robot is not None:
-            until = self._deadline - TO_ENCODE * self._job.remaining
+            until = self.deadline - TO_ENCODE * self.job.remaining
             with self._stage("arm"):
                 detection = plan_picks(detection, prepared.scene, cloud.points, asked, robot, until)
-        self.facts.grasps = len(detection.grasps)
         return detection
-
-    def _robot(self, name: str) -> "Robot":
-        """The robot that a request names."""
-        robots = load_robots(self._settings)
-        if name not in robots:
-            fix = f"Use one of: {', '.join(robots)}." if robots else "Set the setting `robots`."
-            raise InvalidRequest("options.robot.name", repr(name), fix)
-        return robots[name]
-
-    def _score(self) -> Scoring:
-        with self._stage("decode"):
-            detector, cloud, options, given = self._decode()
-        with self._stage("score"):
-            scoring: Scoring = detector.score(cloud, options, **given)
-        self.facts.grasps = len(scoring.evaluations)
-        return scoring
 
     def _decode(self) -> tuple[Any, CloudInput, DetectOptions, dict[str, Array]]:
         """Decode a request within the limits: detector, cloud, options, given grasps."""
-        size, most = len(self._job.body), self._settings.max_points
+        size, most = len(self.job.body), self.settings.max_points
         in_time = most
         try:
             with limited_memory(DECODE_BYTES + DECODE_FACTOR * size):
-                fields = self._encoding.read_request(self._job)
+                fields = ENCODINGS[self.job.transport].read_request(self.job)
                 self.options = options = parse_options(fields["options"])
-                detector = self._catalogue.get(options.model)
-                given = {} if self._job.method == "DetectGrasps" else _given(fields, most)
-                in_time = self._within_deadline(most, self._catalogue.pace.point)
+                detector = self.catalogue.get(options.model)
+                given = {} if self.job.method == "DetectGrasps" else _given(fields, most)
+                in_time = self._within_deadline(most, self.catalogue.pace.point)
                 cloud, options = decode_cloud(fields, options, in_time)
         except MemoryError:
             value, fix = f"{size} bytes that take too much memory to read", "Send packed arrays."
@@ -188,14 +182,14 @@ class _Work:
 
     def _within_deadline(self, most: int, seconds: float) -> int:
         """The number of points or voxels, at most `most`, that can be processed in time."""
-        remaining = max(self._deadline - time.monotonic(), 0.0)
+        remaining = max(self.deadline - time.monotonic(), 0.0)
         return int(min(most, remaining / seconds)) if seconds else most
 
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:
         """Time a stage; raises DeadlineExceeded instead of starting it too late."""
         start = time.monotonic()
-        if start > self._deadline:
+        if start > self.deadline:
             raise DeadlineExceeded()
         try:
             yield
@@ -216,12 +210,3 @@ def _given(fields: Mapping[str, Any], max_points: int) -> dict[str, Array]:
     if name == "hand_poses" and given.dtype.kind in "iu":
         given = given.astype(np.float64)
     return {name: given}
-
-
-def _out_of_memory(error: Exception) -> bool:
-    """Whether an error means out of memory; PyTorch raises its own RuntimeError for each device."""
-    return (
-        isinstance(error, MemoryError)
-        or type(error).__name__ == "OutOfMemoryError"
-        or "can't allocate memory" in str(error)
-    )

@@ -43,7 +43,16 @@ def read_request(job: Job) -> dict[str, Any]:
         fix = "Send a message as the .proto file has it."
         raise InvalidRequest("request", value, fix) from None
     _check(message, "request")
-    fields = _cloud(message)
+    fields: dict[str, Any] = {}
+    if message.HasField("points"):
+        fields["points"] = message.points
+    if message.HasField("encoded"):
+        fields["cloud"] = File(message.encoded.format, message.encoded.data)
+    if message.HasField("point_cloud2"):
+        fields["point_cloud2"] = _plain_fields(message.point_cloud2)
+    if message.depth_images:
+        images = enumerate(message.depth_images)
+        fields["depth_images"] = [_depth_image(image, row) for row, image in images]
     fields |= {name: getattr(message, name) for name in PER_POINT if message.HasField(name)}
     fields["options"] = plain_options(message.options)
     if scores and message.edges:
@@ -58,7 +67,7 @@ def read_request(job: Job) -> dict[str, Any]:
 
 
 def plain_options(message: grasp_pb2.DetectOptions) -> dict[str, Any]:
-    """The options that are set; InvalidRequest: one is set in two fields."""
+    """The options that are set; raises InvalidRequest if one is set in two fields."""
     options = _set_fields(message)
     if "object_choice" in options:
         if "objects" in options:
@@ -107,21 +116,6 @@ def _check(message: Message, name: str) -> None:
                 _check(part, f"{here}.{row}")
         elif is_message and message.HasField(field.name):
             _check(getattr(message, field.name), here)
-
-
-def _cloud(message: Any) -> dict[str, Any]:
-    """The cloud of either request, or clouds; both have it in the same fields."""
-    fields: dict[str, Any] = {}
-    if message.HasField("points"):
-        fields["points"] = message.points
-    if message.HasField("encoded"):
-        fields["cloud"] = File(message.encoded.format, message.encoded.data)
-    if message.HasField("point_cloud2"):
-        fields["point_cloud2"] = _plain_fields(message.point_cloud2)
-    if message.depth_images:
-        images = enumerate(message.depth_images)
-        fields["depth_images"] = [_depth_image(image, row) for row, image in images]
-    return fields
 
 
 def _depth_image(message: grasp_pb2.DepthImage, row: int) -> dict[str, Any]:

@@ -117,7 +117,7 @@ def unpack(text: bytes, body: bytes) -> Any:
 
 
 def receive(file: BinaryIO) -> Any:
-    """The next message; None: there are no more."""
+    """The next message; None at the end."""
     head = file.read(HEADER.size)
     if len(head) < HEADER.size:
         return None
