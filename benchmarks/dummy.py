@@ -41,7 +41,7 @@ class DummyPrepared:
 
 
 class DummyDetector:
-    """Puts top-down grasps on points drawn by the seed; its network takes `seconds`."""
+    """Makes top-down grasps on points drawn from the seed; its network takes `seconds`."""
 
     def __init__(self, seconds: float = 0.0) -> None:
         self._seconds = seconds
@@ -58,7 +58,7 @@ class DummyDetector:
         return DummyPrepared(options, points, drawn, scores, counts)
 
     def evaluate(self, prepared: DummyPrepared) -> Float32:
-        """Take the time of a network."""
+        """Wait as long as a network would take."""
         time.sleep(self._seconds)
         prepared.seconds["network"] = self._seconds
         return prepared.batch
@@ -98,7 +98,7 @@ class DummyDetector:
         edges: Array | None = None,
         hand_poses: Array | None = None,
     ) -> Scoring:
-        """Make up scores; an edge from a row to itself defines no grasp."""
+        """Random scores; an edge from a row to itself defines no grasp."""
         checked = check_cloud(cloud)
         if edges is not None:
             rows = check_edges(edges, checked.rows_sent)
@@ -119,7 +119,7 @@ class DummyDetector:
 
 
 class DummyCatalogue:
-    """The dummy detector as the only weights."""
+    """A catalogue with the dummy detector alone."""
 
     pace = Pace()
 
@@ -133,7 +133,7 @@ class DummyCatalogue:
         return self._detector
 
     def describe(self) -> list[dict[str, Any]]:
-        """The facts of the dummy."""
+        """The description of the dummy detector."""
         facts = {"name": NAME, "architecture": NAME, "gripper": "panda", "device": "cpu"}
         sizes = {"digest": "", "parameters": 0, "crop_radius": 0.0, "voxel_size": 0.0}
         return [facts | sizes | {"default": True, "hand_description": False}]

@@ -114,7 +114,7 @@ def summary(samples: Sequence[Sample]) -> dict[str, Any]:
 
 
 def percentiles(seconds: Sequence[float]) -> dict[str, float] | None:
-    """In milliseconds; None without any."""
+    """Percentiles in milliseconds; None without samples."""
     if not seconds:
         return None
     values = np.percentile(np.array(seconds) * 1000, (50, 90, 99, 100)).round(3)

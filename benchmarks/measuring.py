@@ -41,7 +41,7 @@ def interleaved(
 
 
 def machine() -> dict[str, Any]:
-    """Where it was measured."""
+    """The machine: its processor, speed, load and versions."""
     import torch
 
     info = Path("/proc/cpuinfo")

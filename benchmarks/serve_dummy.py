@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def main() -> None:
-    """The program `edgegrasp` with the dummy; with settings as JSON, what its workers fork from."""
+    """Run `edgegrasp` with the dummy detector; given settings as JSON, run its nursery instead."""
     from edgegrasp_service.worker import pool, process
 
     if sys.argv[1].startswith("{"):

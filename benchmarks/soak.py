@@ -72,7 +72,7 @@ ROOM = ("--max-queue-length", "512", "--max-streams", "64")  # for all of the cl
 
 
 def main() -> None:
-    """Send, write soak.json, and fail where anything is wrong."""
+    """Run the clients and the attacks, write soak.json, and exit with 1 if anything is wrong."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.soak")
     parser.add_argument("--output", type=Path, default=RESULTS)
     parser.add_argument("--minutes", type=float, default=10.0)
@@ -102,7 +102,7 @@ def main() -> None:
 def run(
     server: Served, clients: int, seconds: float, seed: int, attacks: tuple[Any, ...]
 ) -> dict[str, Any]:
-    """Clients beside attacks, which with the probe are processes of their own; the figures."""
+    """Run clients beside the attacks and the probe, each a process; returns the figures."""
     context, count = multiprocessing.get_context("spawn"), 1 + len(attacks)
     with context.Manager() as manager, ProcessPoolExecutor(count, context) as pool:
         stop = manager.Event()
@@ -130,17 +130,17 @@ class Plan:
     seed: int
 
     def points(self) -> Float32:
-        """(N, 3) a cloud that no other plan has."""
+        """The cloud (N, 3) of this plan, which no other plan has."""
         random = np.random.default_rng([self.seed, self.number])
         return random.uniform(-0.2, 0.2, (self.size, 3)).astype(np.float32)
 
     def options(self) -> Any:
-        """Of the request; malformed in one of several ways."""
+        """The options of the request; faulty ones for a malformed request."""
         return FAULTS[self.number % len(FAULTS)] if self.kind == "malformed" else {}
 
 
 def plans(seed: int, end: float) -> Iterator[Plan]:
-    """Requests in random order until a time: 90 % good ones, 5 % malformed, 5 % abandoned."""
+    """Random requests until `end`: 90 % valid, 5 % malformed, 5 % cancelled by the client."""
     random = np.random.default_rng(seed)
     for number in itertools.count():
         if time.monotonic() > end:
@@ -162,7 +162,7 @@ class Soak:
         self._given = 0
 
     async def run(self, clients: int, seconds: float) -> None:
-        """Send for so long."""
+        """Send requests for `seconds`."""
         self._todo = plans(self._seed, time.monotonic() + seconds)
         ways = itertools.cycle(("grpc", "stream", "rest"))
         sampling = asyncio.create_task(self._sample(seconds / MEMORY_SAMPLES))
@@ -170,7 +170,7 @@ class Soak:
         sampling.cancel()
 
     def figures(self) -> dict[str, Any]:
-        """Its outcome."""
+        """The results of the run."""
         return {
             "requests": self._given,
             "lost": self._given - self._came.total(),
@@ -187,7 +187,7 @@ class Soak:
             await asyncio.sleep(seconds)
 
     async def _send(self, way: str) -> None:
-        """Plans one after the other, or several together in a stream."""
+        """Send plans one by one, or several at a time in a stream."""
         address = self._server.http_url if way == "rest" else self._server.grpc_address
         async with AsyncGraspClient(address, timeout=SECONDS, retry=False) as client:
             while some := list(islice(self._todo, TOGETHER if way == "stream" else 1)):
@@ -248,7 +248,7 @@ def outcome(plan: Plan, came: Detection | GraspClientError) -> str:
 
 
 def poison(url: str, address: str, stop: Any) -> dict[str, int]:
-    """Send small requests that ended workers once; returns the statuses of the answers."""
+    """Send small requests that once killed workers; returns the number of each status."""
     came: Counter[str] = Counter()
     transport = httpx.HTTPTransport(local_address=ATTACKER)
     with httpx.Client(base_url=url, transport=transport, timeout=SECONDS) as http:
@@ -264,7 +264,7 @@ def poison(url: str, address: str, stop: Any) -> dict[str, int]:
 
 
 def poisons(number: int) -> dict[str, bytes]:
-    """By media type: an offset beyond the data, an LZMA dictionary of 4 GiB, a header of text."""
+    """Bodies by media type: an offset beyond the data, a 4 GiB LZMA dictionary, a text header."""
     fields = [
         {"name": name, "offset": offset, "datatype": 7, "count": 1}
         for name, offset in (("x", 2**31 - 4), ("y", 4), ("z", 8))
@@ -284,7 +284,7 @@ def poisons(number: int) -> dict[str, bytes]:
 
 
 def lock_out(url: str, address: str, stop: Any) -> dict[str, int]:
-    """Open pages that nobody reads and silent gRPC calls, hold them, and open them anew."""
+    """Open pages without reading them and gRPC calls without sending; hold and reopen them."""
     came: Counter[str] = Counter()
     page = b"GET /docs/assets/swagger-ui-bundle.js HTTP/1.1\r\nHost: x\r\n\r\n"
     while not stop.is_set():
@@ -317,12 +317,12 @@ def http2_frame(kind: int, flags: int, stream: int, payload: bytes) -> bytes:
 
 
 def http2_opening() -> bytes:
-    """The first bytes of a client."""
+    """The connection preface and an empty SETTINGS frame."""
     return b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + http2_frame(4, 0, 0, b"")
 
 
 def http2_headers(path: str, stream: int) -> bytes:
-    """Begins a gRPC call, and does not end it."""
+    """The HEADERS frame of a gRPC call that never ends."""
     headers = b"\x83\x86"  # :method POST, :scheme http
     fields = {":path": path, ":authority": "x", "content-type": "application/grpc"}
     for text in itertools.chain.from_iterable((fields | {"te": "trailers"}).items()):
@@ -349,7 +349,7 @@ def probe(url: str, address: str, stop: Any) -> dict[str, Any]:
 
 
 def ask_http(url: str) -> None:
-    """As Kubernetes asks for liveness; raises OSError or ValueError unless the answer is 200."""
+    """Probe liveness as Kubernetes does; raises OSError or ValueError unless the status is 200."""
     with connect(url, "127.0.0.1", HEALTH_TIMEOUT) as connection:
         connection.sendall(b"GET /health/live HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
         said = connection.recv(4096)
@@ -358,7 +358,7 @@ def ask_http(url: str) -> None:
 
 
 def ask_grpc(address: str) -> None:
-    """One Check; raises grpc.RpcError or ValueError unless the server serves."""
+    """One gRPC health check; raises grpc.RpcError or ValueError unless it reports SERVING."""
     alone = (("grpc.use_local_subchannel_pool", 1),)
     with grpc.insecure_channel(address, alone) as channel:
         request = health_pb2.HealthCheckRequest()

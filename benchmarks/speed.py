@@ -62,7 +62,7 @@ def main() -> None:
 
 
 def shipped() -> dict[str, Any]:
-    """Each network in the whole pipeline, a view of each kind of scene, the table given.
+    """Time each network in the whole pipeline on a view of each kind of scene, given the table.
 
     Processor seconds on one thread, and seconds of the clock on two.
     """
@@ -86,7 +86,7 @@ def shipped() -> dict[str, Any]:
 
 
 def camera() -> dict[str, float]:
-    """Seconds for images of cameras, given only the camera's position: the default weights.
+    """Seconds for camera images with the default weights, given only the camera's position.
 
     The demo's own scene; each image of SHARED, where it is; and the same enlarged to 1280 x 720.
     """
@@ -198,7 +198,7 @@ def observe(kind: SceneKind = SceneKind.PILE, table: TableView = "known") -> Obs
 def request(
     observation: Observation, num_approach_points: int = 32, num_candidates: int = 2000
 ) -> DetectOptions:
-    """A request where the table is known."""
+    """The options of a request with a known table."""
     return DetectOptions(
         num_approach_points=num_approach_points,
         num_candidates=num_candidates,
@@ -233,7 +233,7 @@ def camera_table(results: dict[str, Any]) -> str:
 
 
 def table(results: dict[str, Any]) -> str:
-    """All other times, and the machine."""
+    """The table of all other times, and the machine."""
     rows = ["| the table given | scene | one thread | two threads |", "| --- | --- | --- | --- |"]
     for name, scenes in results["shipped"].items():
         for scene, of in scenes.items():

@@ -22,7 +22,7 @@ class BenchmarkArm(NamedTuple):
 
 
 def benchmark_arm(name: str, camera: CameraRules) -> BenchmarkArm:
-    """An arm on the camera's side of a scene, as with a camera on its wrist.
+    """The robot's arm, on the camera's side of a scene as if the camera were on its wrist.
 
     Raises:
         InvalidRobot: the file cannot be used.

@@ -26,7 +26,7 @@ DECIDED = (
 
 
 class Cluster(BaseModel):
-    """The flags that say where simulation runs."""
+    """The flags that choose the engine, the processes and the cluster."""
 
     engine: str | None = Field(
         None, description="pybullet or mujoco; else the protocol's, or the one that is installed"
@@ -78,27 +78,19 @@ def benchmark(*, asked: BenchmarkFlags, options: dict[str, Any]) -> None:
     GSR: successes / attempts. DR: objects removed / present. The protocol defines a round.
     Options of the detection are the protocol's unless a flag is given.
     """
-    from edgegrasp_sim.results import ResultFolder, below_gate, summarise
+    from edgegrasp_sim.results import ResultFolder, below_gate, planner_title, summary_of
 
     with interruptible("benchmark", resumes=asked.output is not None):
         config, fields = _plan(asked, parse_option_flags(options))
         print(f"engine: {config.engine}")
         folder = ResultFolder(asked.output) if asked.output is not None else None
-        done, title = run_rounds(config, asked, fields, folder)
-    summary = {
-        "scene": config.scene.value,
-        "engine": config.engine,
-        "protocol": config.protocol.name,
-        "protocol_version": config.protocol.version,
-        **summarise(done),
-    }
-    if folder is not None:
-        folder.finish(done)
-        if asked.report:
-            from edgegrasp_sim.report import write_report
+        done, run = run_rounds(config, asked, fields, folder)
+    summary = summary_of(run, done) if folder is None else folder.finish(done)
+    if folder is not None and asked.report:
+        from edgegrasp_sim.report import write_report
 
-            print(f"report: {write_report(folder)}")
-    _print_summary(summary, title)
+        print(f"report: {write_report(folder)}")
+    _print_summary(summary, planner_title(run["planner"]))
     if asked.gate is not None:
         if below := below_gate(summary, asked.gate):
             sys.exit("edgegrasp benchmark: below the gate: " + "; ".join(below))
@@ -191,20 +183,20 @@ def run_rounds(
     asked: BenchmarkFlags,
     options: dict[str, Any],
     folder: "ResultFolder | None",
-) -> "tuple[list[Round], str]":
-    """Run the remaining rounds, with a progress bar; returns all, and the title of the planner."""
+) -> "tuple[list[Round], dict[str, Any]]":
+    """Run the remaining rounds, with a progress bar; returns all, and `run` of the manifest."""
     from rich.console import Console
 
     from edgegrasp_cli.planners import open_planner
     from edgegrasp_sim.benchmark import manifest, run_benchmark
-    from edgegrasp_sim.results import planner_title
 
     # Fails on a wrong folder before a server is started, and prepares meshes once for all workers.
     with Console(stderr=True).status("reading objects"):
         config.object_set()
     with open_planner(asked, config.protocol.planning, options) as planner:
+        facts = manifest(config, planner.facts)
         if folder is not None:
-            folder.open(manifest(config, planner.facts))
+            folder.open(facts)
         with _progress(config, folder) as on_round:
             done = run_benchmark(
                 config,
@@ -214,7 +206,7 @@ def run_rounds(
                 folder=folder,
                 on_round=on_round,
             )
-    return done, planner_title(planner.facts)
+    return done, facts["run"]
 
 
 @contextmanager

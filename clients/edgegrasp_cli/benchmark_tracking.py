@@ -34,7 +34,7 @@ SUCCESSES = ("still", "open_loop", "followed")
 
 @dataclass(frozen=True)
 class Motion:
-    """What happens between the first answer and the grasp."""
+    """How the object and the camera move between the first answer and the grasp."""
 
     seconds: float = 1.0
     speed: float = 0.0  # of the object, level, metres a second
@@ -68,14 +68,14 @@ class Followed:
 
 
 class Scene:
-    """What a camera sees over time; nothing moves, and nothing can be grasped."""
+    """A scene over time, as a camera sees it; this base class is still and has nothing to grasp."""
 
     def look(self, seconds: float) -> dict[str, Any]:
-        """The image of a time, as arguments of `GraspClient.detect`."""
+        """The image at a time, as arguments of `GraspClient.detect`."""
         raise NotImplementedError
 
     def hold(self, T_cloud_tcp: "Float64") -> None:
-        """From now on the object moves that is nearest to a grasp."""
+        """Choose the object that moves from now on: the one nearest to a grasp."""
 
     def moved(self, seconds: float) -> "Float64":
         """(4, 4) T_now_start of that object, cloud frame."""
@@ -102,7 +102,7 @@ class RecordedScene(Scene):
 
 
 class SimulatedScene(Scene):
-    """Objects on a table of which one moves, seen by a structured-light camera; world frame."""
+    """Objects on a table, one of which moves, under a structured-light camera; world frame."""
 
     def __init__(
         self, simulation: "ClutterSimulation", motion: Motion, rng: np.random.Generator
@@ -128,11 +128,11 @@ class SimulatedScene(Scene):
         return {"cloud": seen.image, "viewpoint": tuple(eye.tolist())}
 
     def hold(self, T_cloud_tcp: "Float64") -> None:
-        """It moves whose middle is nearest."""
+        """Choose the object whose centre is nearest."""
         self.held = int(np.linalg.norm(self.places - T_cloud_tcp[:3, 3], axis=1).argmin())
 
     def moved(self, seconds: float) -> "Float64":
-        """A shift and a turn about its middle."""
+        """A translation, and a rotation about the object's centre."""
         motion, place, T = self.motion, self.places[self.held], np.eye(4)
         gone = min(motion.speed * seconds, motion.shift)
         turn = self.sense * motion.turn * gone / motion.shift
@@ -141,7 +141,7 @@ class SimulatedScene(Scene):
         return T
 
     def execute(self, done: Followed) -> dict[str, bool]:
-        """All three are tried."""
+        """Try all three in simulation."""
         grasps = dict(zip(SUCCESSES, (done.first, done.first, done.last), strict=True))
         success = dict.fromkeys(grasps, False)
         for name, grasp in grasps.items():
@@ -151,7 +151,7 @@ class SimulatedScene(Scene):
         return success
 
     def _place(self, seconds: float) -> None:
-        """Put the object where it is at a time."""
+        """Move the object to its pose at a time."""
         T, start = self.moved(seconds), self.start[self.held]
         place = T[:3, :3] @ start.position + T[:3, 3]
         turn = Rotation.from_matrix(T[:3, :3]) * Rotation.from_quat(start.quaternion_xyzw)
@@ -207,7 +207,7 @@ def benchmark_tracking(
 
 
 def follow(client: Any, scene: Scene, seconds: float, clock: Callable[[], float]) -> Followed:
-    """Follow the first grasp of a scene, whose motion begins when that is there."""
+    """Follow the first grasp of a scene, which starts to move once that grasp is found."""
     from edgegrasp_client import GraspTracker
     from edgegrasp_client.requests import plain_options
 
@@ -238,7 +238,7 @@ def follow(client: Any, scene: Scene, seconds: float, clock: Callable[[], float]
 
 
 def found_again(client: Any, scene: Scene) -> float:
-    """Share of pairs of images of a still scene with the same first grasp, nothing followed."""
+    """Share of image pairs of a still scene with the same first grasp, without tracking."""
     images = [client.detect(**scene.look(number / RATE)).grasps for number in range(REPEATED)]
     alike = [
         bool(some and others) and _alike(some[0].T_cloud_tcp, others[0].T_cloud_tcp)
@@ -253,7 +253,7 @@ def _alike(one: "Float64", other: "Float64") -> bool:
 
 
 def _degrees(one: "Float64", other: "Float64") -> float:
-    """Between the rotations of two poses (4, 4)."""
+    """The angle between the rotations of two poses (4, 4), degrees."""
     turn = Rotation.from_matrix(one[:3, :3].T @ other[:3, :3])
     return float(np.degrees(turn.magnitude()))
 
@@ -289,7 +289,7 @@ def recorded(folders: list[Path]) -> Iterator[tuple[str, Scene]]:
 
 
 def simulated(objects: Path | None, motion: Motion, rounds: int) -> Iterator[tuple[str, Scene]]:
-    """Simulated scenes with their names, of which only the latest is there."""
+    """Simulated scenes with their names; each is valid until the next one."""
     from edgegrasp_sim.objects import ObjectSet, SceneKind
     from edgegrasp_sim.simulation import ClutterSimulation
 

@@ -46,7 +46,7 @@ class DetectorFlags(Connection):
 
 
 class DetectFlags(DetectorFlags):
-    """The flags of `edgegrasp detect` beside the options of the detection."""
+    """The flags of `edgegrasp detect` besides the options of the detection."""
 
     depth: tuple[Path, ...] = Field(
         (), description="Depth image in place of a cloud: .png of 16 bits, or .npy; repeatable"
@@ -210,10 +210,10 @@ class OwnDetector:
         return detect_picks(detector, sent, parsed, load_robot(self.robot or parsed.robot.name))
 
     def close(self) -> None:
-        """Nothing to close, unlike a client."""
+        """Do nothing; a client would close its connection."""
 
     def models(self) -> "list[Model]":
-        """The weights that can be used."""
+        """The weights that are available."""
         from edgegrasp_client import Model
 
         rows = self._catalogue.describe()

@@ -62,7 +62,7 @@ def load_command(name: str) -> Any:
 
 
 def _ending_with_a_sentence(name: str, function: Callable[..., None]) -> Callable[..., None]:
-    """The function; errors that the user can fix end the program with their message."""
+    """Wrap a command so that errors the user can fix end the program with their message."""
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> None:

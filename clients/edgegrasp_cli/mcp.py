@@ -187,7 +187,7 @@ class _Tools:
         return [text.strip(), *pictures]
 
     def edgegrasp_health_check(self) -> str:
-        """Whether the grasp server is there and answers requests."""
+        """Whether the grasp server is reachable and answers requests."""
         ready = self._client.ready(timeout=5.0)
         return "ready" if ready else "not there, or still loading its weights"
 
@@ -215,7 +215,7 @@ class _Tools:
     def _in_image(
         self, asked: dict[str, Any], mask: str | None, pose: Matrix | None
     ) -> dict[str, Any]:
-        """The options of a depth image: on its mask, and z up in a base frame."""
+        """The options for a depth image: limited to its mask, with z up in a base frame."""
         from edgegrasp_client import on_mask
 
         if pose is not None:
@@ -288,7 +288,7 @@ def _asked(
 
 
 def _with_sentences(function: Callable[..., Any], folder: Path) -> Callable[..., Any]:
-    """The tool; errors that the caller can fix reach it without the folder's path."""
+    """Wrap a tool so that errors the caller can fix reach it, without the folder's path."""
     from mcp.server.mcpserver.exceptions import ToolError
 
     from edgegrasp_client import GraspClientError

@@ -114,7 +114,7 @@ def named_planner(name: str) -> Planner:
 
 
 class _OneThread(OwnDetector):
-    """A detector whose sums do not depend on how many threads the process has."""
+    """A detector on one thread, whose sums do not depend on the number of threads."""
 
     def __init__(self, weights: Sequence[Path], robot: str | None, timeout: float) -> None:
         super().__init__(weights)

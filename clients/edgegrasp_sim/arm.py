@@ -23,7 +23,7 @@ class ArmMotion(Protocol):
 
 
 def seconds_of(motion: ArmMotion) -> float:
-    """From home to the grasp, away, and home again as it came."""
+    """Seconds of the motion from home to the grasp, away, and back home the same way."""
     return float(motion.times[-1] + motion.times[motion.pregrasp_row]) + CLOSE_SECONDS
 
 
@@ -41,7 +41,7 @@ class ArmGripper(Gripper):
         self._arm.rest()
 
     def start(self, T_world_hand: Matrix) -> None:
-        """Begin at home, wherever the grasp is."""
+        """Start at home, wherever the grasp is."""
         self.park()
 
     def approach(self, T_world_hand: Matrix) -> Iterator[None]:

@@ -9,7 +9,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from edgegrasp_sim.engine import ArmModel, choose_engine, world_type
+from edgegrasp_sim.engine import (
+    OBJECT_FRICTION,
+    OBJECT_MASS,
+    ArmModel,
+    choose_engine,
+    world_type,
+)
 from edgegrasp_sim.hand import (
     CLOSE_SECONDS,
     MIN_OPENING,
@@ -19,7 +25,7 @@ from edgegrasp_sim.hand import (
     STEP_LENGTH,
     panda,
 )
-from edgegrasp_sim.objects import OBJECT_FRICTION, OBJECT_MASS, ObjectSet, SceneKind
+from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.results import ResultFolder
 from edgegrasp_sim.scene import PACKED, PILE, REST
@@ -95,7 +101,7 @@ def run_benchmark(
 
 
 def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]:
-    """What reproduces the figures; `planner` has name, weights, digest and options."""
+    """All that is needed to reproduce the figures; `planner` has name, weights, digest, options."""
     drawn = config.object_set()
     # Named where it is not the Panda's, so that earlier results can be resumed.
     hand: dict[str, Any] = {} if config.gripper is None else {"gripper": config.gripper}

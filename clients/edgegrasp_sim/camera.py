@@ -31,7 +31,7 @@ class Observation:
 
     @property
     def image(self) -> NDArray[np.float32]:
-        """The cloud as the camera's image, (H, W, 3) with NaN holes; (N, 3) where it is none."""
+        """The cloud as an image (H, W, 3) with NaN holes, or as points (N, 3)."""
         if self.pixels is None:
             return self.cloud
         image = np.full((CAMERA.height * CAMERA.width, 3), np.nan, dtype=np.float32)
@@ -105,7 +105,7 @@ def points_of(
 
 
 def seen_box(workspace: Matrix, table: TableView) -> Matrix | None:
-    """What is kept of a cloud: (2, 3) lowest and highest corner, or None: all of it."""
+    """The box (2, 3) to crop a cloud to, lowest and highest corner; None keeps all of it."""
     if table in ("around", "auto"):
         return None
     return workspace if table == "known" else np.asarray(workspace - _ALOFT + _AROUND)

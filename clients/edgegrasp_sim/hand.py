@@ -156,11 +156,11 @@ class Gripper:
         self.place(_PARKED)
 
     def start(self, T_world_hand: Matrix) -> None:
-        """Put it a little behind the grasp."""
+        """Place the open hand a little behind the grasp."""
         self.place(T_world_hand @ translation(0.0, 0.0, -PREGRASP_DISTANCE))
 
     def approach(self, T_world_hand: Matrix) -> Iterator[None]:
-        """Go straight on to the grasp."""
+        """Move straight to the grasp."""
         return self.steps_to(T_world_hand, step_length=STEP_LENGTH)
 
     def retreat(self, T_world_hand: Matrix) -> Iterator[None]:
@@ -168,7 +168,7 @@ class Gripper:
         return self.steps_to(retreat_pose(T_world_hand), step_length=STEP_LENGTH)
 
     def place(self, T_world_hand: Matrix) -> None:
-        """Put the open hand there at once, at rest."""
+        """Place the open hand there at once, at rest."""
         T_world_com = T_world_hand @ self._T_hand_com
         self.body.set_pose(T_world_com[:3, 3], quaternion_xyzw(T_world_com))
 

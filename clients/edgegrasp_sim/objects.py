@@ -21,10 +21,9 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from edgegrasp_sim.engine import OBJECT_FRICTION, OBJECT_MASS
 from edgegrasp_sim.engine.urdf import convex_hull
 
-OBJECT_MASS = 0.5  # kg
-OBJECT_FRICTION = 1.0
 MESH_SUFFIXES = (".obj", ".stl")
 LAYOUT = 1  # of cached objects; raised whenever what is written changes
 SHORTEST_SIDE = 0.06  # metres, of the box around an object; fits between the fingers
@@ -78,7 +77,7 @@ class ObjectModel:
 
     @property
     def files(self) -> list[Path]:
-        """Its description and the meshes that it names, sorted by name."""
+        """Its URDF file and the meshes that it names, sorted by name."""
         meshes = ElementTree.parse(self.urdf).iter("mesh")
         named = {self.urdf.parent / mesh.get("filename", "") for mesh in meshes}
         return sorted({self.urdf} | {path for path in named if path.is_file()})
@@ -108,7 +107,7 @@ class ObjectSet:
         return digest.hexdigest()
 
     def check_same(self, digest: str) -> None:
-        """Raise ValueError where a set of that digest was read on another machine."""
+        """Raise ValueError unless the set has this digest, which another process read."""
         if self.digest != digest:
             raise ValueError(
                 f"the objects {self.name} differ between the machines of the cluster; put the same "

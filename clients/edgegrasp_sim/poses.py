@@ -23,6 +23,11 @@ def quaternion_xyzw(T: Matrix) -> list[float]:
     return [value / length for value in column]
 
 
+def about_z(angle: float) -> tuple[float, float, float, float]:
+    """The quaternion `xyzw` of a rotation about z, radians."""
+    return 0.0, 0.0, float(np.sin(angle / 2)), float(np.cos(angle / 2))
+
+
 def translation(x: float, y: float, z: float) -> Matrix:
     """A 4 x 4 transform that moves by (x, y, z) metres and does not turn."""
     T = np.eye(4)

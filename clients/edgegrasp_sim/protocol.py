@@ -119,7 +119,7 @@ class Protocol:
 
 
 def load_protocol(name: str) -> Protocol:
-    """A protocol that ships, by name, or of a `.toml` file; FileNotFoundError, ValueError."""
+    """A shipped protocol by name, or a `.toml` file; raises FileNotFoundError or ValueError."""
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if not path.is_file():
         raise FileNotFoundError(

@@ -32,7 +32,7 @@ Row = Sequence[object]
 
 
 class Replay:
-    """The recorded rounds of a result folder, to be repeated; FileNotFoundError, ValueError."""
+    """The recorded rounds of a folder, to repeat; raises FileNotFoundError or ValueError."""
 
     def __init__(self, folder: ResultFolder, objects: Path | None = None) -> None:
         facts = folder.manifest()
@@ -124,7 +124,7 @@ def attempt_title(done: Round, number: int) -> str:
 
 
 def page(title: str, parts: Iterable[str]) -> str:
-    """A page of parts that are HTML already, below a title that is not."""
+    """A page: an escaped title above parts that are HTML."""
     title = escape(title)
     head = "<!doctype html><html lang=en><head><meta charset=utf-8>"
     head += "<meta name=viewport content='width=device-width, initial-scale=1'>"
@@ -142,7 +142,7 @@ def table(rows: Iterable[Row]) -> str:
 
 
 def image(kind: str, content: bytes, text: str) -> str:
-    """A picture of a kind such as png, in the page itself, with a text in its place."""
+    """An embedded picture of a kind such as png, with alternative text."""
     source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
     return f"<img src='{source}' alt='{escape(text, quote=True)}'>"
 

@@ -84,14 +84,7 @@ class ResultFolder:
 
     def finish(self, rounds: Sequence[Round]) -> dict[str, Any]:
         """Write `attempts.csv` and `summary.json`; returns the summary."""
-        manifest = self.manifest()
-        summary = {
-            "scene": manifest["run"]["scene"],
-            "engine": manifest["run"]["engine"],
-            "protocol": manifest["run"]["protocol"]["name"],
-            "protocol_version": manifest["run"]["protocol"]["version"],
-            **summarise(rounds),
-        }
+        summary = summary_of(self.manifest()["run"], rounds)
         _write(self.path / "summary.json", json.dumps(summary, indent=1) + "\n")
         with (self.path / "attempts.csv").open("w", newline="") as file:
             table = csv.DictWriter(file, CSV_COLUMNS)
@@ -105,6 +98,13 @@ class ResultFolder:
 
     def _file(self, seed: int, index: int) -> Path:
         return self.path / "rounds" / f"{seed}-{index}.json"
+
+
+def summary_of(run: dict[str, Any], rounds: Sequence[Round]) -> dict[str, Any]:
+    """What was run, as the manifest has it, and its figures."""
+    protocol = run["protocol"]
+    named = {"protocol": protocol["name"], "protocol_version": protocol["version"]}
+    return {"scene": run["scene"], "engine": run["engine"], **named, **summarise(rounds)}
 
 
 def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
@@ -162,7 +162,7 @@ def _arm_figures(rounds: Sequence[Round]) -> dict[str, Any] | None:
 
 
 def count(rounds: Iterable[Round]) -> NDArray[np.int64]:
-    """Successes, attempts and objects of each round (`COUNTS`), of which rates are made: (3, R)."""
+    """Successes, attempts and objects of each round, as `COUNTS`: (3, R)."""
     rows = [(item.successes, len(item.attempts), len(item.objects)) for item in rounds]
     return np.array(rows, np.int64).reshape(-1, len(COUNTS)).T
 

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_sim.engine import TIME_STEP, Body, World
-from edgegrasp_sim.objects import OBJECT_FRICTION, OBJECT_MASS, ObjectModel, ObjectSet
-from edgegrasp_sim.poses import Matrix
+from edgegrasp_sim.objects import ObjectModel, ObjectSet
+from edgegrasp_sim.poses import Matrix, about_z
 from edgegrasp_sim.surroundings import MIDDLE, SIZE, TABLE_HEIGHT, Box, Surroundings
 
 PACKED_SCALE = (0.7, 0.8)
@@ -86,14 +86,7 @@ def load_object(
     scale: float,
 ) -> SceneObject:
     """Load an object with its link frame there; `scale` comes on top of the model's own."""
-    body = world.load_urdf(
-        model.urdf,
-        position,
-        quaternion_xyzw,
-        scale * model.scale,
-        mass=OBJECT_MASS,
-        friction=OBJECT_FRICTION,
-    )
+    body = world.load_urdf(model.urdf, position, quaternion_xyzw, scale * model.scale)
     return SceneObject(model, scale, body)
 
 
@@ -117,12 +110,13 @@ def make_packed(layout: Layout) -> list[SceneObject]:
             break
         model = layout.objects.sample(rng)
         x, y = rng.uniform(*PACKED.range, size=2)
-        placed = _place(layout, placed, model, (x, y), _upright(rng))
+        upright = about_z(rng.uniform(0.0, 2.0 * np.pi))
+        placed = _place(layout, placed, model, (x, y), upright)
     return placed
 
 
 def make_table(layout: Layout) -> list[SceneObject]:
-    """Put objects on a table or a shelf beside what is there: most upright, some as they fall."""
+    """Put objects on a table or a shelf beside its fixed parts: most upright, some dropped."""
     rng, reach = layout.rng, np.array(layout.surroundings.reach)
     placed: list[SceneObject] = []
     for _ in range(CROWD.attempts * layout.num_objects):
@@ -131,19 +125,20 @@ def make_table(layout: Layout) -> list[SceneObject]:
         model = layout.objects.sample(rng)
         x, y = MIDDLE + rng.uniform(-reach, reach, size=2)
         lying = rng.random() < CROWD.lying_share
-        quaternion = Rotation.random(rng=rng).as_quat().tolist() if lying else _upright(rng)
-        placed = _place(layout, placed, model, (x, y), quaternion)
+        upright = None if lying else about_z(rng.uniform(0.0, 2.0 * np.pi))
+        turn = upright or Rotation.random(rng=rng).as_quat().tolist()
+        placed = _place(layout, placed, model, (x, y), turn)
     return placed
 
 
 def make_bin(layout: Layout) -> list[SceneObject]:
-    """Drop objects into a bin one after another; those that do not fit in it are taken away."""
+    """Drop objects into a bin one by one; those that do not fit are removed."""
     dropped = _pour(layout, layout.num_objects, POUR.margin)
     return settle(layout.world, dropped, layout.surroundings)
 
 
 def make_full_bin(layout: Layout) -> list[SceneObject]:
-    """Pour objects into a bin, all over it, until they hide its floor, or are as many as asked."""
+    """Pour objects all over a bin until they hide its floor or reach the requested number."""
     placed: list[SceneObject] = []
     while len(placed) < layout.num_objects and _covered(layout, placed) < POUR.covered:
         new = _pour(layout, min(POUR.at_once, layout.num_objects - len(placed)), POUR.full_margin)
@@ -152,7 +147,7 @@ def make_full_bin(layout: Layout) -> list[SceneObject]:
 
 
 def make_pile(layout: Layout) -> list[SceneObject]:
-    """Drop objects into an open box one after another, then take the box away."""
+    """Drop objects into an open box one by one, then remove the box."""
     walls = [box.add_to(layout.world) for box in _pile_box()]
     where = np.full(2, SIZE / 3), np.full(2, 2 * SIZE / 3)
     height = TABLE_HEIGHT + PILE.drop_height
@@ -222,12 +217,6 @@ def _drop(
     return dropped
 
 
-def _upright(rng: np.random.Generator) -> list[float]:
-    """A random turn about z, as a quaternion xyzw."""
-    half_turn = rng.uniform(0.0, 2.0 * np.pi) / 2
-    return [0.0, 0.0, float(np.sin(half_turn)), float(np.cos(half_turn))]
-
-
 def _place(
     layout: Layout,
     placed: list[SceneObject],
@@ -235,7 +224,7 @@ def _place(
     place: tuple[float, float],
     quaternion_xyzw: Sequence[float],
 ) -> list[SceneObject]:
-    """Put an object down where it touches nothing, or nowhere; returns all that are there."""
+    """Put an object down if it touches nothing there; returns all placed objects."""
     world, scale = layout.world, float(layout.rng.uniform(*layout.scales))
     state = world.save_state()
     new = load_object(world, model, (*place, 1.0), quaternion_xyzw, scale)

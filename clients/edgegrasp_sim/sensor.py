@@ -136,7 +136,7 @@ SENSORS = {
 
 
 def random_sensor(rng: np.random.Generator) -> DepthSensor:
-    """A camera of one of the three kinds, better or worse than its model."""
+    """A random camera of one of the three kinds, better or worse than its model."""
     typical = list(SENSORS.values())[int(rng.integers(len(SENSORS)))]
     side = float(rng.choice([-1.0, 1.0]))  # of the projector
     worse = float(np.exp(rng.uniform(np.log(0.4), np.log(1.6))))

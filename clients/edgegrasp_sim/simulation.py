@@ -201,7 +201,7 @@ class ClutterSimulation:
         position: Sequence[float],
         quaternion_xyzw: Sequence[float],
     ) -> None:
-        """Put one of the `placements`, by its place among them, elsewhere without simulating."""
+        """Move one of the `placements`, by its index, without simulating."""
         if self._rest_state is not None:
             self.world.remove_state(self._rest_state)
             self._rest_state = None

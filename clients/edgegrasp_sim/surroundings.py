@@ -83,7 +83,7 @@ class Box:
     obstacle: bool = True  # a hand that hits it has failed; the table is none
 
     def add_to(self, world: World) -> Body:
-        """Put it there."""
+        """Add it to a world."""
         return world.add_box(self.size, self.centre, friction=self.friction, yaw=self.yaw)
 
 
@@ -98,13 +98,13 @@ class Surroundings:
     reach: tuple[float, float] = (TABLES.reach, TABLES.reach)
 
     def add_to(self, world: World) -> frozenset[int]:
-        """Put everything there; returns the ids of the obstacles' bodies."""
+        """Add everything to a world; returns the ids of the obstacles' bodies."""
         bodies = [box.add_to(world).uid for box in self.boxes]
         pairs = zip(bodies, self.boxes, strict=True)
         return frozenset(uid for uid, box in pairs if box.obstacle)
 
     def contain(self, body: Body) -> bool:
-        """Whether an object is where objects are."""
+        """Whether an object is within the bounds."""
         low, high = np.asarray(self.bounds)
         position = body.position
         return bool((position >= low).all() and (position <= high).all())
@@ -117,7 +117,7 @@ def _slab(size: Matrix, top: float, x: float = MIDDLE, y: float = MIDDLE) -> Box
 
 
 def open_table(thickness: float = OPEN_THICKNESS) -> Surroundings:
-    """Nothing but a table, of a thickness in metres."""
+    """A table alone, of a thickness in metres."""
     table = _slab(np.array([OPEN_EXTENT, OPEN_EXTENT, thickness]), TABLE_HEIGHT)
     return Surroundings((table,), WORKSPACE, ((0.0, 0.0, 0.0), (SIZE, SIZE, np.inf)))
 

@@ -24,7 +24,7 @@ MIN_SEEN = 100  # points above the table; a round ends where a view shows fewer
 
 @dataclass(frozen=True, slots=True)
 class PlannedGrasp:
-    """A planner's answer."""
+    """A grasp chosen by a planner."""
 
     T_world_hand: ArrayLike  # (4, 4) pose of the `panda_hand` link in the world, metres
     score: float  # how good the planner believes the grasp is; higher is better
@@ -38,7 +38,7 @@ Planner: TypeAlias = Callable[[Observation, int], PlannedGrasp | None]
 
 
 class StartCollides(Exception):  # noqa: N818
-    """A planner's: in this view the arm touches something before it moves."""
+    """Raised by a planner: in this view the arm is in collision before it moves."""
 
 
 class RoundEnd(StrEnum):

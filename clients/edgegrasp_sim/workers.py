@@ -32,7 +32,7 @@ def run_tasks(
     workers: int | None = None,  # at a time; 1: in this process; None: all cores
     ray: str | None = None,  # address of a cluster as of `ray.init`; `local` starts one
 ) -> Iterator[tuple[Task, Result]]:
-    """Do tasks that depend on nothing else, again if a worker dies; yields them with results."""
+    """Run independent tasks, again if a worker dies; yields each task with its result."""
     if workers is not None and workers < 1:
         raise ValueError(f"workers is {workers}; use at least 1")
     if ray is not None:
@@ -64,7 +64,7 @@ def _here(
 def _in_processes(
     make_runner: MakeRunner[Task, Result], tasks: Sequence[Task], workers: int
 ) -> Iterator[tuple[Task, Result]]:
-    """If a process dies, the pool breaks and a new one takes its place."""
+    """Run in a pool of processes; when one dies, a new pool takes over."""
     missing, crashes = list(tasks), 0
     made = pickle.dumps(make_runner)
     while missing:
@@ -112,7 +112,7 @@ def _on_ray(
     tasks: Sequence[Task],
     workers: int | None,
 ) -> Iterator[tuple[Task, Result]]:
-    """Tasks of Ray, not actors: one of a lost machine runs again wherever there is room."""
+    """Run on Ray as tasks, not actors: those of a lost machine are run again elsewhere."""
     try:
         ray: Any = importlib.import_module("ray")
     except ModuleNotFoundError:

@@ -97,7 +97,7 @@ class InvalidGripper(EdgeGraspError):  # noqa: N818
 
 
 class InvalidDevice(EdgeGraspError):  # noqa: N818
-    """The device to compute on is not there; `fix` is an imperative sentence."""
+    """The requested device does not exist; `fix` is an imperative sentence."""
 
     def __init__(self, name: str, fix: str) -> None:
         super().__init__(f"device: got {brief(name)}. {fix}")

@@ -41,7 +41,7 @@ FLIP = np.diag(np.array([-1.0, -1.0, 1.0, 1.0], dtype=np.float32))  # the same h
 
 @dataclass(frozen=True)
 class Scorer:
-    """A network as `evaluate` uses it."""
+    """The network and the sizes that `evaluate` needs."""
 
     probability: Callable[[BallBatch | HandBatch], Floats]
     crop_radius: float  # metres

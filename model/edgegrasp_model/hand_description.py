@@ -122,8 +122,8 @@ def points_around_fingers(
     x, y = gripper.pad_half_width + BESIDE, gripper.max_opening / 2 + OUTSIDE
     palm_z = seen_part(gripper).palm_z
     low, high = (-x, -y, palm_z - BEHIND), (x, y, gripper.tip_z + BEYOND_TIPS)
-    points = np.zeros((view.num_candidates, limit, 6), dtype=np.float32)
-    count = np.zeros(view.num_candidates, dtype=np.int64)
+    points = np.zeros((len(T_cloud_hand), limit, 6), dtype=np.float32)
+    count = np.zeros(len(T_cloud_hand), dtype=np.int64)
     _around_fingers(
         view.bounds,
         view.row,
@@ -181,7 +181,7 @@ def _look(
     gripper: Gripper,
 ) -> _Seen:
     """Look from hands with axes (E, 3, 3), the x of which is mirrored where `side` (E,) is -1."""
-    count = view.num_candidates
+    count = len(mirrored)
     shapes = (count, 7), (count, 29), (count,), (count, 2), (count, 3)
     seen = _Seen(*(np.zeros(shape, dtype=np.float32) for shape in shapes))
     boxes = gripper.open_boxes.astype(np.float32)
@@ -324,7 +324,7 @@ def _extent(values: Float32, empty: np.float32, numbers: Float32) -> None:
 
 @compiled("contract")
 def _mean(values: Float32) -> float:
-    """0 if there is none."""
+    """The mean; 0 without values."""
     total = 0.0
     for i in range(len(values)):
         total += values[i]

@@ -10,12 +10,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Floats, Int64
-from edgegrasp_model.candidates.collision import (
-    clearances,
-    hand_views,
-    met_first,
-    required_openings,
-)
+from edgegrasp_model.candidates.collision import FINGER_CLEARANCE, clearances, met_first
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
@@ -134,10 +129,11 @@ def grasps_in_cloud(
 
 def openings(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> tuple[Float32, Bools]:
     """Opening (E,) to approach with, metres, the maximum if the far side is hidden (E,)."""
-    met = met_first(hand_views(scene.cloud, T_cloud_hand, gripper), gripper)
-    width = required_openings(met, gripper)
+    met = met_first(scene.cloud, T_cloud_hand, gripper)
+    width = 2 * (np.abs(met).max(axis=1) + np.float32(FINGER_CLEARANCE))
     hidden = _far_side_hidden(scene, T_cloud_hand, met, gripper)
-    return np.where(hidden, np.float32(gripper.max_opening), width), hidden
+    widest = np.float32(gripper.max_opening)
+    return np.where(hidden, widest, np.minimum(width, widest)), hidden
 
 
 def _far_side_hidden(scene: Scene, T_cloud_hand: Float32, met: Float32, gripper: Gripper) -> Bools:
@@ -209,7 +205,7 @@ def _why_ungraspable(
         hit = len(scored) > 0 or (outcome == CODE[Outcome.COLLISION]).any()
         return Ungraspable.BLOCKED if hit else None
     hands = sample.candidates.T_cloud_hand[scored]
-    met = met_first(hand_views(scene.cloud, hands, gripper), gripper)
+    met = met_first(scene.cloud, hands, gripper)
     hidden = _far_side_hidden(scene, hands, met, gripper)
     return Ungraspable.HIDDEN if hidden.mean() > 0.5 else None
 

@@ -32,6 +32,7 @@ from edgegrasp_model.scene.scene import Scene, SelectedPoints, build_scene, sele
 from edgegrasp_sim.camera import Observation, ViewRange
 from edgegrasp_sim.engine import choose_engine
 from edgegrasp_sim.objects import CLUTTER, ObjectSet, SceneKind
+from edgegrasp_sim.poses import about_z
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
 from edgegrasp_sim.sensor import random_sensor
 from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
@@ -216,7 +217,7 @@ def _make_scene(
     options: GenerationOptions,
     streams: list[np.random.Generator],
 ) -> Query | None:
-    """Make a scene; with weights mostly one that they find hard, and return the hard view."""
+    """Make a scene, with weights mostly one they find hard; returns that hard view, if any."""
     rng = streams[SCENE_STREAM]
     guide = None
     if options.weights is not None and rng.random() < HARD_SHARE:
@@ -236,7 +237,7 @@ def _hard_view(
     guide: GraspDetector,
     streams: list[np.random.Generator],
 ) -> Query | None:
-    """The first view in which the network is unsure, or sure and wrong; easy objects go before."""
+    """The first view in which the network is unsure or wrong; easy objects are removed first."""
     for _ in range(min(simulation.num_objects, HARD_LOOKS)):
         query = ask(simulation, kind, seen_from, streams)
         if len(query.observation.cloud) == 0:
@@ -258,7 +259,7 @@ def ask(
     seen_from: ViewRange,
     streams: list[np.random.Generator],
 ) -> Query:
-    """Look at the scene, and request grasps as a benchmark does, around fewer points.
+    """Observe the scene and make a request like a benchmark's, with fewer approach points.
 
     In bins, on tables and in some other views the cloud holds all that the camera sees, and the
     support is given, not quite where it is, or has to be found.
@@ -306,7 +307,7 @@ def _noise(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def _plane(rng: np.random.Generator) -> SupportPlane:
-    """The table as it is measured or found: not quite where it is."""
+    """The table's plane with the error of a measurement."""
     tilted = np.array([*rng.normal(0.0, PLANE_TILT, size=2), 1.0])
     x, y, z = (tilted / np.linalg.norm(tilted)).tolist()
     height = TABLE_HEIGHT + rng.normal(0.0, PLANE_ERROR)
@@ -320,7 +321,7 @@ def _objects_of(simulation: ClutterSimulation) -> Region:
     for box in simulation.surroundings.boxes:
         if box.obstacle:
             x, y, z = (size / 2 + AROUND_MARGIN for size in box.size)
-            turn = 0.0, 0.0, float(np.sin(box.yaw / 2)), float(np.cos(box.yaw / 2))
+            turn = about_z(box.yaw)
             around.append(OrientedBox(center=box.centre, half_extents=(x, y, z), quaternion=turn))
     return Region(
         include=tuple(Box(min=tuple(low), max=tuple(high)) for low, high in boxes.tolist()),

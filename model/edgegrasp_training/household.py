@@ -129,7 +129,7 @@ def _tray(rng: Random) -> list[Part]:
 
 
 def _book(rng: Random) -> list[Part]:
-    """Covers a little larger than the pages; a quarter stands."""
+    """Covers are a little larger than the pages; a quarter of the books stand."""
     x, y, z = rng.uniform(0.1, 0.28), rng.uniform(0.08, 0.21), rng.uniform(0.008, 0.06)
     cover, inset = rng.uniform(0.001, 0.003), rng.uniform(0.0, 0.005)
     parts = [_box((x, y, cover), (0.0, 0.0, side * (z - cover) / 2)) for side in (-1.0, 1.0)]

@@ -26,7 +26,7 @@ FEW = 25
 
 @dataclass(frozen=True, eq=False)
 class Outcomes:
-    """Grasps that were tried."""
+    """Executed grasps and whether they held."""
 
     logit: Float64  # (N,) of the score
     held: Float64  # (N,) 1 or 0

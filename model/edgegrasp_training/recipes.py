@@ -50,7 +50,7 @@ def prepare_to_train(network: nn.Module) -> None:
 
 
 def start_from(network: nn.Module, start: nn.Module) -> int:
-    """Copy a trained network's weights into one to train; a hand network may read more numbers.
+    """Copy trained weights into a new network, whose hand description may be longer.
 
     Additional numbers start with weight 0. Returns how many `start`, which takes lengths in metres,
     reads; 0 for networks of balls. ValueError: the networks differ in more than that.

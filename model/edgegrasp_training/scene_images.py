@@ -60,7 +60,7 @@ def generate(
     part: int,  # which share of the files this process writes, from 0
     parts: int,  # how many shares there are
 ) -> None:
-    """Write numbered files of images, those that are not there yet."""
+    """Write the numbered files of images that do not exist yet."""
     folder.mkdir(parents=True, exist_ok=True)
     drawn = -1
     for number in range(part, files, parts):
@@ -132,7 +132,7 @@ def draw_pose(rng: np.random.Generator, scene: SceneMeshes) -> Float64:
 
 @lru_cache(maxsize=1)
 def _casting_of(scene: SceneMeshes) -> o3d.t.geometry.RaycastingScene:
-    """What rays are cast at; kept for the next view of a complete scene."""
+    """The ray-casting scene, cached for the next view of the same scene."""
     return _casting(scene.parts)
 
 
@@ -181,7 +181,7 @@ def _faults(
     pose: Float64,
     scene: SceneMeshes,
 ) -> tuple[Float64, NDArray[np.uint8]]:
-    """The image as a real camera gives it, NaN without a reading, and what its readings show."""
+    """The image with a real camera's faults, NaN without a reading, and its labels."""
     numbers = np.arange(OBJECT, OBJECT + len(scene.centres))
     glass = numbers[rng.random(len(numbers)) < 0.03]
     if len(glass):

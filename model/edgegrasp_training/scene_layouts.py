@@ -27,7 +27,7 @@ EMPTY_SHARE = 0.03  # of the scenes that have no object
 
 @dataclass(eq=False)
 class SceneMeshes:
-    """What a scene is made of, and where a camera should look."""
+    """The meshes of a scene, and where a camera should look."""
 
     rng: np.random.Generator  # of all that is drawn
     pool: Sequence[PoolMesh]  # objects to draw from
@@ -62,7 +62,7 @@ class SceneMeshes:
 def draw_scene(
     rng: np.random.Generator, pool: Sequence[PoolMesh], arms: Sequence[Mesh]
 ) -> SceneMeshes:
-    """Any of the kinds of scenes."""
+    """Draw a scene of a random kind."""
     kinds = {_table: 0.34, _bin: 0.33, _shelf: 0.17, _tray: 0.09, _floor: 0.07}
     shares = np.array(list(kinds.values()))
     make = list(kinds)[int(rng.choice(len(kinds), p=shares / shares.sum()))]
@@ -367,7 +367,7 @@ _BOX_FACES = np.array(
 
 
 class HeightMap:
-    """How high what lies on a level surface reaches; objects are put down on it."""
+    """Heights of the objects on a level surface, onto which further objects are put down."""
 
     def __init__(self, half: tuple[float, float], walls: float = 0.0) -> None:
         """Free inside of a rectangle of half sides `half`, `walls` high outside of it, metres."""
@@ -389,11 +389,11 @@ class HeightMap:
         return index[:, 0], index[:, 1]
 
     def rest(self, points: Float64) -> float:
-        """How far an object with these surface points (N, 3) has to be raised to lie."""
+        """How far an object with surface points (N, 3) must be raised to rest there."""
         return float((self.height[self.cells(points)] - points[:, 2]).max())
 
     def put(self, points: Float64) -> None:
-        """Let an object lie there."""
+        """Add an object's surface to the heights."""
         np.maximum.at(self.height, self.cells(points), points[:, 2])
 
 

@@ -59,7 +59,7 @@ class SceneImages:
         self.add(files)
 
     def add(self, files: Sequence[Path]) -> None:
-        """Read those of some files that were not read yet."""
+        """Read the files that have not been read yet."""
         for path in files:
             if path in self.arrays:
                 continue
@@ -143,7 +143,7 @@ def _cropped(
     plane: Float32,
     rng: np.random.Generator,
 ) -> Float32:
-    """Only the points above the support and near the objects, as callers crop clouds."""
+    """Keep only points above the support and near objects, as callers crop clouds."""
     objects = points[(label >= OBJECT) & ~np.isnan(points[..., 2])]
     if len(objects) < 50:
         return points

@@ -12,8 +12,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from edgegrasp_camera.arrays import Float64, Int64
+from edgegrasp_sim.engine import OBJECT_MASS
 from edgegrasp_sim.objects import (
-    OBJECT_MASS,
     ObjectModel,
     ObjectSet,
     as_obj,

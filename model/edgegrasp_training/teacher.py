@@ -31,7 +31,7 @@ class Teacher:
         self.crop_radius = crop_radius
 
     def soft_labels(self, path: Path) -> SoftLabels:
-        """Its scores of a view's candidates, the same ones for the same file."""
+        """The scores of a view's candidates, the same each time for the same file."""
         return self.score(load_view(path), np.random.default_rng(zlib.crc32(path.read_bytes())))
 
     def score(self, view: LabelledView, rng: np.random.Generator) -> SoftLabels:

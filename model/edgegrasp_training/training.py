@@ -210,7 +210,7 @@ class Trainer:
         return float(loss.detach())
 
     def _training_batch(self, rng: np.random.Generator) -> Packed:
-        """Some balls of some views; the seed and the step number alone decide which."""
+        """Random balls of random views, determined by the seed and the step number alone."""
         count = min(self.options.views_per_step, len(self.train_paths))
         parts: list[Packed] = []
         for index in rng.choice(len(self.train_paths), count, replace=False):

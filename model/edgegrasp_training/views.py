@@ -76,12 +76,12 @@ class LabelledView:
 
     @property
     def hand(self) -> Gripper:
-        """The hand that tried them."""
+        """The hand that executed the grasps."""
         return _hand(self.gripper)
 
     @property
     def support_plane(self) -> SupportPlane | None:
-        """The plane that the objects rest on, as it was given or found."""
+        """The support plane, as it was given or found."""
         if self.support is None:
             return TABLE
         x, y, z, offset = self.support.astype(np.float64).tolist()
@@ -102,7 +102,7 @@ class LabelledView:
         return near_workspace_side(self.points, WORKSPACE, UP, self.points)
 
     def numbered_objects(self) -> Int64:
-        """The object (N,) that each point belongs to; where unknown, what hangs together."""
+        """The object (N,) that each point belongs to; connected components where unknown."""
         if self.object_of_point is not None:
             return self.object_of_point.astype(np.int64)
         count = len(self.points)

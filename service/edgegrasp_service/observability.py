@@ -58,7 +58,7 @@ class Call:
 
     @property
     def client(self) -> str:
-        """The client that its requests are counted for."""
+        """The client whose share of the server it uses: its token's name or its network."""
         return self.token or network_of(self.peer)
 
     def limit(self, timeout: float) -> None:
@@ -123,7 +123,7 @@ class JsonFormatter(logging.Formatter):
     """One JSON object a line, with `fields` of the record beside its message."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The line of a record."""
+        """A record as one line of JSON."""
         line = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),

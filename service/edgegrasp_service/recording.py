@@ -61,7 +61,7 @@ class Recorder:
         writing.add_done_callback(lambda _: self._hold(-size))
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the queued recordings."""
         self._thread.shutdown()
 
     def _write(self, time: datetime, job: Job, answer: Answer) -> None:

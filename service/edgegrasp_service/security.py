@@ -118,7 +118,7 @@ class ServerTls:
         )
 
     def use(self, certificates: "Certificates") -> None:
-        """Use these for new connections; open ones are not affected."""
+        """Use these certificates for new connections; open ones are not affected."""
         self.http.current, self._for_grpc = certificates
 
     def read(self) -> "Certificates":

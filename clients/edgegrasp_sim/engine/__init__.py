@@ -18,6 +18,8 @@ Vector: TypeAlias = Sequence[float] | Matrix
 
 TIME_STEP = 1.0 / 80.0  # seconds
 GRAVITY = 9.81  # m/s²
+OBJECT_MASS = 0.5  # kg
+OBJECT_FRICTION = 1.0
 SLIDE_MASS = 0.05  # kg, of what carries fingers that swing
 ENGINES = ("pybullet", "mujoco")  # the first that is installed is the default
 
@@ -85,7 +87,7 @@ class Contact(NamedTuple):
 
 
 class Shake(NamedTuple):
-    """How a hand with something in it is dragged to either side and back, along its x and its y."""
+    """How a hand is shaken while it holds an object: to either side and back, along x and y."""
 
     distance: float  # metres to either side
     step_length: float  # metres in each time step
@@ -130,7 +132,7 @@ class ArmModel:
 
 
 class World(Protocol):
-    """A physics world; a process may have several. Bodies that are removed are gone for good."""
+    """A physics world; a process may have several. Removed bodies cannot be restored."""
 
     name: ClassVar[str]  # of the engine
     constants: ClassVar[dict[str, float]]  # for the record of a result
@@ -162,22 +164,15 @@ class World(Protocol):
         """Keep the present state in memory; valid for the bodies that are there now."""
 
     def restore_state(self, state: int) -> None:
-        """Return to a kept state."""
+        """Return to a saved state."""
 
     def remove_state(self, state: int) -> None:
-        """Forget a kept state."""
+        """Discard a saved state."""
 
     def load_urdf(
-        self,
-        path: Path,
-        position: Vector,
-        quaternion_xyzw: Vector,
-        scale: float,
-        *,
-        mass: float,
-        friction: float,
+        self, path: Path, position: Vector, quaternion_xyzw: Vector, scale: float
     ) -> "Body":
-        """Load a body with its link frame there; its inertia is that of its collision shape."""
+        """Load an object with its link frame there; its inertia is that of its collision shape."""
 
     def add_box(self, size: Vector, centre: Vector, *, friction: float, yaw: float = 0.0) -> "Body":
         """Add a box that never moves, turned about z; `size` is its full extent in metres."""
@@ -190,7 +185,7 @@ class World(Protocol):
         raise ValueError(f"engine is {self.name}; an arm takes mujoco")
 
     def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
-        """Depth (height, width) of pixels' lower left corners, metres; `far`: nothing seen."""
+        """Depth (height, width) at the pixels' lower left corners, metres; `far` if empty."""
 
 
 class Body(Protocol):
@@ -199,7 +194,7 @@ class Body(Protocol):
     uid: int
 
     def remove(self) -> None:
-        """Take the body out of its world."""
+        """Remove the body from its world."""
 
     @property
     def position(self) -> Matrix:
@@ -210,7 +205,7 @@ class Body(Protocol):
         """Orientation in the world."""
 
     def set_pose(self, position: Vector, quaternion_xyzw: Vector) -> None:
-        """Put the centre of mass there, at rest."""
+        """Set the pose of the centre of mass, at rest."""
 
     @property
     def speed(self) -> float:
@@ -232,7 +227,7 @@ class Hand(Body, Protocol):
         """Metres between the fingers."""
 
     def set_pose(self, position: Vector, quaternion_xyzw: Vector) -> None:
-        """Put the hand there at once, at rest and open, and hold it there."""
+        """Set the hand's pose at once, open and at rest, and hold it there."""
 
     def move(self, position: Vector, quaternion_xyzw: Vector) -> None:
         """Pull the centre of mass there in the next step."""
@@ -247,7 +242,7 @@ class Arm(Hand, Protocol):
     substeps: ClassVar[int]  # of a time step
 
     def rest(self) -> None:
-        """Put the arm to its home at once, at rest, its hand open."""
+        """Move the arm to its home at once, at rest, with an open hand."""
 
     def drive(self, positions: Matrix, velocities: Matrix) -> None:
         """Have the joints' controllers follow (substeps, J) in the next time step."""

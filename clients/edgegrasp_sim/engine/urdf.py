@@ -112,7 +112,7 @@ def _triangles(lines: list[str], known: int) -> NDArray[np.int64]:
 
 
 def least_width(shape: Shape) -> float:
-    """The least distance of two planes that an object fits between, one along a face; metres."""
+    """The least distance between parallel planes around an object, one along a face; metres."""
     hull = ConvexHull(np.concatenate([part.points for part in shape.hulls]))
     heights = hull.points[hull.vertices] @ hull.equations[:, :3].T
     return float(np.ptp(heights, axis=0).min())

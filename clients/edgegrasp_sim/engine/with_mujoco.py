@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from edgegrasp_sim.engine import (
     GRAVITY,
+    OBJECT_FRICTION,
+    OBJECT_MASS,
     SLIDE_MASS,
     TIME_STEP,
     Arm,
@@ -29,7 +31,7 @@ from edgegrasp_sim.engine import (
     World,
 )
 from edgegrasp_sim.engine.urdf import read_urdf
-from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
+from edgegrasp_sim.poses import Matrix, about_z, quaternion_xyzw, translation
 
 SUBSTEPS = 4  # of 3.125 ms in each time step
 ARM_SUBSTEPS = 13  # with an arm, for joints that hardly give: more than 1 kHz
@@ -72,7 +74,7 @@ _VISIBLE, _SOLID = 0, 3  # groups of shapes: seen by the camera, and met by rays
 
 
 class MujocoWorld(World):
-    """A model that is compiled anew when a body came or went, and its state."""
+    """A model, recompiled whenever bodies are added or removed, and its state."""
 
     name = "mujoco"
     constants = CONSTANTS
@@ -169,20 +171,13 @@ class MujocoWorld(World):
         del self._states[state]
 
     def load_urdf(
-        self,
-        path: Path,
-        position: Vector,
-        quaternion_xyzw: Vector,
-        scale: float,
-        *,
-        mass: float,
-        friction: float,
+        self, path: Path, position: Vector, quaternion_xyzw: Vector, scale: float
     ) -> "MujocoBody":
         shape = read_urdf(path, scale)
         body = self._add(np.asarray(position), quaternion_xyzw)
         body.add_freejoint()
         corners = np.concatenate([hull.points for hull in shape.hulls])
-        _weigh(body, mass, corners)
+        _weigh(body, OBJECT_MASS, corners)
         for number, surface in enumerate(shape.visible):
             name = f"{body.name} visible {number}"  # which the camera sees, and nothing touches
             self.spec.add_mesh(
@@ -194,7 +189,8 @@ class MujocoWorld(World):
             kind = mujoco.mjtGeom.mjGEOM_MESH
             body.add_geom(type=kind, meshname=name, contype=0, conaffinity=0, group=_VISIBLE)
         for number, hull in enumerate(shape.hulls):
-            self._add_hull(body, f"{body.name} {number}", hull.points, friction=(friction, 0, 0))
+            friction = (OBJECT_FRICTION, 0, 0)
+            self._add_hull(body, f"{body.name} {number}", hull.points, friction=friction)
         added = MujocoBody(self, body, corners)
         added.set_pose(position, quaternion_xyzw)
         centre = added.rotation @ shape.centre
@@ -205,8 +201,7 @@ class MujocoWorld(World):
         self, size: Vector, centre: Vector, *, friction: float, yaw: float = 0.0
     ) -> "MujocoBody":
         half = 0.5 * np.asarray(size)
-        turn = (0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
-        body = self._add(np.asarray(centre), turn)
+        body = self._add(np.asarray(centre), about_z(yaw))
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX,
             size=half,
@@ -318,7 +313,7 @@ class MujocoWorld(World):
         body.add_geom(type=kind, meshname=name, group=_SOLID, **contact)
 
     def _add_slide(self, body: Any) -> Any:
-        """Add what carries fingers that swing, which slides along z."""
+        """Add the carriage of swinging fingers, which slides along z."""
         slide = body.add_body(name=f"{body.name} slide", gravcomp=1.0)
         slide.explicitinertial = True
         slide.mass, slide.inertia = SLIDE_MASS, [1e-5] * 3
@@ -335,7 +330,7 @@ class MujocoWorld(World):
         return drive
 
     def _couple(self, joint: str, other: str, polynomial: Sequence[float]) -> None:
-        """Keep a joint where a polynomial of another's place has it."""
+        """Couple a joint to another's position by a polynomial."""
         self.spec.add_equality(
             type=mujoco.mjtEq.mjEQ_JOINT,
             name1=joint,
@@ -365,7 +360,7 @@ class MujocoWorld(World):
             spring.set_to_position(ARM_STIFFNESS, damping)
 
     def remove(self, body: Any) -> None:
-        """Take a body and its meshes away."""
+        """Remove a body and its meshes."""
         names = [geom.meshname for geom in body.geoms if geom.meshname]
         self.spec.delete(body)
         for name in names:
@@ -463,11 +458,11 @@ class MujocoHand(MujocoBody, Hand):
         self.world.data.ctrl[:2] = -FINGER_SPEED
 
     def aim(self, place: Matrix) -> None:
-        """Have its target there, (3,), in the next substep."""
+        """Set its target (3,) for the next substep."""
         self.world.data.mocap_pos[0] = place
 
     def watch(self) -> None:
-        """Look at what the last substep did."""
+        """Record what happened in the last substep."""
 
 
 class MujocoArm(MujocoHand, Arm):
@@ -509,7 +504,7 @@ class MujocoArm(MujocoHand, Arm):
 
 
 class _Images:
-    """Depth images of a model, made when first asked for."""
+    """Renders depth images of a model; set up for the first image."""
 
     def __init__(self) -> None:
         self._model: Any = None
@@ -552,7 +547,7 @@ class _Images:
 
 @cache
 def _gl_context(width: int, height: int) -> Any:
-    """What this process draws with; made once."""
+    """The OpenGL context of this process, created once."""
     try:
         # MuJoCo chooses on import, which may have been before MUJOCO_GL was set.
         drawing = import_module(f"mujoco.{os.environ['MUJOCO_GL'].lower()}")
@@ -567,7 +562,7 @@ def _gl_context(width: int, height: int) -> Any:
 
 
 def _look(eye: Any, T_world_camera: Matrix, camera: Intrinsics) -> None:
-    """Put OpenGL's camera, which samples a pixel at its middle, where the pinhole camera is."""
+    """Place OpenGL's camera, which samples pixel centres, at the pinhole camera."""
     per_pixel = camera.near / camera.focal_length
     eye.pos = T_world_camera[:3, 3]
     eye.forward = T_world_camera[:3, 2]

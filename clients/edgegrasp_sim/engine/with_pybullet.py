@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from edgegrasp_sim.engine import (
     GRAVITY,
+    OBJECT_FRICTION,
+    OBJECT_MASS,
     SLIDE_MASS,
     TIME_STEP,
     Body,
@@ -23,7 +25,7 @@ from edgegrasp_sim.engine import (
     Vector,
     World,
 )
-from edgegrasp_sim.poses import Matrix
+from edgegrasp_sim.poses import Matrix, about_z
 
 SOLVER_ITERATIONS = 100
 COLLISION_DEPTH = 0.001  # metres
@@ -99,14 +101,7 @@ class PybulletWorld(World):
         self.client.removeState(state)
 
     def load_urdf(
-        self,
-        path: Path,
-        position: Vector,
-        quaternion_xyzw: Vector,
-        scale: float,
-        *,
-        mass: float,
-        friction: float,
+        self, path: Path, position: Vector, quaternion_xyzw: Vector, scale: float
     ) -> "PybulletBody":
         if not path.is_file():
             raise FileNotFoundError(f"no object file at {path}; check the object folder")
@@ -116,7 +111,7 @@ class PybulletWorld(World):
             raise ValueError(f"PyBullet cannot read {path}: {error}") from error
         body = PybulletBody(self.client, uid)
         # A given mass also makes the engine compute the inertia from the collision shape.
-        body.change(-1, lateralFriction=friction, mass=mass)
+        body.change(-1, lateralFriction=OBJECT_FRICTION, mass=OBJECT_MASS)
         return body
 
     def add_box(
@@ -125,8 +120,7 @@ class PybulletWorld(World):
         shape = self.client.createCollisionShape(
             pybullet.GEOM_BOX, halfExtents=[0.5 * extent for extent in size]
         )
-        quaternion_xyzw = [0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2))]
-        uid = self.client.createMultiBody(0.0, shape, -1, centre, quaternion_xyzw)
+        uid = self.client.createMultiBody(0.0, shape, -1, centre, about_z(yaw))
         body = PybulletBody(self.client, uid)
         body.change(-1, lateralFriction=friction)
         return body
@@ -299,7 +293,7 @@ class PybulletHand(PybulletBody, Hand):
             self._drive(finger, 0.0)
 
     def swing(self) -> None:
-        """Have the fingers come forward in the next step as far as they will have closed."""
+        """Move the fingers forward in the next step by as much as their closing requires."""
         if self.model.advance is None:
             return
         finger = self.client.getJointState(self.uid, self._fingers[0])
@@ -314,7 +308,7 @@ class PybulletHand(PybulletBody, Hand):
         )
 
     def _drive(self, finger: int, position: float) -> None:
-        """Let a finger's motor pull toward a place, metres from the middle."""
+        """Drive a finger's motor toward a position, metres from the middle."""
         self.client.setJointMotorControl2(
             self.uid,
             finger,

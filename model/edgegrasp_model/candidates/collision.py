@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -141,17 +140,8 @@ class HandView:
     candidate: Int64  # (P,) ascending
     row: Int64  # (P,) row of the cloud
     position: Float32  # (P, 3) in the hand frame
-    num_candidates: int
-
-    @cached_property
-    def columns(self) -> Float32:
-        """The positions as rows x, y, z (3, P), which is many times faster to process."""
-        return np.ascontiguousarray(self.position.T)
-
-    @cached_property
-    def bounds(self) -> Int64:
-        """Where the points of each hand begin, and the last's end: (E + 1,)."""
-        return np.searchsorted(self.candidate, np.arange(self.num_candidates + 1))
+    columns: Float32  # (3, P) the same, which is many times faster to process
+    bounds: Int64  # (E + 1,) where the points of each hand begin, and the last's end
 
 
 def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandView:
@@ -162,25 +152,20 @@ def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandVie
     high[2] += gripper.max_tip_z - gripper.tip_z
     reach = low.astype(np.float32), high.astype(np.float32)
     hand, row, position = points_in_hand_boxes(cloud.points, T_cloud_hand, *reach)
-    return HandView(hand, row, position, len(T_cloud_hand))
+    bounds = np.searchsorted(hand, np.arange(len(T_cloud_hand) + 1))
+    return HandView(hand, row, position, np.ascontiguousarray(position.T), bounds)
 
 
-def required_openings(met: Float32, gripper: Gripper) -> Float32:
-    """Opening (E,), metres, that leaves FINGER_CLEARANCE on both sides of `met_first`, (E, 2)."""
-    widest = 2 * (np.abs(met).max(axis=1) + np.float32(FINGER_CLEARANCE))
-    width: Float32 = np.minimum(widest, np.float32(gripper.max_opening))
-    return width
-
-
-def met_first(view: HandView, gripper: Gripper) -> Float32:
-    """Greatest and least y (E, 2) of what lies between the open fingers; 0 where nothing does."""
+def met_first(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
+    """Greatest and least y (E, 2) of the points between open fingers, hand frame; 0 without any."""
+    view = hand_views(cloud, T_cloud_hand, gripper)
     half = gripper.pad_half_width
     x, y, z = view.columns
     inner = gripper.max_opening / 2
     ahead = (z > gripper.palm_z) & (z < gripper.max_tip_z)
     between = (np.abs(x) < half) & (np.abs(y) < inner) & ahead
     hand, place = view.candidate[between], y[between]
-    met = np.full((view.num_candidates, 2), (-np.inf, np.inf), dtype=np.float32)
+    met = np.full((len(T_cloud_hand), 2), (-np.inf, np.inf), dtype=np.float32)
     np.maximum.at(met[:, 0], hand, place)
     np.minimum.at(met[:, 1], hand, place)
     return np.where(np.isfinite(met), met, np.float32(0.0))

@@ -50,7 +50,7 @@ def save_checkpoint(path: Path, network: nn.Module, metadata: CheckpointMetadata
 def load_checkpoint(
     path: Path, device: torch.device | str = "cpu"
 ) -> tuple[nn.Module, CheckpointMetadata]:
-    """Load a checkpoint, the network in evaluation mode; InvalidCheckpoint: it cannot be used."""
+    """Load a checkpoint, the network in evaluation mode; raises InvalidCheckpoint."""
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
             text = (file.metadata() or {}).get(_METADATA_KEY)
@@ -85,7 +85,7 @@ def load_checkpoint(
 
 
 def check_reference_logits(network: nn.Module, metadata: CheckpointMetadata) -> None:
-    """Raise InvalidCheckpoint unless the stored logits result, on average as near ties may flip."""
+    """Raise InvalidCheckpoint unless the network gives the stored logits, up to near ties."""
     found = np.asarray(reference_logits(network))
     expected = np.asarray(metadata.reference_logits or found)
     tolerance = MAX_DIFFERENCE * np.ptp(expected) + 1e-3

@@ -91,7 +91,7 @@ class PointNetConv(nn.Module):
 
 
 class GlobalFeature(nn.Module):
-    """One feature per ball: MLP, maximum over the ball, joined to each point; the same again."""
+    """One feature per ball: twice an MLP and a maximum over the ball, joined to each point."""
 
     def __init__(self, inputs: int, widths_1: tuple[int, ...], widths_2: tuple[int, ...]) -> None:
         super().__init__()

@@ -61,7 +61,7 @@ class HandBatch:
         num_points: int,
         description_size: int = HAND_DESCRIPTION_SIZE,
     ) -> Self:
-        """What the hands of some candidates see, with at most `num_points` points each."""
+        """The view of each candidate's hand, with at most `num_points` points."""
         T_cloud_hand = candidates.T_cloud_hand
         view = hand_views(around.cloud, T_cloud_hand, gripper)
         description = describe_hands(around, candidates, gripper, view, description_size)

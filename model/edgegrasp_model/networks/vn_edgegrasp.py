@@ -107,7 +107,7 @@ class VNPointNetConv(nn.Module):
 
 
 class VNGlobalFeature(nn.Module):
-    """One feature per ball: vector MLP, maximum, joined to each point; the same again."""
+    """One feature per ball: twice a vector MLP and a maximum, joined to each point."""
 
     def __init__(self, inputs: int, widths_1: tuple[int, ...], widths_2: tuple[int, ...]) -> None:
         super().__init__()

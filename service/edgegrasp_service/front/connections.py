@@ -148,7 +148,7 @@ class Places:
 async def receive(
     settings: Settings, part: Awaitable[T], received: int = 0, start: float = 0.0
 ) -> T:
-    """The next part of a body; raises RequestTimeout where it arrives too slowly.
+    """The next part of a body; raises RequestTimeout if it arrives too slowly.
 
     Args:
         settings: How slow is too slow.
@@ -168,7 +168,7 @@ async def receive(
 
 
 async def send(settings: Settings, sending: Awaitable[None], size: int) -> None:
-    """Wait until so many bytes are taken; raises Cancelled where that takes too long."""
+    """Send `size` bytes; raises Cancelled if the client does not take them in time."""
     try:
         async with asyncio.timeout(settings.write_seconds + size / settings.min_bytes_per_second):
             await sending
@@ -262,7 +262,7 @@ class HttpProtocol(HttpToolsProtocol):
         self._write_timer = self.loop.call_later(seconds, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """Stop that timer."""
+        """Cancel the timer of `pause_writing`."""
         if self._write_timer is not None:
             self._write_timer.cancel()
         super().resume_writing()
@@ -381,7 +381,7 @@ def grpc_bounds(settings: Settings) -> list[tuple[str, int]]:
 
 
 async def trim_grpc(port: int, most: int, others: Callable[[], int]) -> None:
-    """Close surplus connections to gRPC's port, for ever; gRPC itself cannot limit them by client.
+    """Keep closing surplus connections to gRPC's port, which gRPC cannot limit by client.
 
     Args:
         port: Of gRPC.

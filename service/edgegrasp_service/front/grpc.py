@@ -118,12 +118,12 @@ class GrpcServer:
         self.port = 0 if sockets else port
 
     async def start(self) -> None:
-        """Open for requests, as not serving yet."""
+        """Open the port; health checks report NOT_SERVING."""
         await self.set_serving(False)
         await self._server.start()
 
     async def set_serving(self, serving: bool) -> None:
-        """Set what health checks answer."""
+        """Set the status that health checks report."""
         status = STATES.SERVING if serving else STATES.NOT_SERVING
         for name in ("", SERVICE.full_name):
             await self._health.set(name, status)
@@ -134,7 +134,7 @@ class GrpcServer:
 
 
 class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in its stubs only
-    """Those of edgegrasp.v1.GraspService, health checks and reflection; named, counted, logged."""
+    """The methods of GraspService, health checks and reflection, each named, counted and logged."""
 
     def __init__(self, service: GraspService, reloader: Reloader, checks: Any) -> None:
         self._service = service
@@ -440,7 +440,7 @@ async def _answer(service: GraspService, stream: Call, request: dict[str, Any]) 
 
 
 def _timeout(request: dict[str, Any]) -> float:
-    """Seconds; raises InvalidRequest for a field that is wrong or unknown."""
+    """The timeout in seconds; raises InvalidRequest for a wrong or unknown field."""
     if "unknown" in request:
         fix = "Send the fields of this server's .proto file only."
         raise InvalidRequest("request", "a field that this server does not know", fix)

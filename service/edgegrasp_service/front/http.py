@@ -145,7 +145,7 @@ class HttpMiddleware:
 
     @asynccontextmanager
     async def _page(self, client: str) -> AsyncIterator[None]:
-        """Answer a page: each waits a moment, in which others are served, however many come."""
+        """Hold a slot for a page after a short pause, so that many pages do not delay requests."""
         async with self._page_begins:
             await asyncio.sleep(PAGE_PAUSE_SECONDS)
         async with self._pages.hold(client):
@@ -236,14 +236,14 @@ def create_router(service: GraspService, metrics: Metrics, reloader: Reloader) -
 
 
 class _File:
-    """A route to a file, read at start: a thread for each read would delay others."""
+    """A route to a file, read once at the start: reading in threads would delay other requests."""
 
     def __init__(self, file: Path) -> None:
         kind, _ = mimetypes.guess_type(file.name)
         self._response = Response(file.read_bytes(), media_type=kind)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send it."""
+        """Send the file."""
         await _send_slowly(self._response, send)
 
 

@@ -214,7 +214,7 @@ class WorkerPool:
                 await asyncio.sleep(RETRY_SECONDS)
 
     def _nursery_lost(self, nursery: "_Nursery") -> None:
-        """Load again; the workers continue meanwhile."""
+        """Load the weights again in a new nursery; the workers continue meanwhile."""
         logger.error("the process that workers fork from died; weights are loaded again")
         self._spawn(self._until_done(nursery, self.start))
 
@@ -253,7 +253,7 @@ class _Nursery:
         return nursery
 
     def watch(self, lost: Callable[[], None]) -> None:
-        """Call `lost` when it dies."""
+        """Call `lost` when the nursery dies."""
         loop = asyncio.get_running_loop()
 
         def readable() -> None:
@@ -278,7 +278,7 @@ class _Nursery:
         return False
 
     def fork(self) -> socket.socket:
-        """A socket to a new worker."""
+        """Fork a worker; returns the socket to it."""
         ours, theirs = socket.socketpair()
         with theirs:
             try:
@@ -289,12 +289,12 @@ class _Nursery:
         return ours
 
     def kill(self) -> None:
-        """Kill it, even if it is stopped; `watch` will notice."""
+        """Kill the nursery, even if it is stopped; `watch` notices."""
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGKILL)
 
     def close(self) -> None:
-        """Kill it; the workers that it forked continue."""
+        """Kill the nursery; the workers that it forked continue."""
         with contextlib.suppress(RuntimeError, ValueError):
             asyncio.get_running_loop().remove_reader(self._control)
         self._process.kill()
@@ -316,7 +316,7 @@ class _Worker:
         self.killed = False
 
     async def start(self) -> None:
-        """Fork it and wait until it is ready; raises InvalidSettings if it cannot load."""
+        """Fork the worker and wait until it is ready; raises InvalidSettings if it cannot load."""
         ours = self.nursery.fork()
         self._reader, self._writer = await asyncio.open_unix_connection(sock=ours)
         ready = await self.receive()
@@ -325,7 +325,7 @@ class _Worker:
         self.pid, self.ready = ready.pid, ready
 
     async def receive(self) -> Any:
-        """Its next message; None when it has ended."""
+        """The worker's next message; None when it has ended."""
         try:
             length, body_length = HEADER.unpack(await self._reader.readexactly(HEADER.size))
             text = await self._reader.readexactly(length)
@@ -358,7 +358,7 @@ class _Worker:
             raise
 
     def finish(self, answer: Answer | EdgeGraspError) -> None:
-        """Complete its job, if any, with the answer or an error."""
+        """Complete the worker's job, if any, with the answer or an error."""
         self.at_work = False
         if self._killing is not None:
             self._killing.cancel()
@@ -372,7 +372,7 @@ class _Worker:
             waiting.set_result(answer)
 
     def kill(self) -> None:
-        """Kill it."""
+        """Kill the worker."""
         self.killed = True
         if self.pid:
             with contextlib.suppress(ProcessLookupError):
