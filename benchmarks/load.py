@@ -1,6 +1,6 @@
 """Measure servers under load: `python -m benchmarks.load` writes load.json.
 
-Clients in processes of their own send clouds of 20,000 points, each its next request once it has an
+Clients in processes of their own send clouds or depth images, each its next request once it has an
 answer: latency and throughput by the number of clients. Without `--server` one is started, and
 measured over both transports. Several servers take turns, so that other work on the machine meets
 all alike: a new design beside the old one.
@@ -20,11 +20,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from benchmarks.measuring import RESULTS, machine, served, write_results
+from PIL import Image
 
+import edgegrasp_service
 from edgegrasp_camera.arrays import Float32
 from edgegrasp_client import DetectOptions, GraspClient, GraspClientError
 
 POINTS = 20_000
+SAMPLE = Path(edgegrasp_service.__file__).parent / "playground" / "samples" / "seven_depth.png"
+FOCAL = 540.0  # pixels, of the sample's camera
 OPTIONS: DetectOptions = {"num_approach_points": 32, "num_candidates": 500}
 PROCESSES = 2  # that the clients are shared among
 TIMEOUT = 120.0  # seconds until a request is given up
@@ -45,11 +49,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.load")
     parser.add_argument("--output", type=Path, default=RESULTS)
     parser.add_argument("--server", action="append", help="host:port or http://host:port")
+    parser.add_argument("--points", type=int, default=POINTS, help="of a cloud; 0: a depth image")
     parser.add_argument("--clients", type=int, nargs="+", default=[1, 2, 8])
     parser.add_argument("--seconds", type=float, default=8.0, help="of each run")
     parser.add_argument("--rounds", type=int, default=3, help="turns of each server")
     given = parser.parse_args()
-    results: dict[str, Any] = {"machine": machine(), "points": POINTS, **OPTIONS, "servers": []}
+    results: dict[str, Any] = {"machine": machine(), "points": given.points, **OPTIONS}
+    results["servers"] = []
     with ExitStack() as stack:
         servers = {address: address for address in given.server or ()}
         if not servers:
@@ -59,7 +65,7 @@ def main() -> None:
         list(pool.map(time.sleep, [START_SECONDS] * PROCESSES))  # until all processes have started
         runs: dict[tuple[int, str], list[list[Sample]]] = {}
         for _, clients, name in itertools.product(range(given.rounds), given.clients, servers):
-            samples = send(pool, servers[name], clients, given.seconds)
+            samples = send(pool, servers[name], clients, given.seconds, given.points)
             runs.setdefault((clients, name), []).append(samples)
     for (clients, name), found in runs.items():
         rates = [sum(one.code == OK for one in run) / given.seconds for run in found]
@@ -69,22 +75,27 @@ def main() -> None:
     write_results(given.output, "load", results)
 
 
-def send(pool: ProcessPoolExecutor, address: str, clients: int, seconds: float) -> list[Sample]:
+def send(
+    pool: ProcessPoolExecutor, address: str, clients: int, seconds: float, points: int
+) -> list[Sample]:
     """Share the clients among the processes."""
     processes = min(PROCESSES, clients)
     start = time.monotonic() + START_SECONDS
     shares = [
-        pool.submit(run_clients, address, clients // processes, start, seconds, seed)
+        pool.submit(run_clients, address, clients // processes, start, seconds, points, seed)
         for seed in range(processes)
     ]
     return [sample for share in shares for sample in share.result()]
 
 
 def run_clients(
-    address: str, clients: int, start: float, seconds: float, seed: int
+    address: str, clients: int, start: float, seconds: float, points: int, seed: int
 ) -> list[Sample]:
     """Send from `start` on until the time is over; every request that was sent has its sample."""
-    points = cloud(POINTS, seed)
+    request: dict[str, Any] = {"cloud": cloud(points, seed)}
+    if not points:
+        depth = np.asarray(Image.open(SAMPLE))
+        request = {"depth_images": [{"depth": depth, "intrinsics": (FOCAL, FOCAL, 320.0, 240.0)}]}
 
     def work(_: int) -> list[Sample]:
         samples = []
@@ -92,7 +103,7 @@ def run_clients(
             time.sleep(max(0.0, start - time.monotonic()))
             while (begun := time.monotonic()) < start + seconds:
                 try:
-                    code, detector = OK, client.detect(points, **OPTIONS).seconds["total"]
+                    code, detector = OK, client.detect(**request, **OPTIONS).seconds["total"]
                 except GraspClientError as error:
                     code, detector = type(error).__name__, np.nan
                 took = time.monotonic() - begun

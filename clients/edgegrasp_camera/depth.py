@@ -14,6 +14,7 @@ from edgegrasp_camera.clouds import CloudInput
 
 Position = tuple[float, float, float]  # metres
 
+ENCODINGS = {"32FC1": "<f4", "64FC1": "<f8", "16UC1": "<u2"}  # as sensor_msgs/Image has them
 MILLIMETRE = 0.001  # metres for one unit of whole numbers
 FOCAL_LENGTHS = 0.1, 20.0  # shares of the image's size: 157 and 3 degrees
 OFF_CENTRE = 0.15  # share of the width or height that a principal point may lie off the middle
@@ -57,7 +58,7 @@ def intrinsics_of(value: Any) -> Intrinsics:
     raise ValueError("must be fx, fy, cx, cy or [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
 
 
-def metres(depth: Array, scale: float | None = None, field: str = "depth") -> Float64:
+def metres(depth: Array, scale: float | None = None, field: str = "depth") -> Float32:
     """Depths of an image (H, W) or (H, W, 1) in metres, (H, W); NaN where there is no reading.
 
     No reading is 0 or NaN. `scale` is metres for one unit; None: 0.001 of whole numbers, 1 of
@@ -71,21 +72,32 @@ def metres(depth: Array, scale: float | None = None, field: str = "depth") -> Fl
         value = f"shape {depth.shape}, dtype {depth.dtype}"
         fix = "Send an image (H, W) of 16-bit whole numbers or of floats."
         raise InvalidRequest(field, value, fix)
-    found = depth.astype(np.float64) * (scale or (MILLIMETRE if whole else 1.0))
+    with np.errstate(over="ignore"):  # infinite is no reading
+        found = depth.astype(np.float32)
+        found *= scale or (MILLIMETRE if whole else 1.0)
     if (found < 0).any():
         worst = float(np.nanmin(found))
         raise InvalidRequest(field, f"{worst:g} m", "Send 0 or NaN where there is no reading.")
-    found[~(np.isfinite(found) & (found > 0))] = np.nan
+    np.copyto(found, np.nan, where=~((found > 0) & (found < np.inf)))
     return found
 
 
-def unproject(depth: Float64, camera: Intrinsics) -> Float64:
-    """The points (H, W, 3) of depths (H, W) in metres, camera frame; NaN stays NaN."""
-    row, column = np.indices(depth.shape)
+def unproject(depth: Float32, camera: Intrinsics, T_cloud_camera: Float64 | None = None) -> Float32:
+    """The points (H, W, 3) of depths (H, W) in metres; NaN stays NaN.
+
+    They are in the frame of the pose (4, 4), without one in the camera's.
+    """
+    pose = np.eye(4) if T_cloud_camera is None else T_cloud_camera
+    level = (np.arange(depth.shape[1]) - camera.cx) / camera.fx
+    vertical = (np.arange(depth.shape[0]) - camera.cy) / camera.fy
+    points = np.empty((*depth.shape, 3), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # overflow is refused later
-        x = (column - camera.cx) / camera.fx * depth
-        y = (row - camera.cy) / camera.fy * depth
-    return np.stack([x, y, depth], axis=-1)
+        for axis, (right, down, forward, origin) in enumerate(pose[:3].tolist()):
+            of_row = (down * vertical + forward).astype(np.float32)
+            way = of_row[:, None] + (right * level).astype(np.float32)  # for each metre of depth
+            way *= depth
+            np.add(way, np.float32(origin), out=points[..., axis])
+    return points
 
 
 def fuse_depth_images(
@@ -113,9 +125,7 @@ def fuse_depth_images(
         found = metres(depth, view.depth_scale, f"depth_images.{row}.depth")
         doubts += _doubts(view.intrinsics, found.shape, f"depth_images.{row}.intrinsics")
         pose = np.array(view.T_cloud_camera, dtype=np.float64)
-        with np.errstate(over="ignore", invalid="ignore"):
-            points = unproject(found, view.intrinsics) @ pose[:3, :3].T + pose[:3, 3]
-            clouds.append(points.astype(np.float32))
+        clouds.append(unproject(found, view.intrinsics, pose))
         cameras.append(tuple(pose[:3, 3].tolist()))
     if len(views) == 1:
         return CloudInput(clouds[0], warnings=tuple(doubts)), cameras

@@ -7,7 +7,8 @@ import grpc.aio
 import numpy as np
 from google.protobuf.message import DecodeError, Message
 
-from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp.v1 import grasp_pb2
+from edgegrasp_camera.arrays import Array
 from edgegrasp_client.connection import Tls, read_pem, token_metadata
 from edgegrasp_client.errors import (
     AccessDeniedError,
@@ -46,6 +47,8 @@ CHANNEL_OPTIONS = (
     ("grpc.keepalive_timeout_ms", 10_000),
 )
 
+SERVICE = "edgegrasp.v1.GraspService"
+
 # grpc.health.v1: an empty request asks about the whole server; field 1 = 1 means SERVING.
 HEALTH_CHECK = "/grpc.health.v1.Health/Check"
 SERVING = b"\x08\x01"
@@ -81,21 +84,17 @@ class GrpcTransport:
             )
             self._channel = grpc.aio.secure_channel(address, credentials, CHANNEL_OPTIONS)
         self._metadata = token_metadata(token)
-        self._stub = grasp_pb2_grpc.GraspServiceStub(self._channel)
         self._check = self._channel.unary_unary(HEALTH_CHECK, bytes, bytes)
 
     async def ask(self, kind: type[Answer], request: Request, timeout: float) -> Answer:
         """The answer to a request."""
-        method = self._stub.ScoreGrasps if request.scores else self._stub.DetectGrasps
-        return read_as(kind, await self._call(method, message_of(request), timeout), read_field)
+        name = "ScoreGrasps" if request.scores else "DetectGrasps"
+        answer = await self._call(name, b"".join(wire_of(request)), timeout)
+        return read_as(kind, answer, read_field)
 
     async def listed(self, kind: type[Answer], timeout: float) -> Answer:
         """The server's Models or Robots."""
-        name = f"List{kind.__name__}"
-        call = self._call(
-            getattr(self._stub, name), getattr(grasp_pb2, f"{name}Request")(), timeout
-        )
-        return read_as(kind, await call, read_field)
+        return read_as(kind, await self._call(f"List{kind.__name__}", b"", timeout), read_field)
 
     async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
         """Refused: gRPC has no such call."""
@@ -107,18 +106,17 @@ class GrpcTransport:
         """An answer to each of the named requests."""
         failed: list[Exception] = []
 
-        async def messages() -> AsyncIterator[grasp_pb2.DetectGraspsStreamRequest]:
+        async def messages() -> AsyncIterator[bytes]:
             try:
                 async for name, request in requests:
-                    yield grasp_pb2.DetectGraspsStreamRequest(
-                        request_id=name,
-                        request=message_of(request.request),
-                        timeout=timeout if request.timeout is None else request.timeout,
-                    )
+                    seconds = timeout if request.timeout is None else request.timeout
+                    message = grasp_pb2.DetectGraspsStreamRequest(request_id=name, timeout=seconds)
+                    wire = _field(message, "request", *wire_of(request.request))
+                    yield b"".join([message.SerializeToString(), *wire])
             except Exception as error:  # gRPC would only log it
                 failed.append(error)
 
-        call: Any = self._stub.DetectGraspsStream(messages(), metadata=self._metadata)
+        call: Any = self._method("DetectGraspsStream")(messages(), metadata=self._metadata)
         try:
             async for answer in call:
                 if answer.HasField("detection"):
@@ -150,9 +148,17 @@ class GrpcTransport:
         """Close the channel."""
         await self._channel.close(None)
 
-    async def _call(self, method: Any, message: Message, timeout: float) -> Any:
+    def _method(self, name: str) -> Any:
+        """A method of the service; it takes serialized requests."""
+        streams = name.endswith("Stream")
+        method = self._channel.stream_stream if streams else self._channel.unary_unary
+        response = getattr(grasp_pb2, f"{name}Response")
+        return method(f"/{SERVICE}/{name}", None, response.FromString)
+
+    async def _call(self, name: str, request: bytes, timeout: float) -> Any:
         try:
-            return await method(message, timeout=timeout, metadata=self._metadata)
+            method = self._method(name)
+            return await method(request, timeout=timeout, metadata=self._metadata)
         except grpc.RpcError as error:
             raise _error_of(error) from None
 
@@ -189,20 +195,30 @@ def _described(message: str, detail: grasp_pb2.ErrorDetail) -> GraspClientError:
 # Requests
 
 
-def message_of(request: Request) -> Any:
-    """The message of a request; raises InvalidRequestError for what no message can hold."""
+def wire_of(request: Request) -> list[bytes | memoryview]:
+    """The serialized message of a request, in parts; InvalidRequestError: no message can hold it.
+
+    Protobuf would copy long fields four times. A message whose fields come in two parts is merged.
+    """
     kind = grasp_pb2.ScoreGraspsRequest if request.scores else grasp_pb2.DetectGraspsRequest
     message: Any = kind()
+    long: list[bytes | memoryview] = []
     cloud = request.cloud
     if cloud is None:
         for which, image in enumerate(request.depth_images or ()):
-            fields = depth_image_fields(image, which)
+            view, fields = grasp_pb2.DepthImage(), depth_image_fields(image, which)
             fields["T_cloud_camera"] = np.ravel(fields["T_cloud_camera"]).tolist()
-            fill(message.depth_images.add(), fields, f"depth_images.{which}")
+            data = _field(view.depth, "data", fields["depth"].pop("data"))
+            fill(view, fields, f"depth_images.{which}")
+            whole = view.SerializeToString(), *_field(view, "depth", *data)
+            long += _field(message, "depth_images", *whole)
     elif is_point_cloud2(cloud):
-        fill(message.point_cloud2, point_cloud2_fields(cloud), "point_cloud2")
+        fields = point_cloud2_fields(cloud)
+        data = _field(message.point_cloud2, "data", fields.pop("data"))
+        fill(message.point_cloud2, fields, "point_cloud2")
+        long += _field(message, "point_cloud2", *data)
     elif (points := float32_points(cloud)) is not None:
-        message.points = points.astype("<f4", copy=False).tobytes()
+        long += _field(message, "points", _little_endian(points))
     else:
         message.encoded.format, message.encoded.data = cloud_file(cloud)
     for name, array in request.arrays.items():
@@ -214,9 +230,26 @@ def message_of(request: Request) -> Any:
             for pose in array:
                 message.hand_poses.add(T_cloud_hand=pose.ravel().tolist())
         else:
-            setattr(message, name, array.astype(array.dtype.newbyteorder("<")).tobytes())
+            long += _field(message, name, _little_endian(array))
     fill(message.options, request.options, "options")
-    return message
+    return [message.SerializeToString(), *long]
+
+
+def _little_endian(array: Array) -> memoryview:
+    """The bytes of a contiguous array, without a copy where they are that already."""
+    return array.astype(array.dtype.newbyteorder("<"), copy=False).reshape(-1).view(np.uint8).data
+
+
+def _field(message: Message, name: str, *parts: bytes | memoryview) -> list[bytes | memoryview]:
+    """A field of a message as it is on the wire: its bytes or serialized message, in parts."""
+    head = bytearray()
+    number = message.DESCRIPTOR.fields_by_name[name].number
+    for value in (number << 3 | 2, sum(map(len, parts))):
+        while value > 127:
+            head.append(value & 127 | 128)
+            value >>= 7
+        head.append(value)
+    return [bytes(head), *parts]
 
 
 def fill(message: Message, value: object, path: str) -> None:

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import httpx
 import numpy as np
 
+from edgegrasp_camera.depth import ENCODINGS
 from edgegrasp_client.connection import HTTP_OVER_UNIX, Tls, read_pem, token_metadata
 from edgegrasp_client.errors import (
     DeadlineError,
@@ -140,7 +141,12 @@ def call_of(request: Request) -> Call:
     if cloud is None:
         images = enumerate(request.depth_images or ())
         fields = [depth_image_fields(image, number) for number, image in images]
-        parts["depth_images"] = _json_part("depth_images", fields)
+        if len(fields) == 1:
+            (image,) = fields
+            parts["depth"] = _depth_part(image.pop("depth"))
+            parts |= {name: _json_part(name, value) for name, value in image.items()}
+        else:
+            parts["depth_images"] = _json_part("depth_images", fields)
     elif is_point_cloud2(cloud):
         parts["point_cloud2"] = _json_part("point_cloud2", point_cloud2_fields(cloud))
     else:
@@ -150,6 +156,15 @@ def call_of(request: Request) -> Call:
         parts[name] = (f"{name}.npy", npy_bytes(array), "application/x-npy")
     path = "/v1/grasps:score" if request.scores else "/v1/grasps"
     return {"method": "POST", "url": path, "files": parts}
+
+
+def _depth_part(depth: Mapping[str, Any]) -> Part:
+    """A file of the fields of edgegrasp.v1.Depth."""
+    if depth["encoding"] == "png":
+        return "depth.png", depth["data"], "image/png"
+    pixels = np.frombuffer(depth["data"], ENCODINGS[depth["encoding"]])
+    image = pixels.reshape(depth["height"], depth["width"])
+    return "depth.npy", npy_bytes(image), "application/x-npy"
 
 
 def _json_part(name: str, value: object) -> Part:

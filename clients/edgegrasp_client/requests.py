@@ -17,13 +17,13 @@ from typing_extensions import NotRequired, TypedDict, Unpack
 
 from edgegrasp_camera.arrays import Array, Float32
 from edgegrasp_camera.clouds import PointCloud2
-from edgegrasp_camera.depth import intrinsics_of
+from edgegrasp_camera.depth import ENCODINGS, intrinsics_of
 from edgegrasp_camera.files import FILE_FORMATS
 from edgegrasp_client.errors import invalid
 from edgegrasp_client.options import DetectOptions
 
 SAME_POINT = 0.005  # metres: the side of a cell in which the scene repeats the object
-DEPTH_ENCODINGS = {"float32": "32FC1", "float64": "64FC1", "uint16": "16UC1"}
+DEPTH_ENCODINGS = {np.dtype(kind).name: name for name, kind in ENCODINGS.items()}  # by dtype
 
 
 class Intrinsics(TypedDict):
@@ -250,9 +250,11 @@ def cloud_file(cloud: Cloud) -> CloudFile:
 
 def npy_bytes(array: Array) -> bytes:
     """An array as an .npy file; raises ValueError for one of objects."""
-    stream = io.BytesIO()
-    np.save(stream, array, allow_pickle=False)
-    return stream.getvalue()
+    head, array = io.BytesIO(), np.asarray(array, order="C")
+    if array.dtype.hasobject:
+        raise ValueError("an array of objects")
+    np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(array))
+    return b"".join([head.getvalue(), array.reshape(-1).view(np.uint8).data])
 
 
 def is_point_cloud2(cloud: object) -> TypeGuard[PointCloud2]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, is_dataclass
-from functools import lru_cache, partial
+from functools import cache, partial
 from types import NoneType
 from typing import Annotated, Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
@@ -93,37 +93,48 @@ Record = TypeVar("Record")
 Read = Callable[[Any, str], Any]
 """read(answer, name): the field of that name of an object in an answer; None if it is absent."""
 
-_hints = lru_cache(partial(get_type_hints, include_extras=True))
-
 
 def read_as(kind: type[Record], answer: Any, read: Read) -> Record:
     """An answer, or an object in one, as one of the dataclasses above."""
     if not is_dataclass(kind):  # an answer that says nothing
         return kind()
-    values = {name: _value(hint, read(answer, name), read) for name, hint in _hints(kind).items()}
+    values = {name: value(read(answer, name), read) for name, value in _fields(kind)}
     if kind is ArmTrajectory:  # gRPC has rows one behind the other
         for name in ("positions", "velocities"):
             values[name] = values[name].reshape(-1, len(values["joint_names"]))
     return cast("Callable[..., Record]", kind)(**values)
 
 
-def _value(hint: Any, value: Any, read: Read) -> Any:
-    """A value as a field of such a type has it; arrays in the shape of the annotation."""
+@cache
+def _fields(kind: type[Any]) -> list[tuple[str, Callable[[Any, Read], Any]]]:
+    """Each field of a dataclass, and how its value is read."""
+    hints = get_type_hints(kind, include_extras=True)
+    return [(name, _value(hint)) for name, hint in hints.items()]
+
+
+def _value(hint: Any) -> Callable[[Any, Read], Any]:
+    """How a field of such a type is read; arrays in the shape of the annotation."""
     parts = [part for part in get_args(hint) if part is not NoneType]
     if NoneType in get_args(hint):
+        given = _value(parts[0])
         scalar = parts[0] in (bool, float, int, str) or is_dataclass(parts[0])
-        absent = value is None or not (scalar or len(value))  # gRPC: none are sent
-        return None if absent else _value(parts[0], value, read)
+        # Of lists, gRPC sends none.
+        return lambda value, read: (
+            None if value is None or not (scalar or len(value)) else given(value, read)
+        )
     if is_dataclass(hint):
-        return read_as(cast("type[Any]", hint), value, read)
+        return partial(read_as, cast("type[Any]", hint))
     if get_origin(hint) is list:
-        inner = is_dataclass(parts[0])
-        return [read_as(parts[0], one, read) if inner else one for one in value]
+        one = _value(parts[0])
+        return lambda value, read: [one(part, read) for part in value]
     if get_origin(hint) is dict:  # in the order of the stages; those of a newer server come last
-        return {name: value[name] for name in (*_STAGES, *sorted(value)) if name in value}
+        return lambda value, _: {
+            name: value[name] for name in (*_STAGES, *sorted(value)) if name in value
+        }
     if get_origin(hint) is Annotated:
-        return _value(parts[0], value, read).reshape(hint.__metadata__[0])
+        array, shape = _value(parts[0]), hint.__metadata__[0]
+        return lambda value, read: array(value, read).reshape(shape)
     if get_origin(hint) is np.ndarray:
         (dtype,) = get_args(get_args(hint)[1])
-        return np.array(value, dtype=dtype)  # null in JSON becomes NaN
-    return value
+        return lambda value, _: np.array(value, dtype=dtype)  # null in JSON becomes NaN
+    return lambda value, _: value

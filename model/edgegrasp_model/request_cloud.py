@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, SkipValidation, Str
 
 from edgegrasp_camera.arrays import Array
 from edgegrasp_camera.clouds import CloudInput, read_point_cloud2, too_many
-from edgegrasp_camera.depth import Position, fuse_depth_images, intrinsics_of
+from edgegrasp_camera.depth import ENCODINGS, Position, fuse_depth_images, intrinsics_of
 from edgegrasp_camera.files import read_file, read_npy, read_png
 from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import (
@@ -246,8 +246,6 @@ CAMERA = tuple(DepthImage.model_fields)  # what a form may have as parts, of one
 
 # Depth images
 
-DEPTH_ENCODINGS = {"32FC1": "<f4", "64FC1": "<f8", "16UC1": "<u2"}
-
 
 def read_depth_images(images: object, max_points: int) -> tuple[CloudInput, list[Position]]:
     """Read DepthImages, plain values whose `depth` may also be a File, and fuse them."""
@@ -273,7 +271,7 @@ def _depth(depth: object, max_points: int, field: str) -> Array:
     image = parse(Depth, depth, field)
     if image.encoding == "png":
         return read_png(image.data, max_points, f"{field}.data")
-    dtype = np.dtype(DEPTH_ENCODINGS[image.encoding])
+    dtype = np.dtype(ENCODINGS[image.encoding])
     expected = image.height * image.width * dtype.itemsize
     if len(image.data) != expected:
         value = f"{len(image.data)} bytes where height, width and encoding ask for {expected}"

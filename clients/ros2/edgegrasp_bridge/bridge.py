@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from edgegrasp_camera.arrays import Array, Float64
+from edgegrasp_camera.arrays import Array, Float32, Float64
 from edgegrasp_camera.clouds import read_point_cloud2
 from edgegrasp_camera.depth import intrinsics_of, metres, unproject
 from edgegrasp_camera.picture import fork
@@ -430,7 +430,7 @@ def _from_frames(scene: Scene, settings: Settings, lookup: Lookup) -> dict[str, 
     return asked
 
 
-def _depth_points(scene: Scene) -> Float64:
+def _depth_points(scene: Scene) -> Float32:
     """Points (N, 3) of the scene's depth image, camera frame; NaN where there is no reading."""
     intrinsics = intrinsics_of(camera_matrix(scene.camera))
     return unproject(metres(depth_array(scene.depth)), intrinsics).reshape(-1, 3)

@@ -32,6 +32,8 @@ from edgegrasp_service.worker.process import (
 # -P: nothing is imported from the folder the server was started in.
 NURSERY = (sys.executable, "-P", "-m", "edgegrasp_service.worker.process")
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+# Freed memory is kept for the next request: the system hands out new pages slowly.
+KEPT_MEMORY = {"MALLOC_TRIM_THRESHOLD_": str(2**26), "MALLOC_MMAP_THRESHOLD_": str(2**24)}
 
 WORKER_LOST = kind_of(WorkerLost)
 CRASHES = {signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL}
@@ -54,7 +56,7 @@ def launch(settings: Settings, command: Sequence[str] = ()) -> Launched:
     """Start the nursery, which loads meanwhile; `command` replaces NURSERY."""
     control, theirs = socket.socketpair()
     with theirs:
-        environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
+        environment = KEPT_MEMORY | os.environ | dict.fromkeys(ONE_THREAD, "1")
         command = [*(command or NURSERY), settings.model_dump_json()]
         return subprocess.Popen(command, stdin=theirs.fileno(), env=environment), control
 
