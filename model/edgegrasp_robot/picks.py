@@ -249,19 +249,16 @@ class _Arm:
         parts = [part for part in timed if part is not None]
         if len(parts) < len(timed):
             return pick
-        begins = np.cumsum([0.0, *(part.times[-1] for part in parts)])
-        later = [
-            begin + np.array(part.times[1:]) for begin, part in zip(begins[:-1], parts, strict=True)
-        ]
-        ends = np.cumsum([len(times) for times in later]).tolist()
-        trajectory = ArmTrajectory(
-            self._robot.joint_names,
-            np.concatenate([[0.0], *later]),
-            np.concatenate([self._start[None], *(part.positions[1:] for part in parts)]),
-            np.concatenate([np.zeros((1, len(self._start))), *(p.velocities[1:] for p in parts)]),
-            *ends[:2],
-            None if pick.put is None else ends[4],
-        )
+        times, ends = [0.0], []
+        positions, velocities = [self._start], [np.zeros(len(self._start))]
+        for part in parts:
+            times += [times[-1] + since for since in part.times[1:]]
+            positions += part.positions[1:]
+            velocities += part.velocities[1:]
+            ends.append(len(times) - 1)
+        rows = np.array(times), np.array(positions), np.array(velocities)
+        release = None if pick.put is None else ends[4]
+        trajectory = ArmTrajectory(self._robot.joint_names, *rows, ends[0], ends[1], release)
         return replace(pick, plan=replace(pick.plan, trajectory=trajectory))
 
     def _with_place(self, pick: _Pick, place: Place) -> _Pick | None:
@@ -353,7 +350,7 @@ class _Arm:
         except RuntimeError:
             return None
         rows = np.array(found.positions)
-        if not self._robot.within_limits(rows):
+        if not all(map(scene.isValidConfiguration, rows)):
             return None
         if straight:
             hand = np.array([self._robot.hand_pose(row)[:3, 3] for row in (*rows, joints[-1])])

@@ -1,11 +1,12 @@
 """Robots: the robot file, which names an arm's model and its gripper, and the loaded robot."""
 
+import json
 import tempfile
 import tomllib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -46,14 +47,6 @@ class HandPose(Strict):
 
     position: Vector
     quaternion: Quaternion = (0.0, 0.0, 0.0, 1.0)
-
-    @property
-    def matrix(self) -> Float64:
-        """T_flange_hand (4, 4)."""
-        pose = np.eye(4)
-        pose[:3, :3] = Rotation.from_quat(self.quaternion).as_matrix()
-        pose[:3, 3] = self.position
-        return pose
 
 
 class RobotFile(Strict):
@@ -101,52 +94,34 @@ class Robot:
 
     def joints_at(self, T_base_hand: Float64, start: Float64) -> Float64 | None:
         """Joints (J,) that bring the hand there, found from others (J,); None: not found."""
-        T_base_flange = np.asfortranarray(T_base_hand @ self.T_hand_flange)
-        goal = core.CartesianConfiguration(self.base_frame, self.flange_frame, T_base_flange)
+        goal = core.CartesianConfiguration(self.base_frame, HAND, np.asfortranarray(T_base_hand))
         begin = core.JointConfiguration(self.joint_names, start)
         found = core.JointConfiguration(self.joint_names, start)
         if not self.ik.solveIk(goal, begin, found):
             return None
         joints = np.array(found.positions)
-        return joints if self.within_limits(joints) else None
-
-    def within_limits(self, joints: Float64) -> bool:
-        """Whether joints (..., J) are."""
-        return bool(((joints >= self.lower) & (joints <= self.upper)).all())
-
-    @cached_property
-    def T_hand_flange(self) -> Float64:  # noqa: N802
-        """(4, 4)."""
-        found: Float64 = np.linalg.inv(self.T_flange_hand)
-        return found
+        return joints if self.scene.isValidConfiguration(joints) else None
 
     def hand_pose(self, joints: ArrayLike) -> Float64:
         """T_base_hand (4, 4) at joints (J,)."""
-        T_base_flange = self.scene.forwardKinematics(
-            np.asarray(joints, np.float64), self.flange_frame, self.base_frame
-        )
-        return np.asarray(T_base_flange @ self.T_flange_hand)
+        given = np.asarray(joints, np.float64)
+        return np.asarray(self.scene.forwardKinematics(given, HAND, self.base_frame))
 
     def link_poses(self, joints: ArrayLike) -> Float64:
         """T_base_link (L, 4, 4) of the links that have a shape, the hand last."""
         given = np.asarray(joints, np.float64)
-        poses = [
-            self.scene.forwardKinematics(given, link, self.base_frame) for link in self.model.links
-        ]
-        return np.array(poses)
+        fk = self.scene.forwardKinematics
+        return np.array([fk(given, link, self.base_frame) for link in self.model.links])
 
     def describe(self) -> dict[str, Any]:
         """The public description, as plain JSON values."""
+        numbers = ("home", "lower", "upper", "max_velocity", "max_acceleration")
         return {
             "name": self.name,
             "gripper": self.gripper.name,
             "base_frame": self.base_frame,
             "joint_names": self.joint_names,
-            "home": self.home.tolist(),
-            "lower": self.lower.tolist(),
-            "upper": self.upper.tolist(),
-            "max_velocity": self.max_velocity.tolist(),
-            "max_acceleration": self.max_acceleration.tolist(),
+            **{field: getattr(self, field).tolist() for field in numbers},
             **self.kinematics,
         }
 
@@ -161,18 +136,18 @@ class Model:
     links: list[str]  # those that have a shape
     standing: list[str]  # those of them that no joint moves: they may touch what they stand on
     allowed: list[tuple[str, str]]  # pairs of links that may touch
-    limits: str  # YAML
+    limits: str  # of velocity and acceleration, JSON
 
-    def scene(self, name: str, base: str, flange: str) -> core.Scene:
+    def scene(self, arm: RobotFile | Robot) -> core.Scene:
         """A scene with the robot alone."""
-        scene = core.Scene(name, core.loadUrdfSceneDescriptionFromXml(self.urdf, self.packages))
-        scene.addGroupFromChain(GROUP, base, flange)
+        scene = core.Scene(GROUP, core.loadUrdfSceneDescriptionFromXml(self.urdf, self.packages))
+        scene.addGroupFromChain(GROUP, arm.base_frame, arm.flange_frame)
         scene.allowAdjacentLinkCollisions()
         scene.setCollisions(self.allowed, False)
-        with tempfile.NamedTemporaryFile("w", suffix=".yaml") as file:
-            file.write(self.limits)
-            file.flush()
-            scene.importJointLimitsFromConfig(core.loadJointLimitsConfig(file.name))
+        with tempfile.NamedTemporaryFile("w", suffix=".yaml") as limits:
+            limits.write(f'{{"joint_limits": {self.limits}}}')
+            limits.flush()
+            scene.importJointLimitsFromConfig(core.loadJointLimitsConfig(limits.name))
         return scene
 
 
@@ -217,51 +192,54 @@ def _load(path: Path, file: RobotFile) -> Robot:
     packages = [str(path.parent / folder) for folder in file.packages]
     packages.append(str(get_package_share_dir()))
     root = _read_urdf(_located(path, "urdf", file.urdf, packages))
-    joint_names = _chain(path, root, file.base_frame, file.flange_frame)
+    joints = _chain(path, root, file)
+    joint_names = [str(joint.get("name")) for joint in joints]
+    limits: dict[str, dict[str, list[float]]] = {name: {} for name in joint_names}
+    if not file.max_acceleration:
+        file = file.model_copy(update={"max_acceleration": (CAREFUL,) * len(joints)})
     for field in ("home", "max_velocity", "max_acceleration"):
         given = getattr(file, field)
-        if given and len(given) != len(joint_names):
-            fix = f"The arm has {len(joint_names)} joints: {', '.join(joint_names)}."
+        if given and len(given) != len(joints):
+            fix = f"The arm has {len(joints)} joints: {', '.join(joint_names)}."
             raise InvalidRobot(f"{path.name}: {field}: got {len(given)} numbers. {fix}")
+        if field != "home":
+            for name, value in zip(joint_names, given, strict=False):
+                limits[name][field] = [value]
     gripper_file = path.parent / file.gripper
     named = gripper_file if gripper_file.is_file() else file.gripper
     hand = GripperGeometry.model_validate(gripper_fields(named))
     gripper = gripper_from_fields(hand)
     beyond = _cut_beyond(root, file.flange_frame)
-    T_flange_hand = file.T_flange_hand.matrix
-    _fix_other_joints(root, joint_names)
+    _fix_other_joints(root, joints)
     _check_meshes(path, root, packages)
-    arm = ElementTree.tostring(root, encoding="unicode")
-    _add_hand(root, file.flange_frame, T_flange_hand, gripper)
+    arm = _text(root)
+    _add_hand(root, file, gripper)
+    shaped = [link for link in root.findall("link") if link.find("collision") is not None]
+    links = [str(link.get("name")) for link in shaped]
     allowed: list[tuple[str, str]] = []
     if file.srdf:
         srdf = ElementTree.parse(_located(path, "srdf", file.srdf, packages)).getroot()
-        allowed = _allowed(srdf, root, beyond)
-    limits = _limits(joint_names, file)
-    text = ElementTree.tostring(root, encoding="unicode")
-    links = [link for link in _links(root) if _has_shape(root, link)]
-    standing = [link for link in links if not _moves(root, link)]
-    model = Model(arm, text, packages, links, standing, allowed, limits)
-    for link in root.findall("link"):
+        allowed = _allowed(srdf, links, beyond)
+    standing = [
+        link for link in links if not any(one.get("type") in MOVING for one in _above(root, link))
+    ]
+    model = Model(arm, _text(root), packages, links, standing, allowed, json.dumps(limits))
+    for link in shaped:
         for shape in link.findall("collision"):
             link.remove(shape)
-    bare = replace(model, urdf=ElementTree.tostring(root, encoding="unicode"), allowed=[])
-    scenes = [
-        one.scene(path.stem, file.base_frame, file.flange_frame)
-        for one in (model, model, model, bare)
-    ]
+    bare = replace(model, urdf=_text(root), allowed=[])
+    scenes = [one.scene(file) for one in (model, model, model, bare)]
     lower, upper = scenes[0].getPositionLimitVectors(GROUP)
     home = np.array(file.home) if file.home else np.clip(0.0, lower, upper)
     if ((home < lower) | (home > upper)).any():
         fix = f"Give joints between {lower.tolist()} and {upper.tolist()}."
         raise InvalidRobot(f"{path.name}: home: got {home.tolist()}. {fix}")
     robot = Robot(
-        path.stem, gripper,
-        hand, file.base_frame, file.flange_frame, T_flange_hand, joint_names, home,
-        lower, upper, scenes[0].getVelocityLimitVectors(GROUP)[1],
+        path.stem, gripper, hand, file.base_frame, file.flange_frame,
+        scenes[0].forwardKinematics(home, HAND, file.flange_frame), joint_names, home, lower, upper,
+        scenes[0].getVelocityLimitVectors(GROUP)[1],
         scenes[0].getAccelerationLimitVectors(GROUP)[1],
-        _kinematics(root, scenes[0], joint_names, file), model, *scenes,
-        SimpleIk(scenes[-1], IK),
+        _kinematics(joints, scenes[0], file.base_frame), model, *scenes, SimpleIk(scenes[-1], IK),
     )  # fmt: skip
     if scenes[0].hasCollisions(home):
         pair = touching(scenes[0], model, home)
@@ -271,17 +249,12 @@ def _load(path: Path, file: RobotFile) -> Robot:
 
 
 def _kinematics(
-    root: Element, scene: core.Scene, joint_names: Sequence[str], file: RobotFile
+    joints: Sequence[Element], scene: core.Scene, base_frame: str
 ) -> dict[str, list[Any]]:
     """Frames between joints, joint axes and which joints slide."""
-    by_name = {str(joint.get("name")): joint for joint in root.findall("joint")}
-    joints = [by_name[name] for name in joint_names]
-    zero = np.zeros(len(joints))
-    links = [str(joint.find("child").get("link")) for joint in joints]  # type: ignore[union-attr]
-    poses = [scene.forwardKinematics(zero, link, file.base_frame) for link in links]
-    hand = scene.forwardKinematics(zero, file.flange_frame, file.base_frame)
-    poses = [np.eye(4), *poses, hand @ file.T_flange_hand.matrix]
-    frames = [np.linalg.inv(before) @ pose for before, pose in pairwise(poses)]
+    links = [*(_link(joint, "child") for joint in joints), HAND]
+    poses = [scene.forwardKinematics(np.zeros(len(joints)), link, base_frame) for link in links]
+    frames = [np.linalg.inv(before) @ pose for before, pose in pairwise([np.eye(4), *poses])]
     found = [joint.find("axis") for joint in joints]
     axes = np.array([(1, 0, 0) if one is None else one.get("xyz", "").split() for one in found])
     axes = axes.astype(np.float64)
@@ -328,51 +301,39 @@ def _read_urdf(file: Path) -> Element:
     return ElementTree.fromstring(text)
 
 
-def _links(root: Element) -> list[str]:
-    return [str(link.get("name")) for link in root.findall("link")]
+def _text(root: Element) -> str:
+    return ElementTree.tostring(root, encoding="unicode")
 
 
-def _has_shape(root: Element, link: str) -> bool:
-    return any(one.get("name") == link and one.find("collision") is not None for one in root)
+def _link(joint: Element, which: str) -> str:
+    """The `parent` or `child` of a joint."""
+    return str(joint.find(which).get("link"))  # type: ignore[union-attr]
 
 
-def _moves(root: Element, link: str) -> bool:
-    """Whether a joint between the root and a link moves."""
-    while (joint := _joint(root, link)) is not None:
-        if joint.get("type") in MOVING:
-            return True
-        link = _parent(joint)
-    return False
+def _above(root: Element, link: str) -> list[Element]:
+    """The joints that carry a link, up to the root."""
+    carriers = {_link(joint, "child"): joint for joint in root.findall("joint")}
+    found: list[Element] = []
+    while (joint := carriers.pop(link, None)) is not None:
+        found.append(joint)
+        link = _link(joint, "parent")
+    return found
 
 
-def _joint(root: Element, child: str) -> Element | None:
-    """The joint that carries a link."""
-    for joint in root.findall("joint"):
-        if joint.find("child").get("link") == child:  # type: ignore[union-attr]
-            return joint
-    return None
-
-
-def _parent(joint: Element) -> str:
-    return str(joint.find("parent").get("link"))  # type: ignore[union-attr]
-
-
-def _chain(path: Path, root: Element, base: str, flange: str) -> list[str]:
+def _chain(path: Path, root: Element, file: RobotFile) -> list[Element]:
     """The moving joints between base and flange, in order."""
-    links = _links(root)
-    for field, name in (("base_frame", base), ("flange_frame", flange)):
-        if name not in links:
+    links = [str(link.get("name")) for link in root.findall("link")]
+    for field in ("base_frame", "flange_frame"):
+        if getattr(file, field) not in links:
             fix = f"Use a link of the URDF: {', '.join(links)}."
-            raise InvalidRobot(f"{path.name}: {field}: got {name!r}. {fix}")
-    joints, link = [], flange
-    while link != base:
-        joint = _joint(root, link)
-        if joint is None:
-            fix = f"Name a link that carries {flange!r}."
-            raise InvalidRobot(f"{path.name}: base_frame: got {base!r}. {fix}")
-        link = _parent(joint)
-        if joint.get("type") in MOVING:
-            joints.append(str(joint.get("name")))
+            raise InvalidRobot(f"{path.name}: {field}: got {getattr(file, field)!r}. {fix}")
+    above = _above(root, file.flange_frame)
+    carrying = [file.flange_frame, *(_link(joint, "parent") for joint in above)]
+    if file.base_frame not in carrying:
+        fix = f"Name a link that carries {file.flange_frame!r}."
+        raise InvalidRobot(f"{path.name}: base_frame: got {file.base_frame!r}. {fix}")
+    between = above[: carrying.index(file.base_frame)]
+    joints = [joint for joint in between if joint.get("type") in MOVING]
     if not joints:
         raise InvalidRobot(f"{path.name}: flange_frame: no joint moves it. Name the last link.")
     return joints[::-1]
@@ -380,40 +341,38 @@ def _chain(path: Path, root: Element, base: str, flange: str) -> list[str]:
 
 def _cut_beyond(root: Element, flange: str) -> set[str]:
     """Remove the links beyond the flange and its own shape; the flange is named among them."""
-    beyond, waiting = {flange}, [flange]
-    while waiting:
-        parent = waiting.pop()
-        for joint in [one for one in root.findall("joint") if _parent(one) == parent]:
-            child = str(joint.find("child").get("link"))  # type: ignore[union-attr]
-            beyond.add(child)
-            waiting.append(child)
-            root.remove(joint)
+    beyond = {flange}
+    for link in root.findall("link"):
+        name = str(link.get("name"))
+        if flange in [_link(joint, "parent") for joint in _above(root, name)]:
+            beyond.add(name)
     for part in list(root):
-        if part.tag not in ("link", "joint", "material"):
-            root.remove(part)
-        elif part.tag == "link" and part.get("name") == flange:
+        if part.tag == "link" and part.get("name") == flange:
             for shape in [*part.findall("collision"), *part.findall("visual")]:
                 part.remove(shape)
-        elif part.tag == "link" and part.get("name") in beyond:
+        elif (
+            part.tag not in ("link", "joint", "material")
+            or (part.tag == "link" and part.get("name") in beyond)
+            or (part.tag == "joint" and _link(part, "parent") in beyond)
+        ):
             root.remove(part)
     return beyond
 
 
-def _fix_other_joints(root: Element, moving: Sequence[str]) -> None:
+def _fix_other_joints(root: Element, moving: Sequence[Element]) -> None:
     """Fix all joints but the arm's; continuous joints are limited to one turn each way."""
     for joint in root.findall("joint"):
-        if joint.get("name") not in moving:
+        if joint not in moving:
             joint.set("type", "fixed")
         elif joint.get("type") == "continuous":
             joint.set("type", "revolute")
-            turn = {"lower": str(-2 * np.pi), "upper": str(2 * np.pi)}
             limit = joint.find("limit")
             if limit is None:
                 limit = ElementTree.SubElement(joint, "limit", effort="1", velocity="1")
-            limit.attrib.update(turn)
+            limit.attrib.update(lower=str(-2 * np.pi), upper=str(2 * np.pi))
 
 
-def _add_hand(root: Element, flange: str, T_flange_hand: Float64, gripper: Gripper) -> None:
+def _add_hand(root: Element, file: RobotFile, gripper: Gripper) -> None:
     """Put the open gripper's boxes on the flange."""
     link = ElementTree.SubElement(root, "link", name=HAND)
     for low, high in gripper.boxes(gripper.max_opening):
@@ -422,10 +381,10 @@ def _add_hand(root: Element, flange: str, T_flange_hand: Float64, gripper: Gripp
         geometry = ElementTree.SubElement(collision, "geometry")
         ElementTree.SubElement(geometry, "box", size=_numbers(high - low))
     joint = ElementTree.SubElement(root, "joint", name=f"{HAND}_joint", type="fixed")
-    ElementTree.SubElement(joint, "parent", link=flange)
+    ElementTree.SubElement(joint, "parent", link=file.flange_frame)
     ElementTree.SubElement(joint, "child", link=HAND)
-    turn = Rotation.from_matrix(T_flange_hand[:3, :3]).as_euler("xyz")
-    place = _numbers(T_flange_hand[:3, 3])
+    turn = Rotation.from_quat(file.T_flange_hand.quaternion).as_euler("xyz")
+    place = _numbers(file.T_flange_hand.position)
     ElementTree.SubElement(joint, "origin", xyz=place, rpy=_numbers(turn))
 
 
@@ -442,23 +401,12 @@ def _check_meshes(path: Path, root: Element, packages: Sequence[str]) -> None:
             link.remove(visual)
 
 
-def _allowed(srdf: Element, root: Element, beyond: set[str]) -> list[tuple[str, str]]:
+def _allowed(srdf: Element, links: Sequence[str], beyond: set[str]) -> list[tuple[str, str]]:
     """Pairs of links that may touch; links beyond the flange count as the hand."""
-    links = {link for link in _links(root) if _has_shape(root, link)}
     pairs = set()
     for one in srdf.findall("disable_collisions"):
         names = [str(one.get(which)) for which in ("link1", "link2")]
         first, second = sorted(HAND if name in beyond else name for name in names)
-        if first != second and {first, second} <= links:
+        if first != second and {first, second} <= set(links):
             pairs.add((first, second))
     return sorted(pairs)
-
-
-def _limits(joint_names: Sequence[str], file: RobotFile) -> str:
-    accelerations = file.max_acceleration or [CAREFUL] * len(joint_names)
-    lines = ["joint_limits:"]
-    for row, name in enumerate(joint_names):
-        lines += [f"  {name}:", f"    max_acceleration: [{accelerations[row]}]"]
-        if file.max_velocity:
-            lines.append(f"    max_velocity: [{file.max_velocity[row]}]")
-    return "\n".join(lines)

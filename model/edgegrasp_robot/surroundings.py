@@ -79,23 +79,21 @@ def carrying(
     robot: Robot, around: Surroundings, load: Load, T_base_hand: Float64
 ) -> Iterator[core.Scene]:
     """A scene in which the hand holds a load, by its pose at the grasp; its foot may touch."""
-    scene, obstacles = robot.carrying, around.all()
-    off, half = load.above_its_foot
+    scene, (off, half) = robot.carrying, load.above_its_foot
     # The planner takes the pose in the frame of the joint that the flange hangs on.
     T_base_joint = scene.forwardKinematics(robot.home, robot.joint_names[-1], robot.base_frame)
     T_joint_hand = np.linalg.inv(T_base_joint) @ robot.hand_pose(robot.home)
     T_joint_box = T_joint_hand @ np.linalg.inv(T_base_hand) @ load.T_base_box
     T_joint_box[:3, 3] += off * T_joint_box[:3, 2]
     pose, box = np.asfortranarray(T_joint_box), core.Box(*(2 * half))
-    _add(scene, robot, obstacles)
-    scene.addBoxGeometry(HELD, robot.flange_frame, box, pose, GREY)
-    scene.setCollisions(HELD, HAND, False)
-    try:
-        yield scene
-    finally:
-        for name in (HELD, *(name for name, _, _ in obstacles)):
+    with _standing_in([scene], robot, around.all()):
+        scene.addBoxGeometry(HELD, robot.flange_frame, box, pose, GREY)
+        scene.setCollisions(HELD, HAND, False)
+        try:
+            yield scene
+        finally:
             with suppress(RuntimeError):  # the load may have been put down
-                scene.removeGeometry(name)
+                scene.removeGeometry(HELD)
 
 
 @contextmanager
@@ -127,33 +125,38 @@ def surrounded(
     around = Surroundings(own, known, voxels, T_base_scene)
     obstacles = around.all()
     names = [name for name, _, _ in obstacles]
-    for planned in (robot.scene, robot.straight):
-        _add(planned, robot, obstacles)
-    try:
+    with _standing_in([robot.scene, robot.straight], robot, obstacles):
         robot.straight.setCollisions([(HAND, name) for name in names], False)
         if robot.scene.hasCollisions(joints):
-            again = robot.model.scene(robot.name, robot.base_frame, robot.flange_frame)
-            _add(again, robot, obstacles)
-            pair = touching(again, robot.model, joints, names)
+            again = robot.model.scene(robot)
+            with _standing_in([again], robot, obstacles):
+                pair = touching(again, robot.model, joints, names)
             fix = "Send the joints as they are, T_base_cloud and obstacles in the right frame."
             raise StartCollision("options.robot.joints", f"a start where {pair} touch", fix)
         yield around
-    finally:
-        for planned in (robot.scene, robot.straight):
-            for name in names:
-                planned.removeGeometry(name)
 
 
-def _add(planned: core.Scene, robot: Robot, around: Sequence[Obstacle]) -> None:
-    """Add obstacles to a scene; they may touch each other and links that no joint moves."""
-    T_root_base = planned.forwardKinematics(robot.home, robot.base_frame)
-    for name, shape, pose in around:
-        add = planned.addBoxGeometry if isinstance(shape, core.Box) else planned.addOcTreeGeometry
-        add(name, "universe", shape, np.asfortranarray(T_root_base @ pose), GREY)  # type: ignore[arg-type]
-    names = [name for name, _, _ in around]
+@contextmanager
+def _standing_in(
+    scenes: Sequence[core.Scene], robot: Robot, obstacles: Sequence[Obstacle]
+) -> Iterator[None]:
+    """Add obstacles to scenes for a while; they may touch each other and links that never move."""
+    T_root_base = robot.scene.forwardKinematics(robot.home, robot.base_frame)
+    names = [name for name, _, _ in obstacles]
     still = combinations([*robot.model.standing, *names], 2)
     pairs = [(one, other) for one, other in still if other in names]
-    planned.setCollisions(pairs, False)
+    for planned in scenes:
+        for name, shape, pose in obstacles:
+            box = isinstance(shape, core.Box)
+            add = planned.addBoxGeometry if box else planned.addOcTreeGeometry
+            add(name, "universe", shape, np.asfortranarray(T_root_base @ pose), GREY)  # type: ignore[arg-type]
+        planned.setCollisions(pairs, False)
+    try:
+        yield
+    finally:
+        for planned in scenes:
+            for name in names:
+                planned.removeGeometry(name)
 
 
 def _own_objects(
@@ -203,20 +206,16 @@ def _support(scene: Scene, T_base_scene: Float64) -> Obstacle:
 
 
 def _voxels(
-    robot: Robot,
-    joints: Float64,
-    scene: Scene,
-    points: object,
-    T_base_scene: Float64,
+    robot: Robot, joints: Float64, scene: Scene, points: object, T_base_scene: Float64
 ) -> Float64:
     """Centers (V, 3) of the cloud's voxels, scene frame, without the support's and the arm's."""
     flat = np.asarray(points).reshape(-1, 3)
     if scene.support is None:
-        kept = np.isfinite(flat).all(axis=1)
+        kept = np.flatnonzero(np.isfinite(flat).all(axis=1))
     else:  # in single precision, since most of an image is support
         plane = np.append(scene.support.normal, -scene.support.offset)
         plane = (plane @ scene.frame.T_canonical_cloud).astype(flat.dtype)
-        kept = flat @ plane[:3] > CELL / 2 - plane[3]  # NaN is not
+        kept = np.flatnonzero(flat @ plane[:3] > CELL / 2 - plane[3])  # NaN is not
     # In cells of the scene's frame, from the arm's base.
     T, base = scene.frame.T_canonical_cloud, np.linalg.inv(T_base_scene)[:3, 3]
     cells = flat[kept] @ (T[:3, :3].T / CELL).astype(flat.dtype)
