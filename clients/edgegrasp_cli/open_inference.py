@@ -294,30 +294,24 @@ def _grpc_parameters(parameters: Mapping[str, Any]) -> dict[str, Any]:
 def http_app(models: Models, max_body_bytes: int) -> Starlette:
     """The REST paths of the protocol."""
 
-    def live(request: Request) -> Response:
-        return JSONResponse({"live": True})
+    def answers(body_of: Callable[..., Any]) -> Callable[[Request], Response]:
+        return lambda request: JSONResponse(body_of(**request.path_params))
 
     def ready(request: Request) -> Response:
         is_ready = models.ready()
         return JSONResponse({"ready": is_ready}, 200 if is_ready else 503)
 
-    def server(request: Request) -> Response:
-        return JSONResponse({"name": PLATFORM, "version": VERSION, "extensions": []})
-
-    def index(request: Request) -> Response:
-        return JSONResponse({"models": models.names()})
-
-    def repository(request: Request) -> Response:
+    def repository() -> list[dict[str, str]]:
         state = {"version": VERSION, "state": "READY", "reason": ""}
-        return JSONResponse([{"name": name, **state} for name in models.names()])
+        return [{"name": name, **state} for name in models.names()]
 
-    def model(request: Request) -> Response:
-        models.check(**request.path_params)
-        return JSONResponse(_metadata(request.path_params["name"]))
+    def model(name: str, version: str = "") -> dict[str, Any]:
+        models.check(name, version)
+        return _metadata(name)
 
-    def model_ready(request: Request) -> Response:
-        models.check(**request.path_params)
-        return JSONResponse({"name": request.path_params["name"], "ready": True})
+    def model_ready(name: str, version: str = "") -> dict[str, Any]:
+        models.check(name, version)
+        return {"name": name, "ready": True}
 
     async def infer(request: Request) -> Response:
         body = bytearray()
@@ -338,16 +332,16 @@ def http_app(models: Models, max_body_bytes: int) -> Starlette:
         return JSONResponse({"error": str(error)}, error.status)
 
     routes = [
-        Route("/v2", server),
-        Route("/v2/health/live", live),
+        Route("/v2", answers(lambda: {"name": PLATFORM, "version": VERSION, "extensions": []})),
+        Route("/v2/health/live", answers(lambda: {"live": True})),
         Route("/v2/health/ready", ready),
-        Route("/v2/models", index),
-        Route("/v2/repository/index", repository, methods=["POST"]),
+        Route("/v2/models", answers(lambda: {"models": models.names()})),
+        Route("/v2/repository/index", answers(repository), methods=["POST"]),
     ]
     for path in ("/v2/models/{name}", "/v2/models/{name}/versions/{version}"):
         routes += [
-            Route(path, model),
-            Route(f"{path}/ready", model_ready),
+            Route(path, answers(model)),
+            Route(f"{path}/ready", answers(model_ready)),
             Route(f"{path}/infer", infer, methods=["POST"]),
         ]
     return Starlette(routes=routes, exception_handlers={RefusedError: refused})
