@@ -205,9 +205,12 @@ class OwnDetector:
         detector = self._catalogue.get(parsed.model)
         if parsed.robot is None:
             return detector.detect(sent, parsed)
-        from edgegrasp_robot import detect_picks, load_robot
+        from edgegrasp_robot import load_robot, plan_picks, with_robot
 
-        return detect_picks(detector, sent, parsed, load_robot(self.robot or parsed.robot.name))
+        robot = load_robot(self.robot or parsed.robot.name)
+        prepared = detector.prepare(sent, with_robot(parsed, robot))
+        detection = detector.finish(prepared, detector.evaluate(prepared))
+        return plan_picks(detection, prepared.scene, sent.points, parsed, robot)
 
     def close(self) -> None:
         """Do nothing; a client would close its connection."""

@@ -74,8 +74,11 @@ def _draw(found: Any, file: Path) -> None:
 
     figure = Figure(figsize=(6, 6), dpi=100)
     axes = figure.add_subplot(projection="3d")
-    poses = found.link_poses(found.home)
-    axes.plot(*poses[:, :3, 3].T, "o-", color="0.3", linewidth=4)
+    poses = [
+        found.scene.forwardKinematics(found.home, link, found.base_frame)
+        for link in found.model.links
+    ]
+    axes.plot(*zip(*(pose[:3, 3] for pose in poses), strict=True), "o-", color="0.3", linewidth=4)
     hand = found.hand_pose(found.home)
     for axis, color in zip(hand[:3, :3].T, ("red", "green", "blue"), strict=True):
         axes.plot(*zip(hand[:3, 3], hand[:3, 3] + 0.15 * axis, strict=True), color=color)

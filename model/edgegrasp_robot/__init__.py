@@ -1,14 +1,6 @@
 """From grasps to joint positions and motions of an arm; needs the extra `robot`."""
 
-from edgegrasp_robot.picks import detect_picks, plan_picks, with_robot
+from edgegrasp_robot.picks import plan_picks, with_robot
 from edgegrasp_robot.robot import Robot, load_robot, load_robots, robot_names
 
-__all__ = [
-    "Robot",
-    "detect_picks",
-    "load_robot",
-    "load_robots",
-    "plan_picks",
-    "robot_names",
-    "with_robot",
-]
+__all__ = ["Robot", "load_robot", "load_robots", "plan_picks", "robot_names", "with_robot"]

@@ -13,10 +13,8 @@ from roboplan.rrt import RRT, RRTOptions
 from roboplan.toppra import PathParameterizerTOPPRA, SplineFittingMode, TOPPRAOptions
 
 from edgegrasp_camera.arrays import Float64
-from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions, Place, RobotArm
-from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_results import ArmPlan, ArmTrajectory, DetectedObject, Detection, Grasp
 from edgegrasp_robot.held import Held, can_leave, held_by, load_of, places_for
@@ -65,15 +63,6 @@ def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
     return options.model_copy(update=changes)
 
 
-def detect_picks(
-    detector: GraspDetector, cloud: CloudInput, options: DetectOptions, robot: Robot
-) -> Detection:
-    """Detect grasps and plan motions to them; raises as the detector and `plan_picks`."""
-    prepared = detector.prepare(cloud, with_robot(options, robot))
-    detection = detector.finish(prepared, detector.evaluate(prepared))
-    return plan_picks(detection, prepared.scene, cloud.points, options, robot)
-
-
 def plan_picks(
     detection: Detection,  # made with the options of `with_robot`
     scene: Scene | None,  # the detection's; None: too little is left of the cloud
@@ -106,13 +95,13 @@ def plan_picks(
             if not tried:
                 break
             failures.update(pick.outcome for pick in tried)
-            tried = _preferred(tried, np.array(asked.joints), options)
+            tried.sort(key=lambda pick: _rank(pick, np.array(asked.joints), options))
             for pick in tried:
                 if moves and missing > 0 and pick.line and time.monotonic() <= until:
                     pick = arm.motion(pick)
                 picks.append(pick)
                 missing -= pick.tier <= (0 if moves else 1)
-        untried = [_Pick(grasp, None, "untried") for grasp in waiting]
+        untried = [_Pick(grasp, ArmPlan(False), "untried") for grasp in waiting]
     picks = sorted([*picks, *untried], key=lambda pick: pick.tier)[: options.top_k]
     return _told(detection, picks, failures, asked, time.perf_counter() - start)
 
@@ -122,15 +111,15 @@ class _Pick:
     """A grasp and the arm's plan for it."""
 
     grasp: Grasp
-    plan: ArmPlan | None
-    outcome: str
+    plan: ArmPlan
+    outcome: str  # the name of a count, or `untried`
     line: Sequence[Float64] = ()  # joints (J,) along the approach; empty: out of reach
     put: "_PutDown | None" = None  # where the object goes, if anywhere
 
     @property
     def tier(self) -> int:
         """0: with a trajectory, 1: within reach, 2: not tried, 3: out of reach."""
-        if self.plan is None:
+        if self.outcome == "untried":
             return 2
         return 3 if not self.plan.reachable else int(self.plan.trajectory is None)
 
@@ -164,7 +153,7 @@ class _Arm:
         near = np.maximum(robot.lower, self._start - np.pi)
         far = np.minimum(robot.upper, self._start + np.pi)
         drawn = np.random.default_rng(options.seed).uniform(near, far, (RESTARTS, len(near)))
-        self._drawn = list(drawn)
+        self._drawn = list(drawn)  # joints to start from where the given ones lead nowhere
         self._T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
         up = scene.frame.directions_in_cloud((0.0, 0.0, 1.0))
         self._up = self._T_base_cloud[:3, :3] @ up
@@ -197,10 +186,8 @@ class _Arm:
             starts = [self._start, robot.home, *self._drawn]
             line, outcome = self._reach(poses * turn, starts, robot.scene, robot.straight)
             if line:
-                way = grasp
-                if turn is HALF_TURN:
-                    hand, tcp = grasp.T_cloud_hand * turn, grasp.T_cloud_tcp * turn
-                    way = replace(grasp, T_cloud_hand=hand, T_cloud_tcp=tcp)
+                hand, tcp = grasp.T_cloud_hand * turn, grasp.T_cloud_tcp * turn
+                way = replace(grasp, T_cloud_hand=hand, T_cloud_tcp=tcp)
                 pick = _Pick(way, ArmPlan(True, line[0], line[-1]), outcome, line)
                 placed = pick if self._place is None else self._with_place(pick, self._place)
                 if placed is not None:
@@ -233,17 +220,13 @@ class _Arm:
 
     def motion(self, pick: _Pick) -> _Pick:
         """Add a collision-checked trajectory, if one is found."""
-        assert pick.plan is not None
         free, straight = self._robot.scene, self._robot.straight
         path = self._free_path(free, self._start, pick.line[0])
         back = self._retreat(pick) if pick.put is None else pick.put.back
         if not path or not back:
             return pick
-        timed = [
-            self._timed(free, path),
-            self._timed(straight, pick.line, True),
-            self._timed(straight, back, True),
-        ]
+        ways = pick.line, back
+        timed = [self._timed(free, path), *(self._timed(straight, way, True) for way in ways)]
         if pick.put is not None:
             timed += self._carried(pick.put, pick.grasp)
         parts = [part for part in timed if part is not None]
@@ -262,25 +245,15 @@ class _Arm:
         return replace(pick, plan=replace(pick.plan, trajectory=trajectory))
 
     def _with_place(self, pick: _Pick, place: Place) -> _Pick | None:
-        """Add where the object is put down and how; None: there is no way."""
-        assert pick.plan is not None
-        held = held_by(pick.grasp, self._scene, self._robot.gripper)
-        seen = None if pick.grasp.object is None else self._objects.get(pick.grasp.object)
+        """Add how the object is put down, in the first place within reach; None: in none."""
+        grasp, rules = pick.grasp, self._options.collision
+        held = held_by(grasp, self._scene, self._robot.gripper)
+        seen = None if grasp.object is None else self._objects.get(grasp.object)
         load = load_of(held, seen, self._scene, self._T_base_cloud)
         back = self._retreat(pick, held)
-        put = self._put_down(place, load, pick.grasp, back) if load is not None and back else None
-        if put is None:
+        if load is None or not back:
             return None
-        end = put.down[-1]
-        plan = replace(pick.plan, place_joints=end, T_base_place=self._robot.hand_pose(end))
-        return replace(pick, plan=plan, put=put)
-
-    def _put_down(
-        self, place: Place, load: Load, grasp: Grasp, back: Sequence[Float64]
-    ) -> _PutDown | None:
-        """Straight down onto the first place within reach, and away with an empty hand."""
-        rules, around = self._options.collision, self._around.without(load)
-        over = max(rules.approach_length, rules.retreat_length)
+        around, over = self._around.without(load), max(rules.approach_length, rules.retreat_length)
         places = places_for(place, load, moved(around.T_base_scene, around.voxels))
         T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand
         T_box_hand = np.linalg.inv(load.T_base_box) @ T_base_hand
@@ -293,7 +266,10 @@ class _Arm:
                     scene.removeGeometry(HELD)
                     out = _straight(T_base_place, -T_base_place[:3, 2], 0.0, rules.approach_length)
                     away, _ = self._reach(out, down[-1:], scene, scene)
-                    return _PutDown(back, down, away, around, load) if away else None
+                    hand = self._robot.hand_pose(down[-1])
+                    plan = replace(pick.plan, place_joints=down[-1], T_base_place=hand)
+                    put = _PutDown(back, down, away, around, load)
+                    return replace(pick, plan=plan, put=put) if away else None
         return None
 
     def _carried(self, put: _PutDown, grasp: Grasp) -> list[core.JointTrajectory | None]:
@@ -323,10 +299,8 @@ class _Arm:
     def _free_path(self, scene: core.Scene, start: Float64, end: Float64) -> list[Float64]:
         """Joints between which linear joint motions are collision-free; none: there are none."""
         names, seed = self._robot.joint_names, self._options.seed % 2**31
-        planner = RRT(
-            scene,
-            RRTOptions(GROUP, 3000, rrt_connect=True, collision_check_step_size=PATH_STEP),
-        )
+        options = RRTOptions(GROUP, 3000, rrt_connect=True, collision_check_step_size=PATH_STEP)
+        planner = RRT(scene, options)
         planner.setRngSeed(seed)
         try:
             path = planner.plan(
@@ -355,8 +329,7 @@ class _Arm:
         if straight:
             hand = np.array([self._robot.hand_pose(row)[:3, 3] for row in (*rows, joints[-1])])
             along = (hand[-1] - hand[0]) / np.linalg.norm(hand[-1] - hand[0])
-            away = hand - hand[0]
-            if np.linalg.norm(away - (away @ along)[:, None] * along, axis=1).max() > OFF_LINE:
+            if np.linalg.norm(np.cross(hand - hand[0], along), axis=1).max() > OFF_LINE:
                 return None
         return None if _touches(scene, rows, FINE) else found
 
@@ -377,16 +350,12 @@ def _straight(T_base_hand: Float64, direction: Float64, begin: float, end: float
     return poses
 
 
-def _preferred(picks: Sequence[_Pick], joints: Float64, options: DetectOptions) -> list[_Pick]:
+def _rank(pick: _Pick, joints: Float64, options: DetectOptions) -> tuple[int, float]:
     """Reachable grasps first; by score minus the cost of the motion, or in the order asked for."""
-
-    def key(pick: _Pick) -> tuple[int, float]:
-        if pick.plan is None or pick.plan.pregrasp_joints is None or options.order != "score":
-            return pick.tier, 0.0
-        travel = np.abs(pick.plan.pregrasp_joints - joints).max()
-        return pick.tier, TRAVEL_COST * float(travel) - pick.grasp.score
-
-    return sorted(picks, key=key)
+    if pick.plan.pregrasp_joints is None or options.order != "score":
+        return pick.tier, 0.0
+    travel = np.abs(pick.plan.pregrasp_joints - joints).max()
+    return pick.tier, TRAVEL_COST * float(travel) - pick.grasp.score
 
 
 def _told(
@@ -397,9 +366,9 @@ def _told(
     seconds: float,
 ) -> Detection:
     """The detection with the picks as its grasps, and counts of their outcomes."""
-    grasps = [replace(pick.grasp, arm=pick.plan) for pick in picks]
-    moving = sum(pick.tier == 0 for pick in picks)
-    within = sum(pick.tier <= 1 for pick in picks)
+    tiers = [pick.tier for pick in picks]
+    grasps = [replace(pick.grasp, arm=None if pick.tier == 2 else pick.plan) for pick in picks]
+    moving, within = tiers.count(0), tiers.count(0) + tiers.count(1)
     warnings = list(detection.warnings)
     if detection.grasps and not outcomes["reachable"]:
         warnings.append(NO_REACH)
@@ -408,7 +377,7 @@ def _told(
             f"{within - moving} grasps within reach have no trajectory: none was found in time "
             "that touches nothing."
         )
-    if any(pick.tier == 2 for pick in picks):
+    if 2 in tiers:
         warnings.append("time ran out before the arm was asked for every grasp.")
     names = ["on_arm", "hand_collision", "out_of_reach", "arm_collision", "reachable"]
     if asked.place is not None:

@@ -6,7 +6,7 @@ import tomllib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -31,6 +31,7 @@ ROBOT_FOLDER = Path(__file__).parent / "robots"
 GROUP, HAND = "arm", "edgegrasp_hand"  # names in the planner's model
 CAREFUL = 2.0  # per second squared: acceleration limit if none is given
 MOVING = ("revolute", "continuous", "prismatic")
+as_text = partial(ElementTree.tostring, encoding="unicode")
 IK = SimpleIkOptions(
     GROUP, max_iters=20, max_time=10.0, max_restarts=0, step_size=1.0,
     max_linear_error_norm=5e-4, max_angular_error_norm=1e-3, check_collisions=False,
@@ -52,20 +53,16 @@ class HandPose(Strict):
 class RobotFile(Strict):
     """The fields of a robot file; radians, or metres of sliding joints, and seconds."""
 
-    urdf: str = Field(description="URDF or xacro; a path beside this file, or package://")
-    srdf: str = Field(default="", description="SRDF with links that may touch; empty: none")
-    packages: tuple[str, ...] = Field(default=(), description="folders that hold packages")
-    base_frame: str = Field(description="link that T_base_cloud of a request speaks of")
-    flange_frame: str = Field(description="link that the gripper is on; all beyond is left out")
-    gripper: str = Field(description="name of a gripper that ships, or its file")
+    urdf: str  # URDF or xacro; a path beside this file, or package://
+    srdf: str = ""  # SRDF with links that may touch; empty: none
+    packages: tuple[str, ...] = ()  # folders that hold packages
+    base_frame: str  # link that T_base_cloud of a request speaks of
+    flange_frame: str  # link that the gripper is on; all beyond is left out
+    gripper: str  # name of a gripper that ships, or its file
     T_flange_hand: HandPose
-    home: Joints = Field(
-        default=(), description="joints where the arm touches nothing of itself; empty: near zero"
-    )
-    max_velocity: Joints = Field(default=(), description="of each joint; empty: the URDF's")
-    max_acceleration: Joints = Field(
-        default=(), description=f"of each joint; empty: {CAREFUL} each"
-    )
+    home: Joints = ()  # where the arm touches nothing of itself; empty: near zero
+    max_velocity: Joints = ()  # of each joint; empty: the URDF's
+    max_acceleration: Joints = ()  # of each joint; empty: CAREFUL each
 
 
 @dataclass(frozen=True)
@@ -106,12 +103,6 @@ class Robot:
         """T_base_hand (4, 4) at joints (J,)."""
         given = np.asarray(joints, np.float64)
         return np.asarray(self.scene.forwardKinematics(given, HAND, self.base_frame))
-
-    def link_poses(self, joints: ArrayLike) -> Float64:
-        """T_base_link (L, 4, 4) of the links that have a shape, the hand last."""
-        given = np.asarray(joints, np.float64)
-        fk = self.scene.forwardKinematics
-        return np.array([fk(given, link, self.base_frame) for link in self.model.links])
 
     def describe(self) -> dict[str, Any]:
         """The public description, as plain JSON values."""
@@ -159,8 +150,7 @@ def robot_names() -> list[str]:
 @lru_cache
 def load_robots(files: Sequence[Path]) -> dict[str, Robot]:
     """Robots by name, loaded once; raises InvalidRobot."""
-    robots = [load_robot(file) for file in files]
-    return {robot.name: robot for robot in robots}
+    return {robot.name: robot for robot in map(load_robot, files)}
 
 
 def load_robot(name_or_path: str | Path) -> Robot:
@@ -173,16 +163,13 @@ def load_robot(name_or_path: str | Path) -> Robot:
             f"robot: got {str(name_or_path)!r}. Use one of {robot_names()} or a .toml file."
         )
     try:
-        file = RobotFile.model_validate(tomllib.loads(path.read_text("utf-8")))
+        fields = tomllib.loads(path.read_text("utf-8", errors="replace"))
+        return _load(path, RobotFile.model_validate(fields))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         field = ".".join(map(str, first["loc"]))
         raise InvalidRobot(f"{path.name}: {field}: {first['msg']}; see fr3.toml.") from None
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InvalidRobot(f"{path.name}: {error}") from None
-    try:
-        return _load(path, file)
-    except InvalidGripper as error:
+    except (InvalidGripper, tomllib.TOMLDecodeError) as error:
         raise InvalidRobot(f"{path.name}: {error}") from None
     except (RuntimeError, ValueError, ElementTree.ParseError, xacro.XacroException) as error:
         raise InvalidRobot(f"{path.name}: urdf: {error}") from None
@@ -191,7 +178,11 @@ def load_robot(name_or_path: str | Path) -> Robot:
 def _load(path: Path, file: RobotFile) -> Robot:
     packages = [str(path.parent / folder) for folder in file.packages]
     packages.append(str(get_package_share_dir()))
-    root = _read_urdf(_located(path, "urdf", file.urdf, packages))
+    urdf = _located(path, "urdf", file.urdf, packages)
+    text = urdf.read_text("utf-8")
+    if "xacro:" in text:
+        text = xacro.process_file(str(urdf)).toxml()
+    root = ElementTree.fromstring(text)
     joints = _chain(path, root, file)
     joint_names = [str(joint.get("name")) for joint in joints]
     limits: dict[str, dict[str, list[float]]] = {name: {} for name in joint_names}
@@ -212,22 +203,20 @@ def _load(path: Path, file: RobotFile) -> Robot:
     beyond = _cut_beyond(root, file.flange_frame)
     _fix_other_joints(root, joints)
     _check_meshes(path, root, packages)
-    arm = _text(root)
+    arm = as_text(root)
     _add_hand(root, file, gripper)
     shaped = [link for link in root.findall("link") if link.find("collision") is not None]
     links = [str(link.get("name")) for link in shaped]
-    allowed: list[tuple[str, str]] = []
-    if file.srdf:
-        srdf = ElementTree.parse(_located(path, "srdf", file.srdf, packages)).getroot()
-        allowed = _allowed(srdf, links, beyond)
+    srdf = _located(path, "srdf", file.srdf, packages) if file.srdf else None
+    allowed = _allowed(srdf, links, beyond)
     standing = [
         link for link in links if not any(one.get("type") in MOVING for one in _above(root, link))
     ]
-    model = Model(arm, _text(root), packages, links, standing, allowed, json.dumps(limits))
+    model = Model(arm, as_text(root), packages, links, standing, allowed, json.dumps(limits))
     for link in shaped:
         for shape in link.findall("collision"):
             link.remove(shape)
-    bare = replace(model, urdf=_text(root), allowed=[])
+    bare = replace(model, urdf=as_text(root), allowed=[])
     scenes = [one.scene(file) for one in (model, model, model, bare)]
     lower, upper = scenes[0].getPositionLimitVectors(GROUP)
     home = np.array(file.home) if file.home else np.clip(0.0, lower, upper)
@@ -294,17 +283,6 @@ def _located(path: Path, field: str, name: str, packages: Sequence[str]) -> Path
     raise InvalidRobot(f"{path.name}: {field}: there is no {brief(name)}. {fix}.")
 
 
-def _read_urdf(file: Path) -> Element:
-    text = file.read_text("utf-8")
-    if "xacro:" in text:
-        text = xacro.process_file(str(file)).toxml()
-    return ElementTree.fromstring(text)
-
-
-def _text(root: Element) -> str:
-    return ElementTree.tostring(root, encoding="unicode")
-
-
 def _link(joint: Element, which: str) -> str:
     """The `parent` or `child` of a joint."""
     return str(joint.find(which).get("link"))  # type: ignore[union-attr]
@@ -341,11 +319,9 @@ def _chain(path: Path, root: Element, file: RobotFile) -> list[Element]:
 
 def _cut_beyond(root: Element, flange: str) -> set[str]:
     """Remove the links beyond the flange and its own shape; the flange is named among them."""
-    beyond = {flange}
-    for link in root.findall("link"):
-        name = str(link.get("name"))
-        if flange in [_link(joint, "parent") for joint in _above(root, name)]:
-            beyond.add(name)
+    names = [str(link.get("name")) for link in root.findall("link")]
+    carriers = {name: [_link(joint, "parent") for joint in _above(root, name)] for name in names}
+    beyond = {name for name in names if flange in (name, *carriers[name])}
     for part in list(root):
         if part.tag == "link" and part.get("name") == flange:
             for shape in [*part.findall("collision"), *part.findall("visual")]:
@@ -401,10 +377,10 @@ def _check_meshes(path: Path, root: Element, packages: Sequence[str]) -> None:
             link.remove(visual)
 
 
-def _allowed(srdf: Element, links: Sequence[str], beyond: set[str]) -> list[tuple[str, str]]:
+def _allowed(srdf: Path | None, links: Sequence[str], beyond: set[str]) -> list[tuple[str, str]]:
     """Pairs of links that may touch; links beyond the flange count as the hand."""
     pairs = set()
-    for one in srdf.findall("disable_collisions"):
+    for one in ElementTree.parse(srdf).getroot().findall("disable_collisions") if srdf else ():
         names = [str(one.get(which)) for which in ("link1", "link2")]
         first, second = sorted(HAND if name in beyond else name for name in names)
         if first != second and {first, second} <= set(links):

@@ -113,7 +113,10 @@ def surrounded(
     joints = np.array(asked.joints)
     T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
     own = _own_objects(robot, joints, scene, T_base_cloud)
-    known = [_box(row, box, T_base_cloud) for row, box in enumerate(boxes)]
+    known: list[Obstacle] = []
+    for row, (T_cloud_box, half) in enumerate(map(box_pose, boxes)):
+        place = T_base_cloud @ T_cloud_box
+        known.append((f"collision.obstacles.{row}", core.Box(*(2 * half)), place))
     T_base_scene = T_base_cloud @ np.linalg.inv(scene.frame.T_canonical_cloud)
     if scene.support is not None:
         known.append(_support(scene, T_base_scene))
@@ -166,13 +169,13 @@ def _own_objects(
     of_object = scene.object_of_point >= 0
     number = scene.object_of_point[of_object]
     objects = moved(T_base_cloud, scene.points_in_cloud[of_object])
-    near = np.bincount(number[_near_robot(robot, joints, objects, SEEN_SELF)], minlength=1)
-    within = np.bincount(number[_near_robot(robot, joints, objects, CELL / 2)], minlength=1)
+    near = _near_robot(robot, joints, objects, SEEN_SELF)
+    within = _near_robot(robot, joints, objects, CELL / 2)
     own: set[int | None] = set()
-    for row in np.flatnonzero(near):
-        if near[row] > 0.5 * np.sum(number == row):
-            own.add(int(row))
-        elif row < len(within) and within[row] > INSIDE:
+    for row in np.unique(number[near]).tolist():
+        if near[number == row].mean() > 0.5:
+            own.add(row)
+        elif within[number == row].sum() > INSIDE:
             value = f"a pose that puts the arm into object {row}"
             fix = "Send where the cloud's frame is in the arm's base frame, and the joints now."
             raise InvalidRequest("options.robot.T_base_cloud", value, fix)
@@ -180,17 +183,12 @@ def _own_objects(
 
 
 def _near_robot(robot: Robot, joints: Float64, points: Float64, distance: float) -> Bools:
-    """Which points (N, 3) of the base frame lie within a distance of the robot.  # (N,)."""
+    """Whether points (N, 3) of the base frame lie within a distance of the robot, (N,)."""
     T_root_base = robot.scene.forwardKinematics(joints, robot.base_frame)
     options = core.RobotBodyFilterOptions(distance, num_threads=1)
     return core.RobotBodyFilter(robot.scene, options).computeMask(
         joints, np.ascontiguousarray(moved(T_root_base, points))
     )
-
-
-def _box(row: int, box: Box | OrientedBox, T_base_cloud: Float64) -> Obstacle:
-    T_cloud_box, half = box_pose(box)
-    return f"collision.obstacles.{row}", core.Box(*(2 * half)), T_base_cloud @ T_cloud_box
 
 
 def _support(scene: Scene, T_base_scene: Float64) -> Obstacle:
@@ -244,17 +242,17 @@ def _hidden(scene: Scene, voxels: Float64, T_base_scene: Float64) -> Float64:
 
 def _centers(*groups: Floats) -> Float64:
     """Centers (V, 3) of the voxels in which each group of places (N, 3), in cells, has one."""
-    cells = [np.floor(places).astype(np.int32) for places in groups]
-    if not all(map(len, cells)):
+    cells = [np.floor(np.ascontiguousarray(places.T)).astype(np.int32) for places in groups]
+    if not all(cell.size for cell in cells):
         return np.empty((0, 3))
-    corner = np.min([cell.min(axis=0) for cell in cells], axis=0)
-    size = np.max([cell.max(axis=0) for cell in cells], axis=0) - corner + 1
+    corner = np.min([cell.min(axis=1) for cell in cells], axis=0)[:, None]
+    size = np.max([cell.max(axis=1) for cell in cells], axis=0) - corner[:, 0] + 1
     common = np.ones(size, dtype=bool)
     for cell in cells:
         taken = np.zeros(size, dtype=bool)
-        taken[tuple((cell - corner).T)] = True
+        taken[tuple(cell - corner)] = True
         common &= taken
-    return np.asarray((np.argwhere(common) + corner + 0.5) * CELL)
+    return np.asarray((np.argwhere(common) + corner.T + 0.5) * CELL)
 
 
 def moved(T_b_a: Float64, points: ArrayLike) -> Float64:
