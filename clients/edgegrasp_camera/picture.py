@@ -107,7 +107,7 @@ class View:
         return pixels, z if self.fx > 0 else -z
 
     def rows_of_pixels(self, points: ArrayLike) -> Int64:
-        """(H, W) the row of the cloud that is seen at each pixel, the nearest; -1: none."""
+        """(H, W) the row of the nearest point seen at each pixel; -1 where there is no point."""
         pixels, depth = self.project(points)
         seen = np.flatnonzero(np.isfinite(pixels).all(axis=1) & (depth > 0.0))
         seen = seen[np.argsort(-depth[seen], kind="stable")]  # nearer ones over others

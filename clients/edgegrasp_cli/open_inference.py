@@ -40,7 +40,7 @@ OUTPUTS = {
     "T_cloud_hand": ("FP32", [-1, 4, 4]),  # best first, like all outputs
     "score": ("FP32", [-1]),
     "width": ("FP32", [-1]),  # metres
-    "object": ("INT32", [-1]),  # -1: of none
+    "object": ("INT32", [-1]),  # -1: on no object
 }
 # Parameters of the protocol and of Triton's clients that say how to serve, not what to detect.
 NOT_OPTIONS = {"binary_data_output", "headers", "priority", "timeout"}

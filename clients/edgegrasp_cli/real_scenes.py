@@ -223,7 +223,7 @@ def judge(
     grasps: Sequence[Any],  # best first, camera frame
     # Normal (3,) and offset of the support plane that was found, camera frame.
     plane: tuple[Array, float] | None,
-    answer: Int64,  # (R,) number of the object that each point is of, from 1; 0: of none
+    answer: Int64,  # (R,) number of the object that each point is on, from 1; 0: on no object
     gripper: "Gripper",  # that the grasps are for
     milliseconds: float,  # from the request to the answer
 ) -> SceneFigures:

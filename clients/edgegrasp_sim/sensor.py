@@ -49,8 +49,8 @@ class DepthNoise:
 class DepthSensor:
     """A depth camera: what `apply` does to an image, in this order."""
 
-    baseline: float  # metres along x to what a projector or second camera hides; 0: none
-    window: int  # pixels of the window that smooths steps smaller than `EDGE`; 1: none
+    baseline: float  # metres along x to the projector or second camera; 0: nothing is hidden
+    window: int  # pixels of the window that smooths steps smaller than `EDGE`; 1: not smoothed
     fattening: float  # share of the pixels behind an edge that get the depth of its front
     flying: float  # share of the pixels at an edge that lie between its front and its back
     noise_floor: float  # standard deviation of the noise at depth 0, metres

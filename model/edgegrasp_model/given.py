@@ -226,7 +226,7 @@ def from_hand_poses(
 
 
 def _approach_points(view: HandView, contact: Int64, crop_radius: float) -> Int64:
-    """Rows (M,) of the points nearest to the hands' axes, near the contacts (M,); -1: none."""
+    """Rows (M,) of the points nearest to the hands' axes, near the contacts (M,); else -1."""
     result = np.full(len(contact), -1, dtype=np.int64)
     if len(view.row) == 0:
         return result

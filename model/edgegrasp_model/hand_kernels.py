@@ -69,7 +69,7 @@ def free_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, behind: flo
 def extents_between(
     points: Float32, rows: Int64, first: Int64, last: Int64, T_cloud_hand: Float32, pads: Float32
 ) -> Float32:
-    """Least and greatest y (E, 2) of the points between the pads of hands; (inf, -inf): none.
+    """Least and greatest y (E, 2) of the points between the pads of hands; (inf, -inf) without one.
 
     Hand e looks at rows first[e] to last[e]; `pads` are least and greatest x and z, hand frame.
     """

@@ -25,7 +25,7 @@ UNTRIED = -1  # label of a candidate that was not tried
 TOGETHER = 0.009  # metres between points of one object: twice the edge of a voxel
 CARD_FILE = "card.md"
 OPTIONAL = ("T_world_hand", "firm", "support", "at_side", "object_of_point")
-# Of views that say nothing of them: the table of the simulated scenes, and where they are cut off.
+# The table and the limits of the simulated scenes, for views whose file does not have them.
 TABLE = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.05)
 WORKSPACE = Workspace(min=(0.02, 0.02, 0.055), max=(0.28, 0.28, 0.3))
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)
@@ -45,7 +45,7 @@ class LabelledView:
     firm: NDArray[np.int8] | None = None  # (E,) 1 held after shaking too, 0 not, UNTRIED
     support: Float32 | None = None  # (4,) unit normal and offset; zeros: unknown; None: TABLE
     at_side: Bools | None = None  # (N,) cut off there; None: as WORKSPACE cuts it
-    object_of_point: NDArray[np.int16] | None = None  # (N,) -1: of none; None: not known
+    object_of_point: NDArray[np.int16] | None = None  # (N,) -1: on no object; None: not known
     engine: str = "pybullet"  # that simulated the labels
     gripper: str = ""  # fields of the hand that tried them, JSON; empty: the Panda's own hand
     objects: tuple[str, ...] = ()  # names of the objects in the scene, where they are known

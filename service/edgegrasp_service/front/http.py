@@ -52,7 +52,7 @@ OWN_ONLY = (  # what a page may load, and who may show it
     "default-src 'none'; script-src 'self'{0}; style-src 'self'{0}; img-src 'self' data: blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-# The page of the interface has a script inside, and nothing of a stranger's.
+# The page that documents the interface has an inline script; it loads nothing from elsewhere.
 POLICIES = {"/docs": OWN_ONLY.format(" 'unsafe-inline'")}
 POLICY = OWN_ONLY.format("")
 CHALLENGE = 'Bearer realm="edgegrasp"'
