@@ -32,6 +32,7 @@ SHARE = 0.99  # share of the limits that is used, as splines overshoot a little
 DT = 0.01  # seconds between the rows of a trajectory
 FINE = 0.005  # radians between the joints that are checked along a trajectory
 PATH_STEP = 0.03  # radians between the joints that are checked along a path
+PATH_SECONDS = 1.0  # of a request, for searches that find no path; others take milliseconds
 RESTARTS = 2  # of the inverse kinematics, from joints at random
 TRAVEL_COST = 0.02  # cost, as a share of a score, per radian of the joint that turns most
 # Of a hand about its z, by columns of its pose.
@@ -87,11 +88,11 @@ def plan_picks(
     with surrounded(robot, scene, points, asked, options.collision.obstacles) as around:
         grasps = [grasp for grasp in detection.grasps if grasp.object not in around.own]
         failures["on_arm"] = len(detection.grasps) - len(grasps)
-        arm = _Arm(robot, asked, scene, options, around, detection.objects)
+        arm = _Arm(robot, asked, scene, options, around, detection.objects, until)
         moves, waiting = asked.plan == "motion", iter(grasps)
         missing = options.top_k
         while missing > 0 and time.monotonic() < until:
-            tried = arm.reach_some(waiting, missing + (SPARE if moves else 0), until)
+            tried = arm.reach_some(waiting, missing + (SPARE if moves else 0))
             if not tried:
                 break
             failures.update(pick.outcome for pick in tried)
@@ -145,9 +146,11 @@ class _Arm:
         options: DetectOptions,
         around: Surroundings,
         objects: Sequence[DetectedObject],
+        until: float,
     ) -> None:
         self._robot, self._scene, self._options, self._around = robot, scene, options, around
         self._place, self._objects = asked.place, {one.number: one for one in objects}
+        self._until, self._path_seconds = until, PATH_SECONDS
         self._start = np.array(asked.joints)
         self._start_x = robot.hand_pose(self._start)[:3, 0]
         near = np.maximum(robot.lower, self._start - np.pi)
@@ -162,10 +165,10 @@ class _Arm:
             value = f"a region where up is {self._up.round(2).tolist()} in the base frame"
             raise InvalidRequest("options.robot.place.region", value, fix)
 
-    def reach_some(self, grasps: Iterator[Grasp], wanted: int, until: float) -> list[_Pick]:
+    def reach_some(self, grasps: Iterator[Grasp], wanted: int) -> list[_Pick]:
         """The next picks, as many as it takes for some to be within reach."""
         picks: list[_Pick] = []
-        while wanted > 0 and time.monotonic() < until and (grasp := next(grasps, None)) is not None:
+        while wanted > 0 and time.monotonic() < self._until and (grasp := next(grasps, None)):
             picks.append(self._reach_either_way(grasp))
             wanted -= picks[-1].outcome == "reachable"
         return picks
@@ -300,13 +303,16 @@ class _Arm:
         """Joints between which linear joint motions are collision-free; none: there are none."""
         names, seed = self._robot.joint_names, self._options.seed % 2**31
         options = RRTOptions(GROUP, 3000, rrt_connect=True, collision_check_step_size=PATH_STEP)
+        begin = time.monotonic()
+        # Nodes alone are no limit: none are added where every way is blocked. Zero is without end.
+        options.max_planning_time = max(1e-3, min(self._path_seconds, self._until - begin))
         planner = RRT(scene, options)
         planner.setRngSeed(seed)
+        ends = [core.JointConfiguration(names, joints) for joints in (start, end)]
         try:
-            path = planner.plan(
-                core.JointConfiguration(names, start), core.JointConfiguration(names, end)
-            )
-        except RuntimeError:  # the node limit was reached without a path
+            path = planner.plan(*ends)
+        except RuntimeError:  # no path within these limits
+            self._path_seconds -= time.monotonic() - begin
             return []
         rules = core.PathShortcuttingOptions(GROUP, PATH_STEP, seed=seed)
         return list(map(np.array, core.PathShortcutter(scene, rules).shortcut(path).positions))

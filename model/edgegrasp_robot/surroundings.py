@@ -50,7 +50,7 @@ class Load(NamedTuple):
 class Surroundings(NamedTuple):
     """What is around a robot."""
 
-    own: set[int | None]  # numbers of objects that are the arm itself, as the camera sees it
+    own: set[int]  # numbers of objects that are the arm itself, as the camera sees it
     boxes: list[Obstacle]  # the support and the request's obstacles
     voxels: Float64  # (V, 3) centers of those of the cloud and of unseen space, scene frame
     T_base_scene: Float64  # (4, 4)
@@ -162,16 +162,14 @@ def _standing_in(
                 planned.removeGeometry(name)
 
 
-def _own_objects(
-    robot: Robot, joints: Float64, scene: Scene, T_base_cloud: Float64
-) -> set[int | None]:
+def _own_objects(robot: Robot, joints: Float64, scene: Scene, T_base_cloud: Float64) -> set[int]:
     """Numbers of detected objects that are the arm itself."""
     of_object = scene.object_of_point >= 0
     number = scene.object_of_point[of_object]
     objects = moved(T_base_cloud, scene.points_in_cloud[of_object])
     near = _near_robot(robot, joints, objects, SEEN_SELF)
     within = _near_robot(robot, joints, objects, CELL / 2)
-    own: set[int | None] = set()
+    own: set[int] = set()
     for row in np.unique(number[near]).tolist():
         if near[number == row].mean() > 0.5:
             own.add(row)
@@ -186,9 +184,8 @@ def _near_robot(robot: Robot, joints: Float64, points: Float64, distance: float)
     """Whether points (N, 3) of the base frame lie within a distance of the robot, (N,)."""
     T_root_base = robot.scene.forwardKinematics(joints, robot.base_frame)
     options = core.RobotBodyFilterOptions(distance, num_threads=1)
-    return core.RobotBodyFilter(robot.scene, options).computeMask(
-        joints, np.ascontiguousarray(moved(T_root_base, points))
-    )
+    placed = np.ascontiguousarray(moved(T_root_base, points))
+    return core.RobotBodyFilter(robot.scene, options).computeMask(joints, placed)
 
 
 def _support(scene: Scene, T_base_scene: Float64) -> Obstacle:
@@ -257,5 +254,4 @@ def _centers(*groups: Floats) -> Float64:
 
 def moved(T_b_a: Float64, points: ArrayLike) -> Float64:
     """Points (N, 3) of frame a in frame b."""
-    found: Float64 = np.asarray(points, np.float64) @ T_b_a[:3, :3].T + T_b_a[:3, 3]
-    return found
+    return np.asarray(np.asarray(points, np.float64) @ T_b_a[:3, :3].T + T_b_a[:3, 3])

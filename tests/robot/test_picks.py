@@ -1,3 +1,4 @@
+import time
 from dataclasses import replace
 from itertools import count
 
@@ -115,6 +116,31 @@ def test_the_motion_goes_around_what_is_seen(fr3):
     assert not any(touches(fr3, joints, seen) for joints in plan.trajectory.positions)
     direct = np.linspace(turned, plan.pregrasp_joints, 60)
     assert any(touches(fr3, joints, seen) for joints in direct)  # it had to go around
+
+
+def test_searches_without_a_path_end(fr3, monkeypatch):
+    """As from a start that is shut in, where the planner would go on for ever."""
+    searched = []
+
+    class Lost:
+        def __init__(self, scene, options):
+            self.seconds = options.max_planning_time
+
+        def setRngSeed(self, seed):  # noqa: N802
+            pass
+
+        def plan(self, start, end):
+            searched.append(self.seconds)
+            time.sleep(self.seconds)
+            raise RuntimeError
+
+    monkeypatch.setattr("edgegrasp_robot.picks.RRT", Lost)
+    monkeypatch.setattr("edgegrasp_robot.picks.PATH_SECONDS", 0.1)
+    detection = picks_of(fr3)
+    assert detection.counts["reachable"] == len(searched) == len(BOXES)
+    assert detection.counts["with_trajectory"] == 0
+    assert "no trajectory" in detection.warnings[0]
+    assert sum(searched) < 0.11
 
 
 def test_what_is_out_of_reach_is_counted_and_comes_last(fr3):
