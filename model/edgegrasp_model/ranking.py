@@ -29,6 +29,7 @@ GOOD_SCORE = 0.5  # score from which an object has a good grasp
 SURE_SCORE = 0.9  # score from which the order `highest` goes by height (the paper's robot policy)
 HIDDEN = 0.004  # metres of unseen space into which an object may extend
 FLAT = 0.012  # metres of visible height below which the support may block grasps
+DRAWBACK, FAR = 0.01, 0.1  # of a rating; metres from an object's middle
 OUTCOMES = list(Outcome)
 
 
@@ -50,7 +51,10 @@ def select(
     T_cloud_tcp = hands @ gripper.T_hand_tcp
     clearance = clearances(scene, hands, gripper) if options.order == "clearance" else None
     free = sample.collision_free | (options.collision.mode == "ignore")
-    order = ranked(rating, free, options.order, T_cloud_tcp[:, :3, 3] @ UP, clearance)
+    preferred = rating
+    if options.order == "score":
+        preferred = rating - drawbacks(scene, sample.candidates.contact_index, T_cloud_tcp)
+    order = ranked(preferred, free, options.order, T_cloud_tcp[:, :3, 3] @ UP, clearance)
 
     outcome = np.full(len(score), CODE[Outcome.BEYOND_TOP_K])
     good = score[order] >= options.min_score
@@ -67,6 +71,23 @@ def select(
     outcome[dropped], outcome[order] = CODE[Outcome.SUPPRESSED], CODE[Outcome.RETURNED]
     counts["suppressed"], counts["returned"] = len(dropped), len(order)
     return order, outcome
+
+
+def drawbacks(scene: Scene, contact_index: Int64, T_cloud_tcp: Float32) -> Floats:
+    """What is taken off ratings (E,), of which noise would else decide among equal ones.
+
+    A hand should be vertical, near the middle of its object as seen from above, and close level and
+    across the line of sight, where both sides are seen; its object should be large.
+    """
+    _, row, size = np.unique(scene.object_of_point, return_inverse=True, return_counts=True)
+    x, y = (np.bincount(row, plan) / size for plan in scene.cloud.points.T[:2])
+    mine = row[contact_index]
+    apart = np.hypot(T_cloud_tcp[:, 0, 3] - x[mine], T_cloud_tcp[:, 1, 3] - y[mine])
+    lean = np.hypot(T_cloud_tcp[:, 0, 2], T_cloud_tcp[:, 1, 2])
+    along, _, tilt = np.abs(T_cloud_tcp[:, :3, 1].T)  # x points to the camera
+    small = np.log(size[mine].max(initial=1) / size[mine]) / 3
+    taken: Floats = DRAWBACK * (np.minimum(apart / FAR, 1.0) + lean + along + tilt + small)
+    return taken
 
 
 def objects_first(order: Int64, score: Floats, number: Int64) -> Int64:

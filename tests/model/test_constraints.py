@@ -23,6 +23,7 @@ CASES = 75  # for each seed
 ROWS = 1500  # of the cloud
 TOLERANCE = 2e-5  # metres, of float32 poses half a metre from the origin
 VOXEL_DIAGONAL = 0.0045 * math.sqrt(3)
+CLOSE = 0.05  # scores among which how the hand lies decides
 STEPS = 7
 
 
@@ -195,8 +196,8 @@ def check_regions(fields: dict, sent: CloudInput, grasp: Grasp) -> None:
             assert not include or any(holds(shape, sent, point, True) for shape in include)
             assert not any(holds(shape, sent, point, False) for shape in exclude)
         if fields["workspace"] is not None:
-            assert (point >= np.array(fields["workspace"]["min"]) - 1e-6).all()
-            assert (point <= np.array(fields["workspace"]["max"]) + 1e-6).all()
+            assert (point >= np.array(fields["workspace"]["min"]) - 1e-4).all()
+            assert (point <= np.array(fields["workspace"]["max"]) + 1e-4).all()
 
 
 def holds(shape: dict, sent: CloudInput, point: np.ndarray, at_least_partly: bool) -> bool:
@@ -324,14 +325,15 @@ def check_order(fields: dict, grasps: list[Grasp]) -> None:
     worth = [g.score if is_free else g.score / 2 for g, is_free in zip(grasps, free, strict=True)]
     if fields["order"] == "score":  # the best of each object come first
         firsts = len({grasp.object for grasp in grasps if grasp.score >= 0.5})
-        assert all(a >= b - 1e-6 for a, b in itertools.pairwise(worth[:firsts]))
+        assert all(a >= b - CLOSE for a, b in itertools.pairwise(worth[:firsts]))
         assert len({grasp.object for grasp in grasps[:firsts]}) == firsts
         worth = worth[firsts:]
     sure = sum(value >= 0.9 for value in worth) if fields["order"] == "highest" else 0
     heights = [float(grasp.T_cloud_tcp[:3, 3] @ up) for grasp in grasps[:sure]]
     assert all(a >= b - 1e-5 for a, b in itertools.pairwise(heights))
     assert all(value >= 0.9 for value in worth[:sure])
-    assert all(a >= b - 1e-6 for a, b in itertools.pairwise(worth[sure:]))
+    apart = CLOSE if fields["order"] == "score" else 1e-6
+    assert all(a >= b - apart for a, b in itertools.pairwise(worth[sure:]))
 
 
 def check_suppression(fields: dict, grasps: list[Grasp]) -> None:

@@ -47,7 +47,7 @@ def test_a_box_is_grasped_across_its_edges(turn: float) -> None:
     aligned = [g for g in straight if abs(g.T_cloud_hand[:3, 1] @ across) > FIFTEEN_DEGREES]
     assert len(aligned) > 0.8 * len(straight)
     for grasp in aligned:
-        assert abs(grasp.T_cloud_tcp[:3, 3] @ across) < 0.004
+        assert abs(grasp.T_cloud_tcp[:3, 3] @ across) < 0.006
         assert abs(abs(grasp.contact_point @ across) - 0.025) < 0.005
 
 

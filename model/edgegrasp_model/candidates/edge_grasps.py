@@ -20,31 +20,41 @@ MIN_DEPTH = 1e-4  # metres; a shallower edge has no approach direction
 TIP_MARGIN = 0.002  # metres a contact stays inside the fingertips when the hand retracts
 WIDE = 0.75  # share of the opening from which an object counts as wide
 BESIDE_PADS = 0.004  # metres beside the finger pads in which points count
+CELLS = tuple(0.04 * 0.7**level for level in range(8))  # metres, of grids of approach points
+NODES, SPREAD = 2**14, 2654435761  # nodes along a grid; its multiples modulo 2^32 look random
 
 
 def sample_approach_points(
     points: Float32,  # (N, 3)
     count: int,
-    method: Literal["farthest", "uniform"],  # `farthest` spreads them from a random start
+    method: Literal["farthest", "uniform"],  # `farthest` spreads them
     rng: np.random.Generator,
     before: Sequence[int] | Int64 = (),  # (B,) rows chosen earlier, which are excluded
 ) -> Int64:
-    """Choose `count` different rows of the points, or all of them if there are fewer."""
+    """Choose `count` different rows of the points, or all of them if there are fewer.
+
+    Those that are spread lie nearest to the nodes of grids, of which each is finer than the one
+    before, around the middle of the points: noise and other points hardly change them.
+    """
     count = min(count, len(points) - len(before))
     if method == "uniform":
         left = np.delete(np.arange(len(points)), before)
         return rng.choice(left, count, replace=False).astype(np.int64)
-    chosen = np.empty(len(before) + count, dtype=np.int64)
-    chosen[: len(before)] = before
-    chosen[len(before) : 1] = rng.integers(len(points))
-    nearest = np.full(len(points), np.inf, dtype=np.float32)
-    columns = np.ascontiguousarray(points.T)
-    for i in range(1, len(chosen)):
-        x, y, z = columns - points[chosen[i - 1], :, None]
-        nearest = np.minimum(nearest, x * x + y * y + z * z)
-        if i >= len(before):
-            chosen[i] = int(nearest.argmax())
-    return chosen[len(before) :]
+    chosen, total = np.asarray(before, dtype=np.int64), len(before) + count
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    for cell in CELLS:
+        if len(chosen) == total:
+            break
+        place = (points - middle).astype(np.float64) / cell
+        node = np.rint(place)
+        number = (node + NODES // 2) @ (NODES**2, NODES, 1.0)
+        order = np.argsort(number + np.square(place - node).sum(axis=1))
+        nearest = order[np.diff(number[order], prepend=-1.0) > 0]
+        free = nearest[~np.isin(number[nearest], number[chosen])]
+        mixed = number[free].astype(np.uint64) * np.uint64(SPREAD) % np.uint64(2**32)
+        chosen = np.append(chosen, free[np.argsort(mixed)][: total - len(chosen)])
+    rest = np.delete(np.arange(len(points)), chosen)[: total - len(chosen)]
+    return np.append(chosen[len(before) :], rest)
 
 
 class BallCrop(NamedTuple):
