@@ -32,8 +32,10 @@ class ArmGripper(Gripper):
 
     motion: ArmMotion | None = None
 
-    def __init__(self, world: World, hand: HandModel, arm: ArmModel) -> None:
-        self.world, self.model = world, hand
+    def __init__(
+        self, world: World, hand: HandModel, arm: ArmModel, min_opening: float
+    ) -> None:
+        self.world, self.model, self.min_opening = world, hand, min_opening
         self.body = self._arm = world.add_arm(arm, hand)
 
     def park(self) -> None:

@@ -18,7 +18,6 @@ from edgegrasp_sim.engine import (
 )
 from edgegrasp_sim.hand import (
     CLOSE_SECONDS,
-    MIN_OPENING,
     PREGRASP_DISTANCE,
     RETREAT_DISTANCE,
     SIDE_GRASP_ANGLE,
@@ -151,7 +150,6 @@ def constants(engine: str) -> dict[str, float]:
         "retreat_distance": RETREAT_DISTANCE,
         "side_grasp_angle": SIDE_GRASP_ANGLE,
         "step_length": STEP_LENGTH,
-        "min_opening": MIN_OPENING,
         "min_points": MIN_SEEN,
     }
 
@@ -169,6 +167,7 @@ class RoundRunner:
             engine=config.engine,
             gripper=config.gripper,
             arm=config.arm,
+            min_opening=config.protocol.round.min_opening,
         )
 
     def __call__(self, task: Task) -> Round:

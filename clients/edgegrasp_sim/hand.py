@@ -30,7 +30,7 @@ RETREAT_DISTANCE = 0.10  # metres
 SIDE_GRASP_ANGLE = np.pi / 3  # radians from straight down; beyond it the hand lifts straight up
 # The reference asks for 0.10 m/s in pieces of 2 mm and rounds each down to whole steps of 1/80 s.
 STEP_LENGTH = 0.002  # metres in each time step
-MIN_OPENING = 0.1 * MAX_OPENING  # below it, the hand holds nothing
+MIN_OPENING = 0.001  # metres; thinner than any object that is held
 
 # When a grasp that need not be run to its end has a clear outcome.
 STILL = 5e-5  # metres that fingers at rest still close in a time step
@@ -101,7 +101,7 @@ def run_grasp(
             return result(FailureCause.APPROACH_COLLISION)
         collided = collided or bool(cut)
     _close(gripper, objects, to_the_end=to_the_end)
-    missed = gripper.opening <= MIN_OPENING
+    missed = gripper.is_shut
     caught = _touched(gripper, objects)
     if not missed or to_the_end:
         watch = _Watch(gripper, objects)
@@ -109,7 +109,7 @@ def run_grasp(
             if not to_the_end and watch.is_clear():
                 break
         held = next(iter(_touched(gripper, objects)), None)
-        if held is not None and gripper.opening > MIN_OPENING:
+        if held is not None and not gripper.is_shut:
             found = result(None, held)
             if shake:
                 still = _holds_when_shaken(gripper, T_world_hand, held, objects)
@@ -139,8 +139,10 @@ class Gripper:
     body: Hand
     on_the_way = False  # whether it is on an arm that has not come to its pregrasp
 
-    def __init__(self, world: World, model: HandModel | None = None) -> None:
-        self.world = world
+    def __init__(
+        self, world: World, model: HandModel | None = None, min_opening: float = MIN_OPENING
+    ) -> None:
+        self.world, self.min_opening = world, min_opening
         self.model = model or panda()
         self._T_hand_com = translation(*self.model.centre)  # the engine moves bodies by it
         self.body = world.add_hand(self.model, _PARKED[:3, 3])
@@ -150,6 +152,11 @@ class Gripper:
     def opening(self) -> float:
         """Metres between the fingers."""
         return self.body.opening
+
+    @property
+    def is_shut(self) -> bool:
+        """Whether the fingers are too close to hold anything."""
+        return self.opening <= self.min_opening
 
     def park(self) -> None:
         """Put the open hand where it touches nothing and no camera sees it."""
@@ -257,7 +264,7 @@ def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: 
         gripper.world.step()
         before, opening = opening, gripper.opening
         still_steps = still_steps + 1 if abs(opening - before) < STILL else 0
-        shut = opening <= MIN_OPENING
+        shut = gripper.is_shut
         if not to_the_end and (shut or (still_steps >= STILL_STEPS and _touched(gripper, objects))):
             return
 
@@ -277,7 +284,7 @@ class _Watch:
         before, self._opening = self._opening, self._gripper.opening
         closing = abs(self._opening - before) >= STILL  # and may yet catch something
         self._empty_steps = 0 if touched or closing else self._empty_steps + 1
-        if self._gripper.opening <= MIN_OPENING or self._empty_steps >= EMPTY_STEPS:
+        if self._gripper.is_shut or self._empty_steps >= EMPTY_STEPS:
             return True
         held = len(touched) == 1 and self._hangs_still(touched[0].body)
         self._held_steps = self._held_steps + 1 if held else 0
@@ -305,7 +312,7 @@ def _holds_when_shaken(
         for way in (shake.distance, -shake.distance, 0.0):
             aside = T_world_lifted @ translation(*(way * along))
             gripper.move_to(aside, step_length=shake.step_length)
-    return gripper.opening > MIN_OPENING and held in _touched(gripper, objects)
+    return not gripper.is_shut and held in _touched(gripper, objects)
 
 
 def _cut_into(gripper: Gripper) -> set[int]:

@@ -39,8 +39,9 @@ class SceneRules:
 
 @dataclass(frozen=True, config=STRICT)
 class RoundRules:
-    """Conditions that end a round."""
+    """What counts as held, and conditions that end a round."""
 
+    min_opening: float  # metres between the fingers; a hand that is open by less holds nothing
     max_consecutive_failures: int  # failed grasps in a row that end a round
     max_no_grasp: int  # views without any grasp that end a round
 

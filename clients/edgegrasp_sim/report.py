@@ -53,7 +53,10 @@ class Replay:
             )
         self.rounds = {(done.seed, done.index): done for done in folder.rounds()}
         self.simulation = ClutterSimulation(
-            {self.scene: models}, engine=run["engine"], gripper=run.get("gripper")
+            {self.scene: models},
+            engine=run["engine"],
+            gripper=run.get("gripper"),
+            min_opening=self.protocol.round.min_opening,
         )
 
     def __enter__(self) -> Self:

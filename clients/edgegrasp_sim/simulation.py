@@ -14,7 +14,7 @@ from edgegrasp_sim.arm import ArmGripper, ArmMotion
 from edgegrasp_sim.camera import CAMERA, FARTHEST, Observation, TableView, crop, points_of, seen_box
 from edgegrasp_sim.engine import ArmModel, make_world
 from edgegrasp_sim.engine.urdf import least_width, read_urdf
-from edgegrasp_sim.hand import GraspResult, Gripper, hand_of, panda, run_grasp
+from edgegrasp_sim.hand import MIN_OPENING, GraspResult, Gripper, hand_of, panda, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import Matrix, require_pose
 from edgegrasp_sim.scene import (
@@ -95,8 +95,9 @@ class ClutterSimulation:
         engine: str | None = None,
         gripper: Mapping[str, Any] | None = None,
         arm: ArmModel | None = None,
+        min_opening: float = MIN_OPENING,  # metres; a hand that is open by less holds nothing
     ) -> None:
-        self.gripper, self.arm = gripper, arm
+        self.gripper, self.arm, self.min_opening = gripper, arm, min_opening
         self.hand = panda() if gripper is None else hand_of(gripper)
         self.object_sets = (
             dict(objects)
@@ -304,8 +305,8 @@ class ClutterSimulation:
 
     def _add_gripper(self) -> Gripper:
         if self.arm is None:
-            return Gripper(self.world, self.hand)
-        return ArmGripper(self.world, self.hand, self.arm)
+            return Gripper(self.world, self.hand, self.min_opening)
+        return ArmGripper(self.world, self.hand, self.arm, self.min_opening)
 
     @property
     def _hand(self) -> Gripper:

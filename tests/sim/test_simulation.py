@@ -9,6 +9,7 @@ from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.hand import CENTRE, FINGERTIP
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.poses import translation
+from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
 from edgegrasp_sim.surroundings import WORKSPACE
 
@@ -78,6 +79,14 @@ def test_what_is_wider_than_the_hand_opens_is_counted_and_not_held(engine: str) 
             simulation.reset_from_poses([cube_at(0.15, 0.15)])
             assert len(simulation.too_wide) == wide
             assert simulation.try_grasp(T_world_hand).success is not bool(wide)
+
+
+def test_a_thin_object_is_held_unless_the_hand_has_to_stay_open(engine: str) -> None:
+    thin = ObjectPlacement(CUBE, 0.12, (0.15, 0.15, 0.053), UPRIGHT)  # 6 mm
+    for least, held in ((0.001, True), (0.008, False)):
+        with ClutterSimulation(engine=engine, min_opening=least) as simulation:
+            simulation.reset_from_poses([thin])
+            assert simulation.try_grasp(top_down(0.15, 0.15, 0.051)).success is held
 
 
 def test_executed_grasp_removes_the_object(simulation: ClutterSimulation) -> None:
@@ -152,7 +161,8 @@ def test_wrong_use_is_refused(simulation: ClutterSimulation) -> None:
 def test_outcomes_agree_with_the_reference_simulator(shared_dir, engine, kind, to_the_end) -> None:
     recorded = shared_dir / "reference" / "grasp_outcomes" / f"{kind}.json"
     agreed = []
-    with ClutterSimulation(engine=engine) as simulation:
+    least = load_protocol("edgegrasp").round.min_opening
+    with ClutterSimulation(engine=engine, min_opening=least) as simulation:
         for scene in json.loads(recorded.read_text())["scenes"]:
             simulation.reset_from_poses(
                 [
