@@ -156,7 +156,8 @@ def _fitted(
     found = measured(part, _close_to(plane, part.points, around), THICK)
     places = found.frame.points(part.points)
     cells = np.floor(places[np.abs(places[:, 2]) < MOST_MARGIN, :2] / CELL)
-    return found if len(np.unique(cells, axis=0)) * CELL**2 > LEAST_AREA else None
+    count = len(np.unique(cells @ (1.0, 1e6)))  # many times as fast as unique rows
+    return found if count * CELL**2 > LEAST_AREA else None
 
 
 def _close_to(plane: SupportPlane, points: Float32, objects: Float32) -> SupportPlane:
