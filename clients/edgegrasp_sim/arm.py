@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from edgegrasp_sim.engine import TIME_STEP, ArmModel, HandModel, World
-from edgegrasp_sim.hand import CLOSE_SECONDS, Gripper
+from edgegrasp_sim.hand import CLOSE_SECONDS, MIN_OPENING, Gripper
 from edgegrasp_sim.poses import Matrix
 
 SETTLE_SECONDS = 0.25  # at the grasp and at the end, in which the joints arrive
@@ -33,7 +33,7 @@ class ArmGripper(Gripper):
     motion: ArmMotion | None = None
 
     def __init__(
-        self, world: World, hand: HandModel, arm: ArmModel, min_opening: float
+        self, world: World, hand: HandModel, arm: ArmModel, min_opening: float = MIN_OPENING
     ) -> None:
         self.world, self.model, self.min_opening = world, hand, min_opening
         self.body = self._arm = world.add_arm(arm, hand)
