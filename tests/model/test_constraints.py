@@ -196,8 +196,8 @@ def check_regions(fields: dict, sent: CloudInput, grasp: Grasp) -> None:
             assert not include or any(holds(shape, sent, point, True) for shape in include)
             assert not any(holds(shape, sent, point, False) for shape in exclude)
         if fields["workspace"] is not None:
-            assert (point >= np.array(fields["workspace"]["min"]) - 1e-4).all()
-            assert (point <= np.array(fields["workspace"]["max"]) + 1e-4).all()
+            assert (point >= np.array(fields["workspace"]["min"]) - 1e-6).all()
+            assert (point <= np.array(fields["workspace"]["max"]) + 1e-6).all()
 
 
 def holds(shape: dict, sent: CloudInput, point: np.ndarray, at_least_partly: bool) -> bool:

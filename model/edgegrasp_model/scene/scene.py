@@ -254,11 +254,12 @@ def build_scene(
     if cloud is None:
         return None
     in_cloud = frame.points_in_cloud(middles)
+    inside = inside_workspace(in_cloud, options.workspace)[kept]
     number = voxels.commonest(selected.number)[kept]
 
     def allowed(region: Region | None) -> Bools:
         held = True if region is None else inside_region(region, in_cloud, voxels, sent)[kept]
-        return np.asarray(held & (number >= 0))
+        return np.asarray(held & inside & (number >= 0))
 
     approach = allowed(options.approach_region)
     counts["in_approach_region"] = int(approach.sum())
