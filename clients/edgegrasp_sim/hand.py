@@ -264,7 +264,7 @@ def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: 
         gripper.world.step()
         before, opening = opening, gripper.opening
         still_steps = still_steps + 1 if abs(opening - before) < STILL else 0
-        shut = gripper.is_shut
+        shut = opening <= gripper.min_opening
         if not to_the_end and (shut or (still_steps >= STILL_STEPS and _touched(gripper, objects))):
             return
 

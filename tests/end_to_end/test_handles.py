@@ -1,7 +1,7 @@
 """Grasps on the handle of a mug, which a mask or a cloud of its own marks."""
 
 import numpy as np
-from tests.model.rendered import FOCAL_LENGTH, box, camera, render, seen_box, table, to_world
+from tests.model.rendered import box, camera, depth_image, render, seen_box, table, to_world
 
 from edgegrasp_client import GraspClient, object_in_scene, on_mask
 
@@ -22,8 +22,7 @@ def test_grasps_are_on_what_a_mask_or_the_cloud_of_an_object_marks(real_server) 
     height, width = cloud.shape[:2]
     handle = ((number >= 0) & (number < len(HANDLE))).reshape(height, width)
     assert handle.sum() > 100
-    camera_matrix = (FOCAL_LENGTH, FOCAL_LENGTH, width / 2, height / 2)
-    image = {"depth": cloud[..., 2], "intrinsics": camera_matrix}
+    image = depth_image(cloud)
     marked, segment_ids = object_in_scene(cloud[handle], cloud[number.reshape(height, width) >= 0])
     with GraspClient(real_server.grpc_address) as client:
         by_mask = client.detect(depth_images=[image], **on_mask(handle, {"top_k": 5}))

@@ -1,7 +1,7 @@
 """Grasps on the rim of a bowl that is wider than the hand opens."""
 
 import numpy as np
-from tests.model.rendered import FOCAL_LENGTH, box, camera, render, table, to_world
+from tests.model.rendered import box, camera, depth_image, render, table, to_world
 
 from edgegrasp_client import GraspClient
 
@@ -16,12 +16,7 @@ FLOOR = box((0, 0, 0.002), (0.05, 0.05, 0.002))
 
 def test_the_rim_of_a_bowl_is_grasped_with_one_finger_inside(real_server) -> None:
     scene, pose = [*WALL, FLOOR, table()], camera(0.8, 0.5, 0.5)
-    cloud = render(scene, pose)
-    height, width = cloud.shape[:2]
-    image = {
-        "depth": cloud[..., 2],
-        "intrinsics": (FOCAL_LENGTH, FOCAL_LENGTH, width / 2, height / 2),
-    }
+    image = depth_image(render(scene, pose))
     with GraspClient(real_server.grpc_address) as client:
         best = client.detect(depth_images=[image]).grasps[0]
     assert best.score > 0.5

@@ -131,3 +131,10 @@ def wavy(distance: float) -> np.ndarray:
 SCENE = render([table(), *boxes_on_table(3)], camera(0.7, -1.2, 0.85))
 ROOM = [box(3 * way, 3.1 - 3 * np.abs(way)) for way in np.concatenate([np.eye(3), -np.eye(3)])]
 ROOM_INSIDE = render(ROOM, camera(1.2, 0.3, 0.4))
+
+
+def depth_image(cloud: np.ndarray) -> dict[str, object]:
+    """A rendered cloud (H, W, 3) as one of `depth_images`."""
+    height, width = cloud.shape[:2]
+    camera_matrix = (FOCAL_LENGTH, FOCAL_LENGTH, width / 2, height / 2)
+    return {"depth": cloud[..., 2], "intrinsics": camera_matrix}

@@ -42,10 +42,11 @@ def sample_approach_points(
         return rng.choice(left, count, replace=False).astype(np.int64)
     chosen, total = np.asarray(before, dtype=np.int64), len(before) + count
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    offset = (points - middle).astype(np.float64)
     for cell in CELLS:
         if len(chosen) == total:
             break
-        place = (points - middle).astype(np.float64) / cell
+        place = offset / cell
         node = np.rint(place)
         number = (node + NODES // 2) @ (NODES**2, NODES, 1.0)
         order = np.argsort(number + np.square(place - node).sum(axis=1))
