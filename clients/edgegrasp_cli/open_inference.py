@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import grpc
 import numpy as np
@@ -29,6 +29,7 @@ from edgegrasp.oip.open_inference_pb2_grpc import (
 from edgegrasp_camera.arrays import Array
 from edgegrasp_cli.flags import Server, takes_flags
 from edgegrasp_client import GraspClient, errors
+from edgegrasp_client.errors import invalid
 from edgegrasp_client.requests import option_of_text, plain_options
 
 PLATFORM = "edgegrasp"
@@ -56,6 +57,7 @@ STATUS: tuple[tuple[type[Exception], str, int], ...] = (  # the first that fits
     (errors.GraspClientError, "INTERNAL", 500),
 )
 PARALLEL_CALLS = 32
+MAX_BODY_BYTES = 32 * 2**20
 MAX_SHORT_LISTS = 20_000  # in JSON; most lists hold numbers
 
 Tensors = dict[str, Array]
@@ -70,7 +72,6 @@ def open_inference(
     name: Annotated[
         str, Option(help="Model that stands for the server's default weights.")
     ] = "default",
-    max_body_bytes: Annotated[int, Option(help="Largest request accepted.")] = 33_554_432,
     *,
     asked: Server,
 ) -> None:
@@ -80,28 +81,19 @@ def open_inference(
     """
     with asked.connect(asked.server) as client:
         models = Models(client, name, asked.timeout)
-        with grpc_server(models, f"{host}:{grpc_port}", max_body_bytes):
-            app = http_app(models, max_body_bytes)
+        with grpc_server(models, f"{host}:{grpc_port}", MAX_BODY_BYTES):
+            app = http_app(models, MAX_BODY_BYTES)
             uvicorn.run(app, host=host, port=http_port, log_level="warning")
 
 
-class RefusedError(Exception):
-    """A refusal: the gRPC code's name, the HTTP status and the reason."""
-
-    def __init__(self, code: str, status: int, why: str) -> None:
-        super().__init__(why.encode("utf-8", "backslashreplace").decode())  # half characters
-        self.code, self.status = code, status
-
-
-class Answer(NamedTuple):
-    """A model's answer to tensors."""
-
-    outputs: Tensors  # in the order of OUTPUTS
-    parameters: dict[str, str]
+def refusal(error: errors.GraspClientError) -> tuple[str, int, str]:
+    """The gRPC code's name, the HTTP status and the reason."""
+    code, status = next(row[1:] for row in STATUS if isinstance(error, row[0]))
+    return code, status, str(error).encode("utf-8", "backslashreplace").decode()
 
 
 class Models:
-    """The weights of a grasp server as models of the protocol; raises RefusedError.
+    """The weights of a grasp server as models of the protocol; raises GraspClientErrors.
 
     `default` names the server's default weights, beside their own name.
     """
@@ -115,18 +107,15 @@ class Models:
 
     def names(self) -> list[str]:
         """The models' names."""
-        with _refusing():
-            return [self._default, *(model.name for model in self._client.models())]
+        return [self._default, *(model.name for model in self._client.models())]
 
     def check(self, name: str, version: str = "") -> None:
         """Refuse an unknown name or version."""
         known = self.names()
         if name not in known:
-            raise RefusedError(
-                "NOT_FOUND", 404, f"No model {name!r}. Use one of: {', '.join(known)}."
-            )
+            raise errors.UnknownModelError(f"No model {name!r}. Use one of: {', '.join(known)}.")
         if version not in ("", VERSION):
-            raise RefusedError("NOT_FOUND", 404, f"No version {version!r}. Use {VERSION}.")
+            raise errors.UnknownModelError(f"No version {version!r}. Use {VERSION}.")
 
     def infer(
         self,
@@ -135,10 +124,13 @@ class Models:
         parameters: Mapping[str, Any],
         timeout: float | None,
         wanted: Sequence[str] = (),
-    ) -> Answer:
+    ) -> tuple[Tensors, dict[str, str]]:
         """Grasps of `points`, or of `depth` with `intrinsics`; parameters are options.
 
         `timeout` among them is in microseconds; `wanted` are names of outputs, empty: all.
+
+        Returns:
+            Outputs in the order of OUTPUTS, and the answer's parameters.
         """
         asked = {key: option_of_text(value) for key, value in parameters.items()}
         options: Any = {key: value for key, value in asked.items() if key not in NOT_OPTIONS}
@@ -152,18 +144,15 @@ class Models:
             cloud = {"depth_images": [image]}
         else:
             named = ", ".join(sorted(given)) or "nothing"
-            fix = "Send points, or depth and intrinsics."
-            raise RefusedError("INVALID_ARGUMENT", 400, f"inputs: got {named}. {fix}")
+            raise invalid("inputs", named, "Send points, or depth and intrinsics.")
         if unknown := sorted(set(wanted) - set(OUTPUTS)):
-            why = f"outputs: got {unknown[0]}. Ask for {', '.join(OUTPUTS)}."
-            raise RefusedError("INVALID_ARGUMENT", 400, why)
-        with _refusing():
-            plain_options(options)  # no other argument of the client
-            seconds = self._timeout if timeout is None else min(timeout, self._timeout)
-            micro = asked.get("timeout")
-            if isinstance(micro, int | float) and micro > 0:
-                seconds = min(seconds, micro / 1e6)
-            found = self._client.detect(**cloud, **options, timeout=seconds)
+            raise invalid("outputs", unknown[0], f"Ask for {', '.join(OUTPUTS)}.")
+        plain_options(options)  # no other argument of the client
+        seconds = self._timeout if timeout is None else min(timeout, self._timeout)
+        micro = asked.get("timeout")
+        if isinstance(micro, int | float) and micro > 0:
+            seconds = min(seconds, micro / 1e6)
+        found = self._client.detect(**cloud, **options, timeout=seconds)
         grasps = found.grasps
         poses = np.array([grasp.T_cloud_hand for grasp in grasps], "<f4").reshape(-1, 4, 4)
         outputs = {
@@ -173,21 +162,11 @@ class Models:
             "object": np.array([-1 if g.object is None else g.object for g in grasps], "<i4"),
         }
         outputs = {each: outputs[each] for each in wanted or OUTPUTS}
-        return Answer(outputs, {"model": found.model, "warnings": " ".join(found.warnings)})
-
-
-@contextmanager
-def _refusing() -> Iterator[None]:
-    """Converts errors of the client to those of the protocol."""
-    try:
-        yield
-    except errors.GraspClientError as error:
-        code, status = next(row[1:] for row in STATUS if isinstance(error, row[0]))
-        raise RefusedError(code, status, str(error)) from error
+        return outputs, {"model": found.model, "warnings": " ".join(found.warnings)}
 
 
 def tensor(name: str, datatype: str, shape: Any, data: Any) -> Array:
-    """A tensor of bytes, little-endian, or of nested or flat lists; raises RefusedError."""
+    """A tensor of bytes, little-endian, or of nested or flat lists; raises InvalidRequestError."""
     try:
         dtype = DTYPES[datatype]
         raw = isinstance(data, bytes)
@@ -196,7 +175,7 @@ def tensor(name: str, datatype: str, shape: Any, data: Any) -> Array:
     except (KeyError, OverflowError, TypeError, ValueError) as error:
         why = f"a datatype {datatype}" if isinstance(error, KeyError) else str(error)
         fix = f"Give {', '.join(DTYPES)}, as many values as the shape has."
-        raise RefusedError("INVALID_ARGUMENT", 400, f"inputs.{name}: got {why}. {fix}") from None
+        raise invalid(f"inputs.{name}", why, fix) from None
 
 
 def _metadata(name: str) -> dict[str, Any]:
@@ -232,49 +211,53 @@ class _Servicer(GRPCInferenceServiceServicer):
         return messages.ServerReadyResponse(ready=self._models.ready())
 
     def ModelReady(self, request: Any, context: Any) -> Any:  # noqa: N802
-        _or_abort(context, lambda: self._models.check(request.name, request.version))
+        with _aborting(context):
+            self._models.check(request.name, request.version)
         return messages.ModelReadyResponse(ready=True)
 
     def ServerMetadata(self, request: Any, context: Any) -> Any:  # noqa: N802
         return messages.ServerMetadataResponse(name=PLATFORM, version=VERSION)
 
     def ModelMetadata(self, request: Any, context: Any) -> Any:  # noqa: N802
-        _or_abort(context, lambda: self._models.check(request.name, request.version))
+        with _aborting(context):
+            self._models.check(request.name, request.version)
         return messages.ModelMetadataResponse(**_metadata(request.name))
 
     def ModelInfer(self, request: Any, context: Any) -> Any:  # noqa: N802
-        def infer() -> Answer:
-            tensors, parameters = _grpc_inputs(request), _grpc_parameters(request.parameters)
-            seconds, wanted = context.time_remaining(), [each.name for each in request.outputs]
+        name, wanted = request.model_name, [each.name for each in request.outputs]
+        with _aborting(context):
+            tensors, given = _grpc_inputs(request), _grpc_parameters(request.parameters)
             if request.model_version:
-                self._models.check(request.model_name, request.model_version)
-            return self._models.infer(request.model_name, tensors, parameters, seconds, wanted)
-
-        answer = _or_abort(context, infer)
+                self._models.check(name, request.model_version)
+            seconds = context.time_remaining()
+            outputs, parameters = self._models.infer(name, tensors, given, seconds, wanted)
         fields: dict[str, Any] = {
-            "parameters": {name: {"string_param": t} for name, t in answer.parameters.items()},
+            "parameters": {key: {"string_param": text} for key, text in parameters.items()},
             "outputs": [
-                {"name": name, "datatype": OUTPUTS[name][0], "shape": array.shape}
-                for name, array in answer.outputs.items()
+                {"name": each, "datatype": OUTPUTS[each][0], "shape": array.shape}
+                for each, array in outputs.items()
             ],
-            "raw_output_contents": [array.tobytes() for array in answer.outputs.values()],
+            "raw_output_contents": [array.tobytes() for array in outputs.values()],
         }
-        named = {"model_name": request.model_name, "model_version": VERSION, "id": request.id}
+        named = {"model_name": name, "model_version": VERSION, "id": request.id}
         return messages.ModelInferResponse(**named, **fields)
 
 
-def _or_abort(context: grpc.ServicerContext, call: Callable[[], Any]) -> Any:
+@contextmanager
+def _aborting(context: grpc.ServicerContext) -> Iterator[None]:
+    """End the call with the client's errors in the protocol's form."""
     try:
-        return call()
-    except RefusedError as refused:
-        context.abort(grpc.StatusCode[refused.code], str(refused))
+        yield
+    except errors.GraspClientError as error:
+        code, _, why = refusal(error)
+        context.abort(grpc.StatusCode[code], why)
 
 
 def _grpc_inputs(request: Any) -> Tensors:
     raw = list(request.raw_input_contents)
     if raw and len(raw) != len(request.inputs):
-        why = f"raw_input_contents: got {len(raw)} for {len(request.inputs)} inputs. Give each one."
-        raise RefusedError("INVALID_ARGUMENT", 400, why)
+        value = f"{len(raw)} for {len(request.inputs)} inputs"
+        raise invalid("raw_input_contents", value, "Give each one.")
     tensors = {}
     for number, each in enumerate(request.inputs):
         field = CONTENTS.get(each.datatype, "fp32_contents")
@@ -318,9 +301,7 @@ def http_app(models: Models, max_body_bytes: int) -> Starlette:
         async for chunk in request.stream():
             body += chunk
             if len(body) > max_body_bytes:
-                raise RefusedError(
-                    "RESOURCE_EXHAUSTED", 413, f"The body is over {max_body_bytes:,} bytes."
-                )
+                raise errors.PayloadTooLargeError(f"The body is over {max_body_bytes:,} bytes.")
         header = request.headers.get("inference-header-content-length")
         name = request.path_params["name"]
         if "version" in request.path_params:
@@ -328,8 +309,9 @@ def http_app(models: Models, max_body_bytes: int) -> Starlette:
         return JSONResponse(await run_in_threadpool(_http_infer, models, name, body, header))
 
     def refused(request: Request, error: Exception) -> Response:
-        assert isinstance(error, RefusedError)
-        return JSONResponse({"error": str(error)}, error.status)
+        assert isinstance(error, errors.GraspClientError)
+        _, status, why = refusal(error)
+        return JSONResponse({"error": why}, status)
 
     routes = [
         Route("/v2", answers(lambda: {"name": PLATFORM, "version": VERSION, "extensions": []})),
@@ -344,11 +326,11 @@ def http_app(models: Models, max_body_bytes: int) -> Starlette:
             Route(f"{path}/ready", answers(model_ready)),
             Route(f"{path}/infer", infer, methods=["POST"]),
         ]
-    return Starlette(routes=routes, exception_handlers={RefusedError: refused})
+    return Starlette(routes=routes, exception_handlers={errors.GraspClientError: refused})
 
 
 def _http_infer(models: Models, name: str, body: bytearray, header: str | None) -> dict[str, Any]:
-    """The answer to the body of an inference; raises RefusedError."""
+    """The answer to the body of an inference; raises GraspClientErrors."""
     try:
         head = len(body) if header is None else int(header)
         lists = body.count(b"[", 0, head)
@@ -358,12 +340,11 @@ def _http_infer(models: Models, name: str, body: bytearray, header: str | None) 
         str(request.get("id", "")).encode()  # otherwise it could not be sent back
         tensors, parameters = _http_inputs(request, bytes(body[head:]))
         wanted = [str(each["name"]) for each in request.get("outputs") or ()]
-    except RefusedError:
+    except errors.InvalidRequestError:
         raise
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
-        fix = "Give the JSON of an inference request."
-        raise RefusedError("INVALID_ARGUMENT", 400, f"body: got {error!r}. {fix}") from None
-    answer = models.infer(name, tensors, parameters, None, wanted)
+        raise invalid("body", repr(error), "Give the JSON of an inference request.") from None
+    found, said = models.infer(name, tensors, parameters, None, wanted)
     outputs = [
         {
             "name": each,
@@ -371,10 +352,10 @@ def _http_infer(models: Models, name: str, body: bytearray, header: str | None) 
             "shape": array.shape,
             "data": array.ravel().tolist(),
         }
-        for each, array in answer.outputs.items()
+        for each, array in found.items()
     ]
     named = {"model_name": name, "model_version": VERSION, "id": request.get("id", "")}
-    return {**named, "parameters": answer.parameters, "outputs": outputs}
+    return {**named, "parameters": said, "outputs": outputs}
 
 
 def _http_inputs(request: dict[str, Any], binary: bytes) -> tuple[Tensors, dict[str, Any]]:
