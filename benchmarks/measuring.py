@@ -4,34 +4,29 @@ import json
 import os
 import platform
 import statistics
-import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import psutil
 
-from edgegrasp_client.connection import local_server
+from edgegrasp_client.connection import Addresses, local_server
 from edgegrasp_service.settings import MIB
 
 RESULTS = Path(__file__).parent / "results"
 RUNS = 5
-STOP_SECONDS = 30.0
-SERVE = ("-c", "from edgegrasp_cli.main import main; main()")
 
 
 def interleaved(
     variants: Mapping[str, Callable[[], object]],  # what to run, by name
-    runs: int = RUNS,  # rounds that count
     # Of the processor, which other work on the machine changes little; or of the wall.
     clock: Callable[[], float] = time.process_time,
 ) -> dict[str, list[float]]:
-    """Seconds of each variant in each of `runs` rounds, after one that does not count."""
+    """Seconds of each variant in each of RUNS rounds, after one that does not count."""
     seconds: dict[str, list[float]] = {name: [] for name in variants}
-    for number in range(runs + 1):
+    for number in range(RUNS + 1):
         for name, variant in variants.items():
             start = clock()
             variant()
@@ -67,30 +62,14 @@ def write_results(folder: Path, name: str, results: Mapping[str, Any]) -> None:
     (folder / f"{name}.json").write_text(json.dumps(results, indent=1) + "\n")
 
 
-@dataclass(frozen=True)
-class Served:
-    """A running server; its figures are those of all its processes together."""
-
-    http_url: str
-    grpc_address: str
-    process: psutil.Process
-
-    def memory(self) -> float:
-        """Resident memory, MiB; shared pages count once."""
-        return sum(one.memory_full_info().pss for one in self._processes()) / MIB
-
-    def stop(self) -> int:
-        """Send SIGTERM; returns the exit code."""
-        self.process.terminate()
-        return int(self.process.wait(STOP_SECONDS))
-
-    def _processes(self) -> list[psutil.Process]:
-        return [self.process, *self.process.children(recursive=True)]
-
-
-@contextmanager
-def served(*flags: str, program: Sequence[str] = SERVE) -> Iterator[Served]:
+def served(*flags: str, program: Sequence[str] = ()) -> AbstractContextManager[Addresses]:
     """Run `edgegrasp serve` with these flags on free ports of 127.0.0.1 while the context lasts."""
     quiet = ("--log-level", "error")  # every refusal is a line, and they come by the thousand
-    with local_server(*quiet, *flags, program=(sys.executable, *program)) as own:
-        yield Served(own.http_url, own.grpc_address, psutil.Process(own.pid))
+    return local_server(*quiet, *flags, program=program)
+
+
+def memory(pid: int) -> float:
+    """Resident memory of a server's processes, MiB; shared pages count once."""
+    front = psutil.Process(pid)
+    processes = [front, *front.children(recursive=True)]
+    return sum(one.memory_full_info().pss for one in processes) / MIB

@@ -2,11 +2,11 @@
 
 Clients send clouds of 32 to 20,000 points to a dummy network, over unary gRPC, streams and REST,
 a few of them malformed and a few abandoned; each answer carries the CRC-32 of the cloud that the
-server saw. First they are alone, then two attackers with another address go on beside them: one
-sends requests made to kill workers, one holds connections and streams open without taking or
-sending anything. A process of its own asks for the server's health, each time on a new connection.
-Fails unless every request has an outcome of its own, health is never refused, each attack is
-answered with an error, memory does not grow and the server stops.
+server saw. Beside them are two attackers with another address: one sends requests made to kill
+workers, one holds connections and streams open without taking or sending anything. A process of
+its own asks for the server's health, each time on a new connection. Fails unless every request has
+an outcome of its own, health is never refused, each attack is answered with an error, memory does
+not grow and the server stops.
 """
 
 import argparse
@@ -28,7 +28,6 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -36,8 +35,9 @@ from typing import Any
 import grpc
 import httpx
 import numpy as np
+import psutil
 from benchmarks import serve_dummy
-from benchmarks.measuring import RESULTS, Served, served, write_results
+from benchmarks.measuring import RESULTS, memory, served, write_results
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from edgegrasp_camera.arrays import Float32
@@ -48,6 +48,7 @@ from edgegrasp_client import (
     InvalidRequestError,
     StreamRequest,
 )
+from edgegrasp_client.connection import Addresses
 
 ANSWERED = "answered"
 REFUSED = "refused"
@@ -57,8 +58,8 @@ EXPECTED = {"good": {ANSWERED}, "malformed": {REFUSED}, "cancelled": {CANCELLED,
 FAULTS: tuple[dict[str, Any], ...] = ({"seed": -1}, {"model": "none"}, {"viewpoint": [1e300, 0, 0]})
 SECONDS = 30.0  # until a request counts as lost
 TOGETHER = 8  # requests of one stream
-ALONE = 0.1  # of the time, before the attacks begin
 START_SECONDS = 1.0  # for processes to start
+STOP_SECONDS = 30.0  # for the server to stop
 PROBE_SECONDS = 0.1  # between two questions for health
 HEALTH_TIMEOUT = 5.0 * float(os.environ.get("SOAK_PATIENCE", "1"))  # as in docker/kubernetes
 MEMORY_SAMPLES = 60
@@ -80,40 +81,31 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     os.environ["DUMMY_SECONDS"] = "0.002"
-    results: dict[str, Any] = {"clients": given.clients, "minutes": given.minutes}
-    with served(*ROOM, program=["-P", serve_dummy.__file__]) as server:
-        seconds, random = given.minutes * 60, itertools.count(given.seed)
-        results["alone"] = run(server, given.clients, seconds * ALONE, next(random), ())
-        attacks = (poison, lock_out)
-        results["attacked"] = run(
-            server, given.clients, seconds * (1 - ALONE), next(random), attacks
-        )
-        alone, beside = (results[name]["good_ms"]["p50"] for name in ("alone", "attacked"))
-        results["p50_beside_to_alone"] = round(beside / alone, 2)
-        begun = time.monotonic()
-        results["exit_code"] = server.stop()
-        results["stop_seconds"] = round(time.monotonic() - begun, 2)
-    results["faults"] = faults(results)
+    with served(*ROOM, program=[sys.executable, "-P", serve_dummy.__file__]) as server:
+        results = run(server, given.clients, given.minutes * 60, given.seed)
+        process = psutil.Process(server.pid)
+        process.terminate()
+        results["exit_code"] = int(process.wait(STOP_SECONDS))
+    # In a shorter time the attacks themselves have only begun.
+    results["faults"] = faults(results, grows=given.minutes >= 2)
     write_results(given.output, "soak", results)
     print(json.dumps(results, indent=1))
     sys.exit(1 if results["faults"] else 0)
 
 
-def run(
-    server: Served, clients: int, seconds: float, seed: int, attacks: tuple[Any, ...]
-) -> dict[str, Any]:
+def run(server: Addresses, clients: int, seconds: float, seed: int) -> dict[str, Any]:
     """Run clients beside the attacks and the probe, each a process; returns the figures."""
-    context, count = multiprocessing.get_context("spawn"), 1 + len(attacks)
-    with context.Manager() as manager, ProcessPoolExecutor(count, context) as pool:
+    context, works = multiprocessing.get_context("spawn"), (probe, poison, lock_out)
+    with context.Manager() as manager, ProcessPoolExecutor(len(works), context) as pool:
         stop = manager.Event()
-        list(pool.map(time.sleep, [START_SECONDS] * count))  # until all processes have started
+        list(pool.map(time.sleep, [START_SECONDS] * len(works)))  # until all have started
         where = server.http_url, server.grpc_address, stop
-        works = [pool.submit(work, *where) for work in (probe, *attacks)]
+        beside = [pool.submit(work, *where) for work in works]
         soak = Soak(server, seed)
         asyncio.run(soak.run(clients, seconds))
         stop.set()
-        health, *attacked = (work.result() for work in works)
-    return soak.figures() | {"health": health, "attacks": attacked}
+        refused, *attacks = (work.result() for work in beside)
+    return soak.figures() | {"health_refused": refused, "attacks": attacks}
 
 
 # The clients
@@ -153,12 +145,11 @@ def plans(seed: int, end: float) -> Iterator[Plan]:
 class Soak:
     """Sends plans from several clients at a time, and records their outcomes."""
 
-    def __init__(self, server: Served, seed: int) -> None:
+    def __init__(self, server: Addresses, seed: int) -> None:
         self._server, self._seed = server, seed
         self._came: Counter[str] = Counter()
         self._wrong: list[dict[str, Any]] = []
         self._memory: list[float] = []
-        self._seconds: list[float] = []  # of good requests that are not in a stream
         self._given = 0
 
     async def run(self, clients: int, seconds: float) -> None:
@@ -174,16 +165,14 @@ class Soak:
         return {
             "requests": self._given,
             "lost": self._given - self._came.total(),
-            "wrong": len(self._wrong),
-            "wrong_first": self._wrong[:20],
+            "wrong": self._wrong[:20],
             "outcomes": dict(sorted(self._came.items())),
-            "good_ms": milliseconds(self._seconds),
             "memory_mb": self._memory,
         }
 
     async def _sample(self, seconds: float) -> None:
         while True:
-            self._memory.append(round(await asyncio.to_thread(self._server.memory), 1))
+            self._memory.append(round(await asyncio.to_thread(memory, self._server.pid), 1))
             await asyncio.sleep(seconds)
 
     async def _send(self, way: str) -> None:
@@ -195,11 +184,7 @@ class Soak:
                 if way == "stream":
                     await self._stream(client, some)
                     continue
-                start = time.monotonic()
-                came = await self._one(client, some[0])
-                if came == ANSWERED and some[0].kind == "good":
-                    self._seconds.append(time.monotonic() - start)
-                self._note(way, some[0], came)
+                self._note(way, some[0], await self._one(client, some[0]))
 
     async def _one(self, client: AsyncGraspClient, plan: Plan) -> str:
         try:
@@ -331,21 +316,16 @@ def http2_headers(path: str, stream: int) -> bytes:
     return http2_frame(1, 4, stream, headers)
 
 
-def probe(url: str, address: str, stop: Any) -> dict[str, Any]:
-    """Ask for health over both transports, each time on a new connection; returns the outcome."""
-    questions = {"http": partial(ask_http, url), "grpc": partial(ask_grpc, address)}
+def probe(url: str, address: str, stop: Any) -> dict[str, int]:
+    """Ask for health over both transports, each time on a new connection; returns refusals."""
     refused: Counter[str] = Counter()
-    seconds: dict[str, list[float]] = {name: [] for name in questions}
     while not stop.wait(PROBE_SECONDS):
-        for name, ask in questions.items():
-            start = time.monotonic()
+        for ask, where in ((ask_http, url), (ask_grpc, address)):
             try:
-                ask()
+                ask(where)
             except (OSError, ValueError, grpc.RpcError) as error:
-                refused[f"{name}: {error}"[:200]] += 1
-            seconds[name].append(time.monotonic() - start)
-    figures = {name: {"asked": len(one), "ms": milliseconds(one)} for name, one in seconds.items()}
-    return {"refused": dict(refused), **figures}
+                refused[f"{where}: {error}"[:200]] += 1
+    return dict(refused)
 
 
 def ask_http(url: str) -> None:
@@ -367,34 +347,22 @@ def ask_grpc(address: str) -> None:
         raise ValueError(answer.status)
 
 
-def milliseconds(seconds: list[float]) -> dict[str, float]:
-    """The median, the 99th percentile and the longest."""
-    found = np.quantile(seconds or [0.0], (0.5, 0.99, 1.0)) * 1e3
-    return dict(zip(("p50", "p99", "max"), found.round(1).tolist(), strict=True))
-
-
-def faults(results: dict[str, Any]) -> list[str]:
-    """What is wrong; empty if all is well."""
-    found, attacked = [], results["attacked"]
-    for name in ("alone", "attacked"):
-        if results[name]["wrong"]:
-            found.append(f"{name}: requests with a wrong outcome")
-        if results[name]["lost"]:
-            found.append(f"{name}: requests without an outcome")
-        if results[name]["health"]["refused"]:
-            found.append(f"{name}: health was refused")
-    poisoned, held = attacked["attacks"]
-    if not all(name.endswith((": 400", ": 413", ": 429")) for name in poisoned):
-        found.append("a poison was not refused")
-    if not all(held.values()):
-        found.append("nothing was held open")
-    *_, before, after = np.array_split(attacked["memory_mb"], 4)
-    # In a shorter time the attacks themselves have only begun.
-    if results["minutes"] >= 2 and np.median(after) > np.median(before) * (1 + MAX_GROWTH):
-        found.append("memory grows")
-    if results["exit_code"] != 0:
-        found.append(f"the server ended with {results['exit_code']}")
-    return found
+def faults(results: dict[str, Any], grows: bool) -> list[str]:
+    """What is wrong, the growth of memory only if asked for; empty if all is well."""
+    poisoned, held = results["attacks"]
+    *_, before, after = np.array_split(results["memory_mb"], 4)
+    found = {
+        "requests with a wrong outcome": results["wrong"],
+        "requests without an outcome": results["lost"],
+        "health was refused": results["health_refused"],
+        "a poison was not refused": not all(
+            one.endswith((": 400", ": 413", ": 429")) for one in poisoned
+        ),
+        "nothing was held open": not all(held.values()),
+        "memory grows": grows and np.median(after) > np.median(before) * (1 + MAX_GROWTH),
+        f"the server ended with {results['exit_code']}": results["exit_code"],
+    }
+    return [fault for fault, is_one in found.items() if is_one]
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.measuring import RESULTS, RUNS, interleaved, machine, served, write_results
+from benchmarks.measuring import RESULTS, RUNS, interleaved, machine, memory, served, write_results
 from examples.your_planner import plan
 
 from edgegrasp_cli.real_scenes import load_scenes
@@ -129,13 +129,13 @@ def server_footprint() -> dict[str, float]:
     start = time.perf_counter()
     with served() as server:
         ready = time.perf_counter() - start
-        at_rest = server.memory()
+        at_rest = memory(server.pid)
         seen = observe(table="auto")
         viewpoint = tuple(seen.camera_position.tolist())
         with GraspClient(server.grpc_address) as client:
             for seed in range(10):
                 client.detect(seen.cloud, seed=seed, viewpoint=viewpoint)
-        return {"ready_seconds": ready, "rest_mb": at_rest, "used_mb": server.memory()}
+        return {"ready_seconds": ready, "rest_mb": at_rest, "used_mb": memory(server.pid)}
 
 
 def simulators() -> dict[str, Any]:
