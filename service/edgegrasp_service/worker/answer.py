@@ -4,6 +4,7 @@ Every fault of a request is returned as a Problem. This module knows no event lo
 transports.
 """
 
+import math
 import time
 import traceback
 from collections.abc import Iterator, Mapping
@@ -70,7 +71,7 @@ def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
     Raises:
         MemoryError: Out of memory; the process should be replaced.
     """
-    work = _Work(job, catalogue, settings, time.monotonic() + job.remaining)
+    work = Work(job, catalogue, settings, time.monotonic() + job.remaining)
     try:
         return Answer(work.answer(), work.facts)
     except EdgeGraspError as error:
@@ -88,13 +89,13 @@ def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
 
 
 @dataclass
-class _Work:
-    """One job while it is being answered."""
+class Work:
+    """One job while it is being answered; its errors are the detector's."""
 
     job: Job
     catalogue: "ModelCatalogue"
     settings: Settings
-    deadline: float  # by time.monotonic
+    deadline: float = math.inf  # by time.monotonic
     facts: Facts = field(default_factory=Facts)
     options: DetectOptions | None = None  # known once they are parsed
 
