@@ -41,6 +41,7 @@ ACCEPTED = 16  # in one turn of the event loop
 KEEP_ALIVE_SECONDS = 75  # longer than clients keep theirs: no request meets a closing one
 LINGER_SECONDS = 5.0  # seconds for a refused client to read its answer
 MANY_PIECES, SMALL_PIECE = 1024, 16  # more chunks than this, smaller than this, are refused
+MAX_HEADERS = 64  # or entries of gRPC's metadata
 PAGES = 16  # sent at a time
 PAGE_PAUSE_SECONDS = 0.001  # seconds between the beginnings of two pages
 PAGE_GRACE_SECONDS = 10.0  # seconds after which a page yields its place to another one

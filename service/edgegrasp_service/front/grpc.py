@@ -36,12 +36,14 @@ from edgegrasp_service.errors import (
     STOPPING,
     AddressInUse,
     Cancelled,
+    HeadersTooLarge,
     NotReady,
     Problem,
     RequestTimeout,
     report,
 )
 from edgegrasp_service.front.connections import (
+    MAX_HEADERS,
     SMALL_READ_SECONDS,
     SMALL_READS,
     STREAM_GRACE_SECONDS,
@@ -52,7 +54,7 @@ from edgegrasp_service.front.connections import (
     receive,
     send,
 )
-from edgegrasp_service.front.service import GraspService, Reloader, check_headers
+from edgegrasp_service.front.service import GraspService, Reloader
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call
 from edgegrasp_service.settings import UNIX
 from edgegrasp_service.worker.process import Job, Method
@@ -201,7 +203,9 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
             name = ((REQUEST_ID_HEADER, call.request_id),)
             try:
                 context.set_trailing_metadata(name)
-                check_headers("metadata", len(metadata))
+                if len(metadata) > MAX_HEADERS:
+                    value, fix = f"{len(metadata)} entries", f"Send at most {MAX_HEADERS}."
+                    raise HeadersTooLarge("metadata", value, fix)
                 if not path.startswith(f"/{HEALTH}/"):
                     self._service.authorize(call, headers.get("authorization"))
                 if call.long:

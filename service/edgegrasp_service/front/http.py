@@ -27,6 +27,7 @@ from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, brief
 from edgegrasp_model.gripper import gripper_names, load_gripper
 from edgegrasp_service.errors import (
     Cancelled,
+    HeadersTooLarge,
     Problem,
     UnsupportedMediaType,
     problem_document,
@@ -34,12 +35,13 @@ from edgegrasp_service.errors import (
 )
 from edgegrasp_service.front import connections
 from edgegrasp_service.front.connections import (
+    MAX_HEADERS,
     PAGE_GRACE_SECONDS,
     PAGE_PAUSE_SECONDS,
     PAGES,
     Places,
 )
-from edgegrasp_service.front.service import GraspService, Reloader, check_headers
+from edgegrasp_service.front.service import GraspService, Reloader
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics
 from edgegrasp_service.worker.process import PIECE, Job, Method
 
@@ -155,8 +157,10 @@ class HttpMiddleware:
         """Refuse headers that are too large, a foreign host, a wrong token, a compressed body."""
         size = sum(len(name) + len(value) for name, value in scope["headers"])
         size += len(scope["raw_path"]) + len(scope["query_string"])
-        most = self._service.settings.max_header_bytes
-        check_headers("headers", len(scope["headers"]), size, most)
+        count, most = len(scope["headers"]), self._service.settings.max_header_bytes
+        if count > MAX_HEADERS or size > most:
+            fix = f"Send at most {MAX_HEADERS}, of {most} bytes."
+            raise HeadersTooLarge("headers", f"{count} entries of {size} bytes", fix)
         if call.method not in ("Live", "Ready"):
             self._check_host(headers.get("host", ""))
         if call.method not in OPEN:

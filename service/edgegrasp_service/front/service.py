@@ -15,7 +15,6 @@ from edgegrasp_service.errors import (
     STOPPING,
     Cancelled,
     HarmfulRequest,
-    HeadersTooLarge,
     NotReady,
     PayloadTooLarge,
     PermissionDenied,
@@ -32,7 +31,6 @@ from edgegrasp_service.worker.process import Answer, Job
 
 logger = logging.getLogger(__name__)
 
-MAX_HEADERS = 64
 MOST_DEATHS = 3  # dead workers after which a request is refused; a crash counts as 3
 HARMFUL_SECONDS = 600.0  # seconds for which it is refused
 MOST_HARMFUL = 1000  # requests remembered
@@ -64,7 +62,7 @@ class GraspService:
     @property
     def ready(self) -> bool:
         """Whether requests can be answered."""
-        return bool(self.pool.models) and self.pool.alive and not self.stopping.is_set()
+        return bool(self.pool.models and self.pool.pids) and not self.stopping.is_set()
 
     def loaded(self) -> WorkerPool:
         """The workers; raises NotReady while weights are loading or the server is stopping."""
@@ -274,11 +272,3 @@ class Reloader:
             digests = {model["name"]: model["digest"] for model in service.pool.models}
             logger.info("reloaded", extra={"fields": {"digests": digests}})
             return service.pool.models
-
-
-def check_headers(kind: str, count: int, size: int = 0, most: int = 0) -> None:
-    """Raise HeadersTooLarge for more than MAX_HEADERS, or than `most` bytes in all."""
-    if count > MAX_HEADERS:
-        raise HeadersTooLarge(kind, f"{count} entries", f"Send at most {MAX_HEADERS}.")
-    if size > most:
-        raise HeadersTooLarge(kind, f"{size} bytes", f"Send at most {most}.")
