@@ -27,7 +27,7 @@ from edgegrasp_client.errors import DeadlineError, ServerUnavailableError, Worke
 from edgegrasp_client.over_grpc import GrpcTransport
 from edgegrasp_client.over_rest import RestTransport
 from edgegrasp_client.requests import Cloud, Request, RequestFields, StreamRequest
-from edgegrasp_client.results import Model, Models, Robot, Robots, StreamAnswer
+from edgegrasp_client.results import Model, Robot, StreamAnswer
 from edgegrasp_results import Detection, Grasp, Scoring
 
 POLL_SECONDS = 0.1
@@ -143,11 +143,11 @@ class AsyncGraspClient:
 
     async def models(self, *, timeout: float | None = None) -> list[Model]:
         """The weights that `model` can name."""
-        return (await self._retried(partial(self._transport.listed, Models), timeout)).models
+        return await self._retried(partial(self._transport.listed, Model), timeout)
 
     async def robots(self, *, timeout: float | None = None) -> list[Robot]:
         """The robots that `robot` can name."""
-        return (await self._retried(partial(self._transport.listed, Robots), timeout)).robots
+        return await self._retried(partial(self._transport.listed, Robot), timeout)
 
     async def record_outcome(
         self, detection: Detection, grasp: Grasp, held: bool, *, timeout: float | None = None

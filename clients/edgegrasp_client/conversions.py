@@ -115,7 +115,6 @@ def moveit_grasp(
     T_hand_link: ArrayLike | None = None,
     approach_distance: float = 0.05,
     retreat_distance: float = 0.1,
-    retreat_direction: Sequence[float] | None = None,
 ) -> Message:
     """A grasp as the fields of `moveit_msgs/Grasp` (ROS 2).
 
@@ -131,15 +130,12 @@ def moveit_grasp(
         T_hand_link: (4, 4) pose in our hand frame of the end effector's parent link, whose pose
             MoveIt wants, such as PANDA_LINK8; None: it is the hand frame.
         approach_distance: Metres of straight approach.
-        retreat_distance: Metres of straight retreat.
-        retreat_direction: (3,) direction of the retreat, cloud frame; None: back along the
-            approach.
+        retreat_distance: Metres of straight retreat, back along the approach.
 
     Returns:
         The message's fields; orientations are the four fields x, y, z, w.
     """
     approach = np.asarray(grasp.approach_direction, dtype=np.float64)
-    retreat = -approach if retreat_direction is None else np.asarray(retreat_direction, np.float64)
     T_cloud_link = _matrix(grasp.T_cloud_hand) @ _matrix(T_hand_link)
     header = {"stamp": stamp or {"sec": 0, "nanosec": 0}, "frame_id": frame_id}
     return {
@@ -152,7 +148,7 @@ def moveit_grasp(
         },
         "grasp_quality": float(grasp.score),
         "pre_grasp_approach": _translation(approach, approach_distance, header),
-        "post_grasp_retreat": _translation(retreat, retreat_distance, header),
+        "post_grasp_retreat": _translation(-approach, retreat_distance, header),
         "post_place_retreat": _translation(-approach, retreat_distance, header),
         "max_contact_force": 0.0,
         "allowed_touch_objects": [],

@@ -31,7 +31,7 @@ from edgegrasp_client.requests import (
     is_point_cloud2,
     point_cloud2_fields,
 )
-from edgegrasp_client.results import Models, StreamAnswer, read_as
+from edgegrasp_client.results import Model, StreamAnswer, read_as
 from edgegrasp_results import Detection
 
 Answer = TypeVar("Answer")
@@ -92,9 +92,11 @@ class GrpcTransport:
         answer = await self._call(name, b"".join(wire_of(request)), timeout)
         return read_as(kind, answer, read_field)
 
-    async def listed(self, kind: type[Answer], timeout: float) -> Answer:
-        """The server's Models or Robots."""
-        return read_as(kind, await self._call(f"List{kind.__name__}", b"", timeout), read_field)
+    async def listed(self, kind: type[Answer], timeout: float) -> list[Answer]:
+        """The server's models or robots."""
+        name = f"{kind.__name__}s"
+        answer = await self._call(f"List{name}", b"", timeout)
+        return [read_as(kind, each, read_field) for each in getattr(answer, name.lower())]
 
     async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
         """Refused: gRPC has no such call."""
@@ -140,7 +142,7 @@ class GrpcTransport:
             if error.code() != grpc.StatusCode.UNIMPLEMENTED:
                 return False
         try:  # a server without gRPC's health service, such as Ray's: try a request
-            return bool((await self.listed(Models, timeout)).models)
+            return bool(await self.listed(Model, timeout))
         except GraspClientError:
             return False
 

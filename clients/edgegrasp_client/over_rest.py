@@ -4,7 +4,8 @@ import base64
 import json
 import operator
 import ssl
-from collections.abc import AsyncGenerator, AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
+from functools import partial
 from typing import Any, TypeVar
 
 import httpx
@@ -64,27 +65,31 @@ class RestTransport:
 
     async def ask(self, kind: type[Answer], request: Request, timeout: float) -> Answer:
         """The answer to a request."""
-        return await self._call(kind, call_of(request), timeout)
+        return await self._call(partial(read_json_as, kind), call_of(request), timeout)
 
-    async def listed(self, kind: type[Answer], timeout: float) -> Answer:
-        """The server's Models or Robots."""
-        call = {"method": "GET", "url": f"/v1/{kind.__name__.lower()}"}
-        return await self._call(kind, call, timeout)
+    async def listed(self, kind: type[Answer], timeout: float) -> list[Answer]:
+        """The server's models or robots."""
+        name = f"{kind.__name__.lower()}s"
+
+        def read(body: Any) -> list[Answer]:
+            return [read_json_as(kind, each) for each in body[name]]
+
+        return await self._call(read, {"method": "GET", "url": f"/v1/{name}"}, timeout)
 
     async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
         """Report to the server whether a grasp held."""
         call = {"method": "POST", "url": "/v1/outcomes", "json": tried}
-        await self._call(dict, call, timeout)
+        await self._call(lambda _: None, call, timeout)
 
     async def detect_stream(
         self, requests: AsyncIterator[tuple[str, StreamRequest]], timeout: float
     ) -> AsyncGenerator[StreamAnswer, None]:
         """An answer to each of the named requests, one after the other."""
         async for name, request in requests:
-            call = call_of(request.request)
+            call, read = call_of(request.request), partial(read_json_as, Detection)
             seconds = timeout if request.timeout is None else request.timeout
             try:
-                yield StreamAnswer(name, await self._call(Detection, call, seconds))
+                yield StreamAnswer(name, await self._call(read, call, seconds))
             except GraspClientError as error:
                 yield StreamAnswer(name, error=error)
 
@@ -99,8 +104,8 @@ class RestTransport:
         """Close the connections."""
         await self._http.aclose()
 
-    async def _call(self, kind: type[Answer], call: Call, timeout: float) -> Answer:
-        """The answer to a call, which both sides give up after `timeout` seconds."""
+    async def _call(self, read: Callable[[Any], Answer], call: Call, timeout: float) -> Answer:
+        """What is read of a call's answer; both sides give up after `timeout` seconds."""
         headers = {**call.get("headers", {}), "x-request-timeout": f"{timeout:.6g}"}
         try:
             response = await self._http.request(**call | {"headers": headers}, timeout=timeout)
@@ -118,9 +123,14 @@ class RestTransport:
         if not response.is_success:
             raise _described(body, response)
         try:
-            return read_as(kind, body, operator.getitem)
+            return read(body)
         except (KeyError, TypeError, ValueError) as error:
             raise _foreign(response) from error
+
+
+def read_json_as(kind: type[Answer], body: Any) -> Answer:
+    """An object of an answer as one of the dataclasses of `results`."""
+    return read_as(kind, body, operator.getitem)
 
 
 def call_of(request: Request) -> Call:

@@ -6,7 +6,7 @@ scene's.
 
 import io
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard, cast
@@ -51,24 +51,14 @@ class DepthImage(TypedDict):
 
 Cloud = Array | str | PathLike[str] | PointCloud2
 BESIDE = ("normals", "colors", "segment_ids", "view_ids")
-Fits = Callable[[tuple[int, ...]], bool]
-VECTORS: tuple[str, Fits, str] = (
-    "iuf",
-    lambda shape: shape[-1:] == (3,),
-    "an array of numbers, three for each row of the cloud",
-)
-INTEGERS: tuple[str, Fits, str] = (
-    "iu",
-    lambda shape: True,
-    "an array of integers, one for each row of the cloud, within 32 bits",
-)
-ARRAYS: dict[str, tuple[str, Fits, str]] = {  # kinds of dtype, shapes that fit, in words
-    "normals": VECTORS,
-    "colors": VECTORS,
-    "segment_ids": INTEGERS,
-    "view_ids": INTEGERS,
-    "edges": ("iu", lambda s: s[1:] == (2,), "an array (M, 2) of rows of the cloud"),
-    "hand_poses": ("f", lambda s: s[1:] == (4, 4), "an array (M, 4, 4) of T_cloud_hand"),
+# Of each array: kinds of dtype, last sides of the shape, and both in words.
+ARRAYS: dict[str, tuple[str, tuple[int, ...], str]] = {
+    "normals": ("iuf", (3,), "an array of numbers, three for each row of the cloud"),
+    "colors": ("iuf", (3,), "an array of numbers, three for each row of the cloud"),
+    "segment_ids": ("iu", (), "an array of integers within 32 bits, one for each row of the cloud"),
+    "view_ids": ("iu", (), "an array of integers within 32 bits, one for each row of the cloud"),
+    "edges": ("iu", (2,), "an array (M, 2) of rows of the cloud"),
+    "hand_poses": ("f", (4, 4), "an array (M, 4, 4) of T_cloud_hand"),
 }
 
 
@@ -355,16 +345,18 @@ def _plain(value: Any) -> Any:
 
 def _sent(name: str, array: object) -> Array:
     """An array of the request as it is sent; raises InvalidRequestError where it is none."""
-    kinds, fits, wanted = ARRAYS[name]
+    kinds, sides, wanted = ARRAYS[name]
     if not isinstance(array, np.ndarray):
         raise invalid(name, f"a {type(array).__name__}", f"Give {wanted}.")
     if array.dtype.kind not in kinds:
         raise invalid(name, f"dtype {array.dtype}", f"Give {wanted}.")
-    if not fits(array.shape):
+    to_score = name in ("edges", "hand_poses")
+    fits = array.shape[array.ndim - len(sides) :] == sides
+    if not fits or (to_score and array.ndim != len(sides) + 1):
         raise invalid(name, f"shape {array.shape}", f"Give {wanted}.")
-    if name in ("edges", "hand_poses"):
+    if to_score:
         return array
-    if kinds == "iuf":
+    if sides:
         return np.ascontiguousarray(array.reshape(-1, 3), dtype=np.float32)
     if array.size and (array.max() >= 2**31 or array.min() < -(2**31)):
         raise invalid(name, f"values from {array.min()} to {array.max()}", f"Give {wanted}.")

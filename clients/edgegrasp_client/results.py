@@ -30,13 +30,6 @@ class Model:
 
 
 @dataclass(frozen=True, eq=False)
-class Models:
-    """All weights that a server has loaded."""
-
-    models: list[Model]
-
-
-@dataclass(frozen=True, eq=False)
 class Robot:
     """An arm with a gripper on it. J joints; radians and seconds, metres of sliding joints."""
 
@@ -54,13 +47,6 @@ class Robot:
     frames: Annotated[Float64, (-1, 4, 4)]
     axes: Annotated[Float64, (-1, 3)]  # (J, 3) that it turns about or slides along, own frame
     sliding: list[bool]  # J
-
-
-@dataclass(frozen=True, eq=False)
-class Robots:
-    """All robots that a server plans for."""
-
-    robots: list[Robot]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +82,8 @@ Read = Callable[[Any, str], Any]
 
 def read_as(kind: type[Record], answer: Any, read: Read) -> Record:
     """An answer, or an object in one, as one of the dataclasses above."""
-    if not is_dataclass(kind):  # an answer that says nothing
-        return kind()
-    values = {name: value(read(answer, name), read) for name, value in _fields(kind)}
+    fields = _fields(cast("Any", kind))
+    values = {name: value(read(answer, name), read) for name, value in fields}
     if kind is ArmTrajectory:  # gRPC has rows one behind the other
         for name in ("positions", "velocities"):
             values[name] = values[name].reshape(-1, len(values["joint_names"]))
