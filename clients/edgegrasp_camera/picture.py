@@ -178,15 +178,15 @@ class Picture:
         grey = 70 + 165 * lit(depth, abs(self.view.fx), self.view.fy)
         return np.repeat(grey[..., None], 3, axis=2)
 
-    def lines(self, points: ArrayLike, color: str, width: float = 1.5) -> None:
+    def lines(self, points: ArrayLike, color: str, width: float) -> None:
         """Draw a line through points (K, 3), cloud frame."""
         pixels, _ = self.view.project(points)
         self._axes.plot(*pixels.T, color=color, linewidth=width)
 
-    def outline(self, mask: Bools, color: str = "white") -> None:
-        """Draw the border of a mask (H, W)."""
+    def outline(self, mask: Bools) -> None:
+        """Draw the border of a mask (H, W) in white."""
         if mask.any():
-            self._axes.contour(mask, [0.5], colors=color, linewidths=1.0)
+            self._axes.contour(mask, [0.5], colors="white", linewidths=1.0)
 
     def regions(self, options: Mapping[str, Any]) -> None:
         """Draw the workspace and the boxes and balls of the regions of a request's options."""
@@ -265,11 +265,10 @@ def draw_grasps(
     *,
     camera_position: ArrayLike,  # (3,) metres, cloud frame; the picture looks from there
     title: str,  # a line below it
-    palm_and_tip: tuple[float, float] = PANDA,  # metres along the hand's z
 ) -> None:
-    """Write a picture of a cloud and of grasps in it, as `Picture.save` does."""
+    """Write a picture of a cloud and of the Panda's grasps in it, as `Picture.save` does."""
     picture = Picture(View.of(cloud, camera_position), cloud, title=title)
-    picture.grasps(grasps, palm_and_tip)
+    picture.grasps(grasps)
     picture.save(path)
 
 

@@ -170,13 +170,12 @@ def blob(number: int, folder: Path, scale: float = 1.0) -> ObjectModel:
     return ObjectModel(name, write_object(name, as_obj([hull]), folder), scale)
 
 
-def prepare_mesh(mesh: Path, cache: Path | None = None) -> Path:
+def prepare_mesh(mesh: Path) -> Path:
     """Make a simulated object of an `.obj` or `.stl` file, or look it up; returns its URDF file.
 
     The box around it gets a shortest side of `SHORTEST_SIDE`, and no side over `LONGEST_SIDE`; z
     points up in packed scenes. The camera sees the mesh itself; contacts use its convex parts.
-    `cache` keeps objects by the digest of their file and of how they are prepared. ValueError: it
-    is no solid mesh; RuntimeError: coacd or trimesh is not installed.
+    ValueError: it is no solid mesh; RuntimeError: coacd or trimesh is not installed.
     """
     try:
         import coacd  # noqa: F401
@@ -200,7 +199,7 @@ def prepare_mesh(mesh: Path, cache: Path | None = None) -> Path:
         write_parts("object", visible, hulls, solid.center_mass, solid.moment_inertia, folder)
         logger.info("%s: %d convex parts", mesh.name, len(parts))
 
-    return _kept_in(_digest(mesh), write, cache) / "object.urdf"
+    return _kept_in(_digest(mesh), write) / "object.urdf"
 
 
 def cache_folder() -> Path:
@@ -310,8 +309,8 @@ def _write_builtin(folder: Path) -> None:
         blob(number, folder)
 
 
-def _kept_in(name: str, write: Callable[[Path], None], cache: Path | None = None) -> Path:
-    folder = (cache or cache_folder()) / name
+def _kept_in(name: str, write: Callable[[Path], None]) -> Path:
+    folder = cache_folder() / name
     if folder.is_dir():
         return folder
     folder.parent.mkdir(parents=True, exist_ok=True)

@@ -91,12 +91,12 @@ class Replay:
         return repeated, seen
 
 
-def write_report(folder: ResultFolder, objects: Path | None = None) -> Path:
-    """Write `report.html` into a result folder; `objects`: where its objects are now."""
+def write_report(folder: ResultFolder) -> Path:
+    """Write `report.html` into a result folder."""
     rounds = folder.rounds()
     facts = folder.manifest()
     summary = folder.finish(rounds)
-    with Replay(folder, objects) as replay:
+    with Replay(folder) as replay:
         pictures = list(_failure_pictures(replay, rounds))
     title = f"{planner_title(facts['run']['planner'])} on {summary['scene']} scenes"
     parts = [

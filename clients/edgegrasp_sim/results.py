@@ -19,13 +19,7 @@ from scipy.stats import binomtest
 from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.trial import Attempt, Round
 
-CSV_COLUMNS = (
-    "seed",
-    "round",
-    "attempt",
-    *(name for name in Attempt.__dataclass_fields__ if name != "T_world_hand"),
-    "T_world_hand",
-)
+CSV_COLUMNS = ("seed", "round", "attempt", *Attempt.__dataclass_fields__)
 PAIRED = ("scene", "engine", "protocol", "objects", "constants")  # equal in paired runs
 COUNTS = ("successes", "attempts", "objects")
 RATE_LABELS = {"grasp_success_rate": "GSR", "declutter_rate": "DR"}

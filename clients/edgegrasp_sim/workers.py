@@ -37,17 +37,10 @@ def run_tasks(
         raise ValueError(f"workers is {workers}; use at least 1")
     if ray is not None:
         return _on_ray(ray, make_runner, tasks, workers)
-    processes = min(workers or available_cores(), len(tasks))
+    processes = min(workers or len(os.sched_getaffinity(0)), len(tasks))
     if processes > 1:
         return _in_processes(make_runner, tasks, processes)
     return _here(make_runner, tasks)
-
-
-def available_cores() -> int:
-    """How many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _here(
@@ -122,7 +115,8 @@ def _on_ray(
     own: dict[str, Any] = {}
     if address == LOCAL_RAY:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # only read from there
-        own = {"num_cpus": workers or available_cores(), "include_dashboard": False}
+        cores = workers or len(os.sched_getaffinity(0))
+        own = {"num_cpus": cores, "include_dashboard": False}
     try:
         ray.init(address=address, log_to_driver=False, logging_level="ERROR", **own)
     except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
