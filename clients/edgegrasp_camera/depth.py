@@ -12,8 +12,6 @@ from edgegrasp_camera import InvalidRequest
 from edgegrasp_camera.arrays import Array, Float32, Float64
 from edgegrasp_camera.clouds import CloudInput
 
-Position = tuple[float, float, float]  # metres
-
 ENCODINGS = {"32FC1": "<f4", "64FC1": "<f8", "16UC1": "<u2"}  # as sensor_msgs/Image has them
 MILLIMETRE = 0.001  # metres for one unit of whole numbers
 FOCAL_LENGTHS = 0.1, 20.0  # shares of the image's size: 157 and 3 degrees
@@ -100,9 +98,7 @@ def unproject(depth: Float32, camera: Intrinsics, T_cloud_camera: Float64 | None
     return points
 
 
-def fuse_depth_images(
-    depths: Sequence[Array], views: Sequence[Any]
-) -> tuple[CloudInput, list[Position]]:
+def fuse_depth_images(depths: Sequence[Array], views: Sequence[Any]) -> CloudInput:
     """Turn depth images into one cloud.
 
     Args:
@@ -111,15 +107,15 @@ def fuse_depth_images(
 
     Returns:
         A cloud whose rows are the pixels, image after image, NaN without a reading: (H, W, 3) for
-        one image, (1, N, 3) with the view of each point for several; doubts about the cameras are
-        in its warnings. And the position of each camera.
+        one image, (1, N, 3) with the view of each point for several; its viewpoint is where the
+        cameras stand, and doubts about them are in its warnings.
 
     Raises:
         InvalidRequest: An array is not a depth image or does not fit its camera; names
             `depth_images.N`.
     """
     clouds: list[Float32] = []
-    cameras: list[Position] = []
+    cameras: list[tuple[float, ...]] = []
     doubts: list[str] = []
     for row, (depth, view) in enumerate(zip(depths, views, strict=True)):
         found = metres(depth, view.depth_scale, f"depth_images.{row}.depth")
@@ -128,10 +124,10 @@ def fuse_depth_images(
         clouds.append(unproject(found, view.intrinsics, pose))
         cameras.append(tuple(pose[:3, 3].tolist()))
     if len(views) == 1:
-        return CloudInput(clouds[0], warnings=tuple(doubts)), cameras
+        return CloudInput(clouds[0], viewpoint=cameras[0], warnings=tuple(doubts))
     together = np.concatenate([cloud.reshape(1, -1, 3) for cloud in clouds], axis=1)
     view_ids = np.repeat(np.arange(len(clouds)), [cloud.size // 3 for cloud in clouds])
-    return CloudInput(together, view_ids=view_ids, warnings=tuple(doubts)), cameras
+    return CloudInput(together, view_ids=view_ids, viewpoint=tuple(cameras), warnings=tuple(doubts))
 
 
 def _doubts(camera: Intrinsics, shape: tuple[int, ...], field: str) -> Iterator[str]:

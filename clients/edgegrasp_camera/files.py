@@ -83,7 +83,7 @@ def sent_cloud(file: Path | None, images: Sequence[Any] | None) -> CloudInput:
         for image in images or ()
     ]
     depths = [pixels(Path(str(image["depth"]))) for image in images or ()]
-    return fuse_depth_images(depths, views)[0]
+    return fuse_depth_images(depths, views)
 
 
 @contextmanager
@@ -160,7 +160,7 @@ def _read_npz(data: bytes, max_points: int) -> CloudInput:
         except ValueError as error:
             value = f"{arrays['intrinsics'].size} numbers that {error}"
             raise InvalidRequest("cloud.intrinsics", value, FIXES["npz"]) from None
-        cloud, _ = fuse_depth_images([arrays["depth"]], [view])
+        cloud = fuse_depth_images([arrays["depth"]], [view])
     else:
         cloud = CloudInput(**arrays)
     if rgb is not None and cloud.colors is None and rgb.shape == np.asarray(cloud.points).shape:

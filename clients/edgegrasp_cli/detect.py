@@ -303,9 +303,8 @@ def _print_detection(detection: Any) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(
-        "#", "score", "TCP x y z (m)", "approach direction", "width (m)", "clearance (m)", "free"
-    )
+    names = "#", "score", "TCP x y z (m)", "approach x y z", "width (m)", "clearance (m)", "free"
+    table = Table(*names, box=None, pad_edge=False, collapse_padding=True)  # in 80 columns
     for rank, grasp in enumerate(detection.grasps, start=1):
         table.add_row(
             str(rank),

@@ -28,8 +28,8 @@ COMMANDS = {
     "replay": ("replay", "service,sim", "Make a recorded attempt or request again."),
     "generate-data": ("train", "train", "Make labelled edge grasps in simulation."),
     "train": ("train", "train", "Train weights on generated data."),
-    "generate-scenes": ("train", "train", "Make depth images to train the scene network."),
-    "train-scene": ("train", "train", "Train the network that recognises objects."),
+    "generate-scenes": ("train", "open3d,train", "Make depth images to train the scene network."),
+    "train-scene": ("train", "open3d,train", "Train the network that recognises objects."),
     "import-checkpoint": ("train", "model", "Convert the authors' checkpoints to safetensors."),
 }
 
@@ -81,7 +81,8 @@ def _ending_with_a_sentence(name: str, function: Callable[..., None]) -> Callabl
 
 def _missing(name: str, error: ModuleNotFoundError) -> str:
     _, extra, _ = COMMANDS[name]
-    return f"edgegrasp {name}: {error}. pip install 'edgegrasp[{extra}]'"
+    said = f"edgegrasp {name}: {error}"
+    return said if "pip install" in said else f"{said}. pip install 'edgegrasp[{extra}]'"
 
 
 def _print_version(asked: bool) -> None:

@@ -323,7 +323,7 @@ def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32]:
         depth = arrays.get("depth", "u", "(H, W) uint16 millimetres")
         values = arrays.get("intrinsics", "f", "fx, fy, cx, cy beside depth", (4,)).tolist()
         view = DepthView(intrinsics_of(values))
-        cloud, _ = fuse_depth_images([depth], [view])
+        cloud = fuse_depth_images([depth], [view])
         return {"depth_images": [{"depth": depth, "intrinsics": values}]}, np.asarray(
             cloud.points, dtype=np.float32
         )

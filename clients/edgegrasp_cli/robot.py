@@ -1,5 +1,6 @@
 """The command `robot`: make a robot file from a URDF, and check one."""
 
+import importlib
 import json
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,6 +27,7 @@ def add(
 
     edgegrasp robot add my.urdf --base base_link --flange tool0 --output my.toml
     """
+    importlib.import_module("edgegrasp_robot")  # fails before there is a file
     if output.suffix != ".toml" or output.exists():
         raise ValueError(f"--output: got {str(output)!r}. Name a new file, .toml.")
     fields: dict[str, Any] = {

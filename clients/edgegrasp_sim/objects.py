@@ -175,13 +175,13 @@ def prepare_mesh(mesh: Path) -> Path:
 
     The box around it gets a shortest side of `SHORTEST_SIDE`, and no side over `LONGEST_SIDE`; z
     points up in packed scenes. The camera sees the mesh itself; contacts use its convex parts.
-    ValueError: it is no solid mesh; RuntimeError: coacd or trimesh is not installed.
+    ValueError: it is no solid mesh; ModuleNotFoundError: coacd or trimesh is not installed.
     """
     try:
         import coacd  # noqa: F401
         import trimesh  # noqa: F401
     except ModuleNotFoundError as error:
-        raise RuntimeError(
+        raise ModuleNotFoundError(
             f"{error.name} is not installed, and meshes need it: pip install 'edgegrasp[meshes]'"
         ) from None
 

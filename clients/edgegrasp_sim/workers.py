@@ -109,7 +109,8 @@ def _on_ray(
     try:
         ray: Any = importlib.import_module("ray")
     except ModuleNotFoundError:
-        raise RuntimeError("ray is not installed: pip install 'edgegrasp[ray]'") from None
+        message = "ray is not installed: pip install 'edgegrasp[ray]'"
+        raise ModuleNotFoundError(message) from None
     if not tasks:
         return
     own: dict[str, Any] = {}

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, SkipValidation, Str
 
 from edgegrasp_camera.arrays import Array
 from edgegrasp_camera.clouds import CloudInput, read_point_cloud2, too_many
-from edgegrasp_camera.depth import ENCODINGS, Position, fuse_depth_images, intrinsics_of
+from edgegrasp_camera.depth import ENCODINGS, fuse_depth_images, intrinsics_of
 from edgegrasp_camera.files import read_file, read_npy, read_png
 from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import (
@@ -70,9 +70,7 @@ def decode_cloud(
         if fields.get("view_ids") is not None:
             fix = "Leave it out: it follows from depth_images."
             raise InvalidRequest("view_ids", "an array beside depth_images", fix)
-        cloud, cameras = read_depth_images(fields[source], max_points)
-        viewpoint = cameras[0] if len(cameras) == 1 else tuple(cameras)
-        options = options.model_copy(update={"viewpoint": viewpoint})
+        cloud = read_depth_images(fields[source], max_points)
     elif source == "point_cloud2":
         layout: Any = parse(PointCloud2, fields[source], "point_cloud2")
         cloud = read_point_cloud2(layout, max_points)
@@ -81,6 +79,8 @@ def decode_cloud(
         cloud = read_file(file.format, file.data, max_points)
     else:
         cloud = CloudInput(decode_points(fields[source], max_points))
+    if options.viewpoint is None and cloud.viewpoint is not None:
+        options = options.model_copy(update={"viewpoint": cloud.viewpoint})
     arrays: dict[str, Any] = {}
     for name in PER_POINT:
         if fields.get(name) is None:
@@ -247,7 +247,7 @@ CAMERA = tuple(DepthImage.model_fields)  # what a form may have as parts, of one
 # Depth images
 
 
-def read_depth_images(images: object, max_points: int) -> tuple[CloudInput, list[Position]]:
+def read_depth_images(images: object, max_points: int) -> CloudInput:
     """Read DepthImages, plain values whose `depth` may also be a File, and fuse them."""
     if not isinstance(images, list) or not 1 <= len(images) <= MAX_VIEWS:
         count = f"{len(images)} images" if isinstance(images, list) else brief(images)

@@ -1,6 +1,7 @@
 """`edgegrasp detect` and `edgegrasp models`."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,7 @@ def test_flags_win_over_the_options_file(file, dummy_server, run, refused, tmp_p
 
 def test_a_table_shows_counts_and_warnings(file: str, dummy_server, run) -> None:
     output = run("detect", file, "--server", dummy_server.http_url, "--top-k", "3")
+    assert len(re.findall(r"^\d +0\.\d{3}.* (?:yes|no) *$", output, re.MULTILINE)) == 3
     assert "500 points" in output
     assert "Warning: The dummy detector made these grasps up." in output
 

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -86,6 +87,7 @@ def test_unknown_command() -> None:
         ("edgegrasp_sim.report", ["replay", "attempt", "FOLDER"], "service,sim"),
         ("edgegrasp_cli.serve", ["serve"], "service"),
         ("matplotlib", ["detect", "absent.ply", "--picture", "grasps.png"], "service,view"),
+        ("open3d", ["train-scene", "FOLDER", "--run", "FOLDER"], "open3d,train"),
     ],
 )
 def test_a_missing_package_names_the_extra(missing, words, extra, refused, monkeypatch) -> None:
@@ -93,10 +95,33 @@ def test_a_missing_package_names_the_extra(missing, words, extra, refused, monke
     assert f"pip install 'edgegrasp[{extra}]'" in refused(*words)
 
 
+@pytest.mark.parametrize("command", ["generate-data", "benchmark-tracking"])
+def test_a_missing_engine_is_named(command: str, refused, monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    folder = [tmp_path] if command == "generate-data" else []
+    assert f"edgegrasp {command}: " in (said := refused(command, *folder))
+    assert "is installed: pip install 'edgegrasp[sim]'" in said or "pip install mujoco" in said
+
+
 def test_the_command_line_is_an_extra() -> None:
     program = "import sys; sys.modules['typer'] = None; import edgegrasp_cli.main"
     said = run_program(sys.executable, "-c", program, code=1).stderr
     assert "pip install 'edgegrasp[cli]'" in said
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("serve", "--http-port", 0, "--grpc-port", 0, "--robots", "fr3"), ("robot", "check", "fr3")],
+)
+def test_arms_are_an_extra(words: tuple[object, ...], tmp_path: Path) -> None:
+    absent = "raise ModuleNotFoundError('no arms', name='roboplan')"
+    (tmp_path / "roboplan.py").write_text(absent)
+    paths = os.pathsep.join([str(tmp_path), *sys.path])
+    ended = run_program(*EDGEGRASP, *words, code=1, env=os.environ | {"PYTHONPATH": paths})
+    assert f"edgegrasp {words[0]}: roboplan is not installed" in ended.stderr
+    assert "pip install 'edgegrasp[robot]'\n" in ended.stderr
+    assert "Traceback" not in ended.stderr
 
 
 @pytest.mark.parametrize("transport", ["http", "grpc"])

@@ -49,8 +49,8 @@ def test_several_depth_images_show_each_object_once() -> None:
     poses = [camera(0.7, turn, 0.9) for turn in (0.0, 2.1, 4.2)]
     intrinsics = Intrinsics(FOCAL_LENGTH, FOCAL_LENGTH, WIDTH / 2, HEIGHT / 2)
     depths = [render(boxes, pose)[..., 2] for pose in poses]
-    cloud, cameras = fuse_depth_images(depths, [DepthView(intrinsics, pose) for pose in poses])
-    found = detector().detect(cloud, DetectOptions.model_validate({"viewpoint": cameras}))
+    cloud = fuse_depth_images(depths, [DepthView(intrinsics, pose) for pose in poses])
+    found = detector().detect(cloud, DetectOptions.model_validate({"viewpoint": cloud.viewpoint}))
     assert len(found.objects) == 4
     assert found.grasps
 

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.cloud_files import point_cloud2
+from tests.cloud_files import npz, point_cloud2
 
 from edgegrasp_camera.clouds import CloudInput, read_point_cloud2
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.request_cloud import (
+    File,
     PointCloud2,
     decode_array,
     decode_cloud,
@@ -52,7 +53,7 @@ def image(depth: np.ndarray, T_cloud_camera: np.ndarray, encoding: str = "64FC1"
 
 def test_points_project_back_onto_their_pixels() -> None:
     depth, T_cloud_camera = depth_of(), pose(1)
-    cloud, cameras = read_depth_images([image(depth, T_cloud_camera)], MANY)
+    cloud = read_depth_images([image(depth, T_cloud_camera)], MANY)
     assert cloud.points.shape == (24, 32, 3)
     homogeneous = np.concatenate([cloud.points, np.ones((24, 32, 1))], axis=-1)
     x, y, z = np.moveaxis((homogeneous @ np.linalg.inv(T_cloud_camera).T)[..., :3], -1, 0)
@@ -60,25 +61,28 @@ def test_points_project_back_onto_their_pixels() -> None:
     row, column = np.indices(depth.shape)
     np.testing.assert_allclose(FX * x / z + CX, column, atol=1e-4)
     np.testing.assert_allclose(FY * y / z + CY, row, atol=1e-4)
-    np.testing.assert_array_equal(cameras, [T_cloud_camera[:3, 3]])
+    np.testing.assert_array_equal(cloud.viewpoint, T_cloud_camera[:3, 3])
     sent = {"depth_images": [image(depth, T_cloud_camera)]}
     _, options = decode_cloud(sent, DetectOptions(), MANY)
     assert options.viewpoint == tuple(T_cloud_camera[:3, 3].tolist())
+    archive = File("npz", npz(depth=depth, intrinsics=np.array([FX, FY, CX, CY])))
+    _, options = decode_cloud({"cloud": archive}, DetectOptions(), MANY)
+    assert options.viewpoint == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("encoding", ["32FC1", "64FC1", "16UC1"])
 def test_encodings_give_the_same_depths(encoding: str) -> None:
     millimetres = np.round(depth_of() * 1000)
-    expected, _ = read_depth_images([image(millimetres / 1000, pose(2))], MANY)
+    expected = read_depth_images([image(millimetres / 1000, pose(2))], MANY)
     sent = image(millimetres if encoding == "16UC1" else millimetres / 1000, pose(2), encoding)
-    packed, _ = read_depth_images([sent], MANY)
+    packed = read_depth_images([sent], MANY)
     np.testing.assert_allclose(packed.points, expected.points, atol=1e-6)
     sent["depth"]["data"] = base64.b64encode(sent["depth"]["data"]).decode()
-    in_json, _ = read_depth_images([sent], MANY)
+    in_json = read_depth_images([sent], MANY)
     np.testing.assert_array_equal(in_json.points, packed.points)
     rows = (millimetres / 1000).tolist()
     rows[1][2] = None
-    listed, _ = read_depth_images([sent | {"depth": rows}], MANY)
+    listed = read_depth_images([sent | {"depth": rows}], MANY)
     assert np.isnan(listed.points[1, 2]).all()
     np.testing.assert_allclose(listed.points[2:], expected.points[2:], atol=1e-6)
     with pytest.raises(PayloadTooLarge) as caught:
@@ -107,10 +111,10 @@ def test_intrinsics_that_do_not_fit_the_image_are_refused(intrinsics, field, val
 
 def test_doubtful_intrinsics_get_a_warning() -> None:
     good, doubtful = image(depth_of(), pose(0)), image(depth_of(), pose(1))
-    assert read_depth_images([good], MANY)[0].warnings == ()
+    assert read_depth_images([good], MANY).warnings == ()
     doubtful["intrinsics"] |= {"cx": 8.0}
     for images in ([doubtful], [good, doubtful]):
-        (warning,) = read_depth_images(images, MANY)[0].warnings
+        (warning,) = read_depth_images(images, MANY).warnings
         assert f"depth_images.{len(images) - 1}.intrinsics: cx 8 lies far from the" in warning
 
 
@@ -126,7 +130,7 @@ def test_views_are_fused() -> None:
     checked = check_cloud(cloud)
     np.testing.assert_array_equal(checked.segment_ids, np.arange(1, 3 * 24 * 32))
     for view, single in enumerate(images):
-        alone, _ = read_depth_images([single], MANY)
+        alone = read_depth_images([single], MANY)
         seen = checked.points[checked.view_ids == view]
         np.testing.assert_array_equal(seen, check_cloud(alone).points)
 

@@ -13,7 +13,7 @@ def engine(request: pytest.FixtureRequest) -> str:
     """Each engine that is installed."""
     try:
         return choose_engine(request.param)
-    except RuntimeError as error:
+    except ModuleNotFoundError as error:
         pytest.skip(str(error))
 
 

@@ -112,7 +112,7 @@ def test_a_missing_ray_or_cluster_is_named(alone, monkeypatch) -> None:
     with pytest.raises(ValueError, match="differ between the machines"):
         RoundRunner(config, make_planner, "another digest")
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(RuntimeError, match=r"ray is not .*edgegrasp\[ray\]"):
+    with pytest.raises(ModuleNotFoundError, match=r"ray is not .*edgegrasp\[ray\]"):
         run_benchmark(config, make_planner, ray="local")
 
     class Ray:

@@ -123,5 +123,5 @@ def test_two_meshes_of_one_name_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("package", ["coacd", "trimesh"])
 def test_a_missing_package_is_named(meshes, cache, package, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(RuntimeError, match=rf"{package} is not .*edgegrasp\[meshes\]"):
+    with pytest.raises(ModuleNotFoundError, match=rf"{package} is not .*edgegrasp\[meshes\]"):
         ObjectSet.from_folder(meshes, SceneKind.PILE)

@@ -29,17 +29,17 @@ def choose_engine(asked: str | None = None, protocol: str = "") -> str:
 
     Raises:
         ValueError: There is no engine of that name.
-        RuntimeError: It is not installed, or none is.
+        ModuleNotFoundError: It is not installed, or none is.
     """
     for name in filter(None, (asked, protocol)):
         if name not in ENGINES:
             raise ValueError(f"engine is {name!r}; choose one of {', '.join(ENGINES)}")
     if asked and not installed(asked):
-        raise RuntimeError(f"engine {asked} is not installed: pip install {asked}")
+        raise ModuleNotFoundError(f"engine {asked} is not installed: pip install {asked}")
     for name in filter(None, (asked, protocol, *ENGINES)):
         if installed(name):
             return name
-    raise RuntimeError("no physics engine is installed: pip install 'edgegrasp[sim]'")
+    raise ModuleNotFoundError("no physics engine is installed: pip install 'edgegrasp[sim]'")
 
 
 def installed(engine: str) -> bool:

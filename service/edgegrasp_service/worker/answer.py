@@ -133,12 +133,12 @@ class Work:
         """Detect, and plan an arm's motions where the request names a robot."""
         asked, robot = options, None
         if asked.robot is not None:
-            from edgegrasp_robot import plan_picks, with_robot
-
             robots, name = load_robots(self.settings), asked.robot.name
             if name not in robots:
                 fix = f"Use one of: {', '.join(robots)}." if robots else "Set the setting `robots`."
                 raise InvalidRequest("options.robot.name", repr(name), fix)
+            from edgegrasp_robot import plan_picks, with_robot
+
             robot = robots[name]
             options = with_robot(options, robot)
         with self._stage("prepare"):

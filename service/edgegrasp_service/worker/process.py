@@ -144,7 +144,7 @@ def main(settings_json: str, load: Callable[[Settings], Any] | None = None) -> N
     try:
         # A GPU's context cannot be forked: with one, every worker loads the weights for itself.
         catalogue = loading() if settings.device == "cpu" else None
-    except EdgeGraspError as error:
+    except (EdgeGraspError, ModuleNotFoundError) as error:
         _send(pool, Ready(os.getpid(), [], str(error)))
         return
     _send(pool, Ready(os.getpid(), []))
@@ -180,7 +180,7 @@ def _work(
 
     try:
         catalogue = catalogue or loading()
-    except EdgeGraspError as error:
+    except (EdgeGraspError, ModuleNotFoundError) as error:
         _send(pool, Ready(os.getpid(), [], str(error)))
         return
     robots = [robot.describe() for robot in load_robots(settings).values()]
