@@ -18,7 +18,6 @@ from concurrent.futures import Future
 from functools import partial, wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-import httpx
 from typing_extensions import Self, Unpack
 
 from edgegrasp_camera.arrays import Array
@@ -56,7 +55,6 @@ class AsyncGraspClient:
         token: For a server that requires one; send it over TLS only.
         tls: How to verify the server; None: gRPC is not encrypted, and "https://..." trusts the
             authorities that httpx trusts.
-        http_transport: httpx transport to use instead of the network.
     """
 
     def __init__(
@@ -67,13 +65,12 @@ class AsyncGraspClient:
         retry: bool = True,
         token: str | None = None,
         tls: Tls | None = None,
-        http_transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self._timeout = timeout
         self._retry = retry
         self._transport: GrpcTransport | RestTransport
         if is_rest(address):
-            self._transport = RestTransport(address, token, tls, http_transport)
+            self._transport = RestTransport(address, token, tls)
         else:
             self._transport = GrpcTransport(address, token, tls)
 
@@ -248,7 +245,6 @@ class GraspClient:
         retry: bool = True,
         token: str | None = None,
         tls: Tls | None = None,
-        http_transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         if not is_rest(address):
             _ASKED_OVER_GRPC.add(os.getpid())
@@ -257,14 +253,7 @@ class GraspClient:
                 raise invalid("address", "gRPC in a fork of a process that has used it", fix)
 
         async def make() -> AsyncGraspClient:
-            return AsyncGraspClient(
-                address,
-                timeout=timeout,
-                retry=retry,
-                token=token,
-                tls=tls,
-                http_transport=http_transport,
-            )
+            return AsyncGraspClient(address, timeout=timeout, retry=retry, token=token, tls=tls)
 
         self._client = _run(make())
 

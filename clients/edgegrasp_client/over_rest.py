@@ -46,13 +46,8 @@ Answer = TypeVar("Answer")
 class RestTransport:
     """Posts over connections that are kept open; raises GraspClientErrors."""
 
-    def __init__(
-        self,
-        address: str,
-        token: str | None,
-        tls: Tls | None,
-        transport: httpx.AsyncBaseTransport | None,
-    ) -> None:
+    def __init__(self, address: str, token: str | None, tls: Tls | None) -> None:
+        transport = None
         if address.startswith(HTTP_OVER_UNIX):
             transport = httpx.AsyncHTTPTransport(uds=address.removeprefix(HTTP_OVER_UNIX))
             address = "http://localhost"
