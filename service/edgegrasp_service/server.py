@@ -28,7 +28,7 @@ from edgegrasp_service.front.connections import (
 )
 from edgegrasp_service.front.grpc import GrpcServer
 from edgegrasp_service.front.http import HttpMiddleware, create_router
-from edgegrasp_service.front.service import GraspService, Observer, Reloader
+from edgegrasp_service.front.service import GraspService, Observer
 from edgegrasp_service.observability import LogQueue, Metrics, log_call, start_logging, write_line
 from edgegrasp_service.recording import Recorder, check_outcomes
 from edgegrasp_service.security import ServerTls, load_tokens
@@ -64,19 +64,15 @@ class Server:
         self.metrics = Metrics(lambda: self.pool.models)
         self.pool = WorkerPool(settings, nursery, self.metrics.workers_replaced.inc, launched)
         self._recorder: Recorder | None = None
-        self.service = GraspService(
-            settings,
-            self.pool,
-            load_tokens(settings),
-            (self.metrics.count_call, log_call, *observers),
-        )
+        observers = (self.metrics.count_call, log_call, *observers)
+        reloaded = self.metrics.reloaded
+        self.service = GraspService(settings, self.pool, self._tls, observers, reloaded)
         if settings.record_folder is not None:
             hold = self.service.admission.hold
             self._recorder = Recorder(settings.record_folder, settings.record_bytes, hold)
             self.service.record = self._recorder.record
         if settings.outcomes_file is not None:
             check_outcomes(settings.outcomes_file)
-        self.reloader = Reloader(self.service, self._tls, self.metrics.reloaded)
         service, admission, pool = self.service, self.service.admission, self.pool
         watch = self.metrics.watch
         watch("ready", "1: requests are answered", lambda: service.ready)
@@ -108,7 +104,7 @@ class Server:
         with _listen(settings.host, settings.http_port) as http_socket:
             credentials = None if self._tls is None else self._tls.grpc
             http_connections = Places(settings.max_connections, spare=HEALTH_PLACES)
-            grpc_server = GrpcServer(self.service, self.reloader, credentials)
+            grpc_server = GrpcServer(self.service, credentials)
             http_server = self._http_server(http_connections)
             scheme = "http" if self._tls is None else "https"
             self.http_url = _url(scheme, http_socket)
@@ -150,7 +146,7 @@ class Server:
 
     def _http_server(self, places: Places) -> "_HttpServer":
         tls = self._tls
-        router = create_router(self.service, self.metrics, self.reloader)
+        router = create_router(self.service, self.metrics)
         config = uvicorn.Config(
             HttpMiddleware(router, self.service),
             log_config=None,
@@ -228,7 +224,7 @@ async def _serve_until_signalled(
         if terminal and not _at_a_terminal():  # stdout was closed
             stop.set()
         else:
-            server.reloader.reload_soon()
+            server.service.reload_soon()
 
     loop.add_signal_handler(signal.SIGHUP, hang_up)
 

@@ -98,7 +98,7 @@ async def test_certificates_are_read_anew(serve, pem, transport, cloud, tmp_path
     async with AsyncGraspClient(address, tls=tls("", "")) as before:
         assert await before.models()
         put("other_")
-        await running.server.reloader.reload()
+        await running.server.service.reload()
         async with AsyncGraspClient(address, tls=tls("other_", "other_")) as after:
             assert len((await after.detect(cloud)).grasps) == 10
         assert len((await before.detect(cloud)).grasps) == 10
@@ -106,7 +106,7 @@ async def test_certificates_are_read_anew(serve, pem, transport, cloud, tmp_path
         assert isinstance(await refused(address, tls=stranger), ServerUnavailableError)
     files["server_key"].write_text("half a k")
     with pytest.raises(ReloadFailed, match="cannot be read as a certificate with its key"):
-        await running.server.reloader.reload()
+        await running.server.service.reload()
     async with AsyncGraspClient(address, tls=tls("other_", "other_")) as still:
         assert await still.models()
 

@@ -54,7 +54,7 @@ from edgegrasp_service.front.connections import (
     receive,
     send,
 )
-from edgegrasp_service.front.service import GraspService, Reloader
+from edgegrasp_service.front.service import GraspService
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call
 from edgegrasp_service.settings import UNIX
 from edgegrasp_service.worker.process import Job, Method
@@ -88,16 +88,11 @@ class GrpcServer:
         AddressInUse: The port cannot be bound.
     """
 
-    def __init__(
-        self,
-        service: GraspService,
-        reloader: Reloader,
-        credentials: grpc.ServerCredentials | None,
-    ) -> None:
+    def __init__(self, service: GraspService, credentials: grpc.ServerCredentials | None) -> None:
         settings = service.settings
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
         self._server = aio.server(options=grpc_bounds(settings))
-        methods = _Methods(service, reloader, self._health)
+        methods = _Methods(service, self._health)
         self._server.add_generic_rpc_handlers((methods,))
         # It has a queue of its own: no other calls come before it.
         checking = grpc.stream_stream_rpc_method_handler(
@@ -138,9 +133,8 @@ class GrpcServer:
 class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in its stubs only
     """The methods of GraspService, health checks and reflection, each named, counted and logged."""
 
-    def __init__(self, service: GraspService, reloader: Reloader, checks: Any) -> None:
+    def __init__(self, service: GraspService, checks: Any) -> None:
         self._service = service
-        self._reloader = reloader
         self._checks = checks
         names = (SERVICE.full_name, HEALTH, *REFLECTION)
         self._reflection = reflection.aio.ReflectionServicer(names)  # type: ignore[attr-defined]
@@ -289,7 +283,7 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
         await context.write(grasp_pb2.ListRobotsResponse(robots=robots))
 
     async def _reload_models(self, call: Call, context: Any) -> None:
-        models = [grasp_pb2.Model(**facts) for facts in await self._reloader.reload(call)]
+        models = [grasp_pb2.Model(**facts) for facts in await self._service.reload(call)]
         await context.write(grasp_pb2.ReloadModelsResponse(models=models))
 
     async def _check_health(self, call: Call, context: Any) -> None:

@@ -41,7 +41,7 @@ from edgegrasp_service.front.connections import (
     PAGES,
     Places,
 )
-from edgegrasp_service.front.service import GraspService, Reloader
+from edgegrasp_service.front.service import GraspService
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics
 from edgegrasp_service.worker.process import PIECE, Job, Method
 
@@ -184,7 +184,7 @@ class HttpMiddleware:
         raise InvalidRequest("Host", brief(host), fix)
 
 
-def create_router(service: GraspService, metrics: Metrics, reloader: Reloader) -> Router:
+def create_router(service: GraspService, metrics: Metrics) -> Router:
     """The routes. Starlette alone: the document is written by hand, and bodies are for workers."""
     settings = service.settings
 
@@ -195,7 +195,7 @@ def create_router(service: GraspService, metrics: Metrics, reloader: Reloader) -
         return JSONResponse({"robots": service.loaded().robots})
 
     async def reload(request: Request) -> Response:
-        return JSONResponse({"models": await reloader.reload(request.scope["call"])})
+        return JSONResponse({"models": await service.reload(request.scope["call"])})
 
     async def ready(request: Request) -> Response:
         status = "ready" if service.ready else "not ready"

@@ -24,7 +24,7 @@ from edgegrasp_service.errors import (
 )
 from edgegrasp_service.front.admission import Admission, Ticket
 from edgegrasp_service.observability import CALL, Call
-from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens, load_tokens
+from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, load_tokens
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.pool import CRASH_FIX, CRASHED, WORKER_LOST, WorkerPool
 from edgegrasp_service.worker.process import Answer, Job
@@ -46,18 +46,23 @@ class GraspService:
         self,
         settings: Settings,
         pool: WorkerPool,
-        tokens: Tokens,
-        observers: Sequence[Observer] = (),
+        tls: ServerTls | None,
+        observers: Sequence[Observer],
+        reloaded: Callable[[bool], None],  # told of every reload whether it succeeded
     ) -> None:
         self.settings = settings
         self.pool = pool
-        self.tokens = tokens  # replaced on reload
+        self.tokens = load_tokens(settings)  # replaced on reload
         self.stopping = asyncio.Event()  # when set, new requests are refused
         self.in_flight = 0  # number of calls in progress
         self.admission = Admission(pool.size, settings.max_queue_length, settings.max_held_bytes)
         self._observers = observers
         self.record: Recorder | None = None  # called with each job and its answer
         self._harmful = HarmfulRequests()
+        self._tls = tls
+        self._reloaded = reloaded
+        self._reloading = asyncio.Lock()
+        self._tasks: set[asyncio.Task[Any]] = set()
 
     @property
     def ready(self) -> bool:
@@ -170,6 +175,52 @@ class GraspService:
                 async with asyncio.timeout(1.0):  # time for the errors to be sent
                     await self.admission.empty()
 
+    def reload_soon(self) -> None:
+        """Start a reload in the running event loop; the log has its outcome."""
+        task = asyncio.get_running_loop().create_task(self.reload())
+        self._tasks.add(task)
+        task.add_done_callback(self._reloaded_soon)
+
+    def _reloaded_soon(self, task: asyncio.Task[Any]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()):
+            logger.warning("SIGHUP: %s", error)
+
+    async def reload(self, call: Call | None = None) -> list[dict[str, Any]]:
+        """Reload weights, tokens and certificates; the old ones stay in use meanwhile.
+
+        Returns what is loaded now.
+
+        Raises:
+            PermissionDenied: The caller has no admin token.
+            NotReady: The first weights are still loading, or the server is stopping.
+            ReloadFailed: Something cannot be used, and nothing was changed; or a reload is under
+                way.
+        """
+        if call is not None and not call.is_admin:  # however its path is spelled
+            raise PermissionDenied(HEADER, "a call for administrators", ADMIN_FIX)
+        self.loaded()
+        if self._reloading.locked():
+            raise ReloadFailed("A reload is under way already. Try again later.")
+        async with self._reloading:
+            try:
+                tokens = load_tokens(self.settings)
+                certificates = self._tls and self._tls.read()
+                await self.pool.start()
+            except Exception as error:
+                self._reloaded(False)
+                known = isinstance(error, EdgeGraspError)
+                logger.error("reload failed: %s", error, exc_info=not known)
+                why = error if known else "The log says why."
+                raise ReloadFailed(f"The old weights still serve. {why}") from None
+            self.tokens = tokens
+            if self._tls and certificates:
+                self._tls.use(certificates)
+            self._reloaded(True)
+            digests = {model["name"]: model["digest"] for model in self.pool.models}
+            logger.info("reloaded", extra={"fields": {"digests": digests}})
+            return self.pool.models
+
     def check_size(self, size: int) -> None:
         """Raise PayloadTooLarge for a body over the limit."""
         most = self.settings.max_body_bytes
@@ -212,63 +263,3 @@ def _digest(job: Job) -> bytes:
     for part in job.parts:
         digest.update(part)
     return digest.digest()
-
-
-class Reloader:
-    """Reloads weights, tokens and certificates; the old ones stay in use meanwhile."""
-
-    def __init__(
-        self, service: GraspService, tls: ServerTls | None, reloaded: Callable[[bool], None]
-    ) -> None:
-        self._service = service
-        self._tls = tls
-        self._reloaded = reloaded
-        self._lock = asyncio.Lock()
-        self._tasks: set[asyncio.Task[Any]] = set()
-
-    def reload_soon(self) -> None:
-        """Start a reload in the running event loop; the log has its outcome."""
-        task = asyncio.get_running_loop().create_task(self.reload())
-        self._tasks.add(task)
-        task.add_done_callback(self._reloaded_soon)
-
-    def _reloaded_soon(self, task: asyncio.Task[Any]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()):
-            logger.warning("SIGHUP: %s", error)
-
-    async def reload(self, call: Call | None = None) -> list[dict[str, Any]]:
-        """Reload everything.
-
-        Returns what is loaded now.
-
-        Raises:
-            PermissionDenied: The caller has no admin token.
-            NotReady: The first weights are still loading, or the server is stopping.
-            ReloadFailed: Something cannot be used, and nothing was changed; or a reload is under
-                way.
-        """
-        if call is not None and not call.is_admin:  # however its path is spelled
-            raise PermissionDenied(HEADER, "a call for administrators", ADMIN_FIX)
-        service = self._service
-        service.loaded()
-        if self._lock.locked():
-            raise ReloadFailed("A reload is under way already. Try again later.")
-        async with self._lock:
-            try:
-                tokens = load_tokens(service.settings)
-                certificates = None if self._tls is None else self._tls.read()
-                await service.pool.start()
-            except Exception as error:
-                self._reloaded(False)
-                known = isinstance(error, EdgeGraspError)
-                logger.error("reload failed: %s", error, exc_info=not known)
-                why = error if known else "The log says why."
-                raise ReloadFailed(f"The old weights still serve. {why}") from None
-            service.tokens = tokens
-            if self._tls is not None and certificates is not None:
-                self._tls.use(certificates)
-            self._reloaded(True)
-            digests = {model["name"]: model["digest"] for model in service.pool.models}
-            logger.info("reloaded", extra={"fields": {"digests": digests}})
-            return service.pool.models
