@@ -19,7 +19,7 @@ from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import Protocol as BenchmarkProtocol
 from edgegrasp_sim.simulation import ClutterSimulation
 
-MIN_SEEN = 100  # points above the table; a round ends where a view shows fewer
+MIN_SEEN = 100  # points above the table; with fewer the planner is not asked
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,6 @@ class RoundEnd(StrEnum):
     CLEARED = "cleared"
     FAILURES = "consecutive failures"
     NO_GRASP = "no grasp found"
-    NOTHING_SEEN = "too few points seen"
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,14 +134,13 @@ class RoundDriver:
     def run(self, planner: Planner) -> Round:
         """Run the round to its end."""
         while self.end is None:
-            observation = self.look()
-            grasp = self.plan(planner, observation) if self.end is None else None
+            grasp = self.plan(planner, self.look())
             if grasp is not None:
                 self.execute(grasp)
         return self.result()
 
     def look(self) -> Observation:
-        """Take the next view; the round ends if it shows almost nothing."""
+        """Take the next view."""
         rules = self.protocol
         self._seen = self.simulation.observe_from(
             rules.camera.view_range().sample(self._camera, rules.camera.views),
@@ -153,18 +151,14 @@ class RoundDriver:
             table=rules.planning.table,
         )
         self.view += 1
-        inside = crop(self._seen.cloud, self._seen.workspace)
-        above = inside[:, 2] > self._seen.table_height + 0.005
-        if np.count_nonzero(above) < MIN_SEEN:
-            self.end = RoundEnd.NOTHING_SEEN
         return self._seen
 
     def plan(self, planner: Planner, observation: Observation) -> PlannedGrasp | None:
-        """Ask the planner; None if it finds no grasp."""
+        """Ask the planner; None if it finds no grasp, or the view shows almost nothing."""
         seed = int(self._policy.integers(2**31))
         started = time.perf_counter()
         try:
-            grasp = planner(observation, seed)
+            grasp = planner(observation, seed) if _shows_objects(observation) else None
         except StartCollides:
             grasp, started_in = None, self._round.start_collisions
             self._round = replace(self._round, start_collisions=started_in + 1)
@@ -210,6 +204,12 @@ class RoundDriver:
             self.end = RoundEnd.FAILURES
         elif self._round.no_grasp >= rules.max_no_grasp:
             self.end = RoundEnd.NO_GRASP
+
+
+def _shows_objects(seen: Observation) -> bool:
+    """Whether enough is seen above the table; something in front may hide all of it."""
+    above = crop(seen.cloud, seen.workspace)[:, 2] > seen.table_height + 0.005
+    return int(np.count_nonzero(above)) >= MIN_SEEN
 
 
 class Stream(IntEnum):

@@ -1,6 +1,7 @@
 """A round of clutter removal, and what a person sees of it."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +74,19 @@ def test_no_grasp_is_no_attempt_and_the_third_ends_a_round(run: Callable[..., Ro
     assert (done.attempts, done.no_grasp) == ((), 3)
     assert len(set(seeds)) == 3
     assert len(set(clouds)) == 3  # a new view every time
+
+
+def test_a_view_that_shows_nothing_is_one_without_a_grasp(cubes, paper_with, monkeypatch) -> None:
+    views: list[Observation] = []
+    observe_from = cubes.observe_from
+
+    def hidden_at_first(*args: object, **rules: object) -> Observation:
+        views.append(observe_from(*args, **rules))
+        return views[-1] if len(views) > 1 else replace(views[0], cloud=views[0].cloud[:0])
+
+    monkeypatch.setattr(cubes, "observe_from", hidden_at_first)
+    done = RoundDriver(cubes, PACKED, paper_with(3), seed=0, index=0).run(plan)
+    assert (done.end, done.no_grasp, done.successes) == (RoundEnd.CLEARED, 1, 3)
 
 
 def test_an_arm_that_cannot_start_in_a_view_takes_another_one(run: Callable[..., Round]) -> None:
