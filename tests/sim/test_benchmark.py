@@ -62,7 +62,7 @@ def test_the_manifest_holds_what_decides_the_figures(engine: str) -> None:
     facts = json.loads(json.dumps(manifest(config, {"name": "top-down"})))
     run = facts["run"]
     assert run["protocol"]["camera"]["polar_degrees"] == [45.0, 60.0]
-    assert run["protocol"]["version"] == 2
+    assert run["protocol"]["version"] == 3
     assert run["engine"] == engine
     assert run["constants"]["gravity"] == 9.81
     assert len(run["objects"]["digest"]) == 64

@@ -35,8 +35,8 @@ def test_a_file_gives_what_differs_from_its_base(tmp_path: Path) -> None:
         ("views = 1", "", "camera.views: Field required"),
         ("views = 1", "views = 1\nzoom = 2", "camera.zoom: Unexpected"),
         ('table = "known"', 'table = "guess"', "planning.table: .* 'known', 'seen', 'around'"),
-        ("version = 2", "version = ", "protocol .*toml"),
-        ("version = 2", 'version = 2\nbase = "nobody"', "base is 'nobody'; name one of bin"),
+        ("version = 3", "version = ", "protocol .*toml"),
+        ("version = 3", 'version = 3\nbase = "nobody"', "base is 'nobody'; name one of bin"),
     ],
 )
 def test_a_wrong_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
