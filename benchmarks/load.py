@@ -1,9 +1,9 @@
 """Measure servers under load: `python -m benchmarks.load` writes load.json.
 
-Clients, a thread each, send clouds or depth images, each its next request once it has an answer:
-latency and throughput by the number of clients. Without `--server` one is started, and measured
-over both transports. Several servers take turns, so that other work on the machine meets all alike:
-a new design beside the old one.
+Clients in processes of their own send clouds or depth images, each its next request once it has an
+answer: latency and throughput by the number of clients. Without `--server` one is started, and
+measured over both transports. Several servers take turns, so that other work on the machine meets
+all alike: a new design beside the old one.
 """
 
 import argparse
@@ -12,8 +12,9 @@ import statistics
 import time
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +30,9 @@ POINTS = 20_000
 SAMPLE = Path(edgegrasp_service.__file__).parent / "playground" / "samples" / "seven_depth.png"
 FOCAL = 540.0  # pixels, of the sample's camera
 OPTIONS: DetectOptions = {"num_approach_points": 32, "num_candidates": 500}
+PROCESSES = 2  # that the clients are shared among
 TIMEOUT = 120.0  # seconds until a request is given up
+START_SECONDS = 1.0  # from the order to the first request: clouds are made
 OK = "OK"
 
 
@@ -58,9 +61,11 @@ def main() -> None:
         if not servers:
             own = stack.enter_context(served())
             servers = {"grpc": own.grpc_address, "rest": own.http_url}
+        pool = stack.enter_context(ProcessPoolExecutor(PROCESSES, mp_context=get_context("spawn")))
+        list(pool.map(time.sleep, [START_SECONDS] * PROCESSES))  # until all processes have started
         runs: dict[tuple[int, str], list[list[Sample]]] = {}
         for _, clients, name in itertools.product(range(given.rounds), given.clients, servers):
-            samples = run_clients(servers[name], clients, given.seconds, given.points)
+            samples = send(pool, servers[name], clients, given.seconds, given.points)
             runs.setdefault((clients, name), []).append(samples)
     for (clients, name), found in runs.items():
         rates = [sum(one.code == OK for one in run) / given.seconds for run in found]
@@ -70,18 +75,33 @@ def main() -> None:
     write_results(given.output, "load", results)
 
 
-def run_clients(address: str, clients: int, seconds: float, points: int) -> list[Sample]:
-    """Send until the time is over; every request that was sent has its sample."""
-    request: dict[str, Any] = {"cloud": cloud(points, 0)}
+def send(
+    pool: ProcessPoolExecutor, address: str, clients: int, seconds: float, points: int
+) -> list[Sample]:
+    """Share the clients among the processes."""
+    processes = min(PROCESSES, clients)
+    start = time.monotonic() + START_SECONDS
+    shares = [
+        pool.submit(run_clients, address, clients // processes, start, seconds, points, seed)
+        for seed in range(processes)
+    ]
+    return [sample for share in shares for sample in share.result()]
+
+
+def run_clients(
+    address: str, clients: int, start: float, seconds: float, points: int, seed: int
+) -> list[Sample]:
+    """Send from `start` on until the time is over; every request that was sent has its sample."""
+    request: dict[str, Any] = {"cloud": cloud(points, seed)}
     if not points:
         depth = np.asarray(Image.open(SAMPLE))
         request = {"depth_images": [{"depth": depth, "intrinsics": (FOCAL, FOCAL, 320.0, 240.0)}]}
-    end = time.monotonic() + seconds
 
     def work(_: int) -> list[Sample]:
         samples = []
         with GraspClient(address, timeout=TIMEOUT, retry=False) as client:
-            while (begun := time.monotonic()) < end:
+            time.sleep(max(0.0, start - time.monotonic()))
+            while (begun := time.monotonic()) < start + seconds:
                 try:
                     code, detector = OK, client.detect(**request, **OPTIONS).seconds["total"]
                 except GraspClientError as error:
