@@ -149,7 +149,9 @@ class GraspService:
         finally:
             self.admission.took.append(time.monotonic() - began)
             ticket.at_work = False
-        if answer.error is not None and answer.error.kind == WORKER_LOST:
+        if answer.error is None:
+            await self._harmful.forget(job)
+        elif answer.error.kind == WORKER_LOST:
             await self._harmful.note(job, 1)
         call.facts, call.problem = answer.facts, answer.error
         call.stages |= answer.facts.seconds
@@ -247,6 +249,11 @@ class HarmfulRequests:
         self._deaths[digest] = now + HARMFUL_SECONDS, deaths + (before if now < until else 0)
         if len(self._deaths) > MOST_HARMFUL:
             del self._deaths[next(iter(self._deaths))]
+
+    async def forget(self, job: Job) -> None:
+        """Clear a request that was answered, so its worker had died for another reason."""
+        if self._deaths:
+            self._deaths.pop(await asyncio.to_thread(_digest, job), None)
 
 
 def _digest(job: Job) -> bytes:
