@@ -91,6 +91,9 @@ class DetectFlags(DetectorFlags):
 def detect(
     file: Cloud = None,
     as_document: Annotated[bool, Option("--json", help="Print JSON, as the HTTP API.")] = False,
+    options_file: Annotated[
+        Path | None, Option("--options", help="JSON file with options; flags beside it win.")
+    ] = None,
     *,
     asked: DetectFlags,
     options: dict[str, Any],
@@ -109,7 +112,7 @@ def detect(
     """
     from rich.console import Console
 
-    fields = parse_option_flags(options) | _robot_option(asked)
+    fields = _options(options_file, options) | _robot_option(asked)
     _check_outputs(asked, fields)
     images = _depth_images(file, asked)
     colors = None if asked.color is None else pixels(asked.color)[..., :3]
@@ -223,6 +226,17 @@ def _check_outputs(asked: DetectFlags, fields: Mapping[str, Any]) -> None:
     if not path.absolute().parent.is_dir():
         raise ValueError(f"--picture: there is no folder {path.parent}. Make it first.")
     importlib.import_module("matplotlib")  # fails before the work
+
+
+def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
+    """The options from the flags, and from the file where no flag is given."""
+    try:
+        fields = json.loads(file.read_text()) if file else {}
+        if not isinstance(fields, dict):
+            raise ValueError("a JSON object is needed")
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
+    return fields | parse_option_flags(given)
 
 
 def _robot_option(asked: DetectFlags) -> dict[str, Any]:

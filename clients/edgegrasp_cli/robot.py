@@ -20,6 +20,8 @@ def add(
     flange: Links,
     output: Annotated[Path, typer.Option(help="Robot file to write, .toml.")],
     gripper: GripperName = "panda",
+    srdf: Annotated[str, typer.Option(help="SRDF with links that may touch.")] = "",
+    packages: Annotated[list[str] | None, typer.Option(help="Folder that holds packages.")] = None,
 ) -> None:
     """Write a robot file for an arm's URDF, and check it.
 
@@ -30,8 +32,8 @@ def add(
         raise ValueError(f"--output: got {str(output)!r}. Name a new file, .toml.")
     fields: dict[str, Any] = {
         "urdf": str(urdf.absolute()),
-        "srdf": "",
-        "packages": [],
+        "srdf": str(Path(srdf).absolute()) if srdf else "",
+        "packages": [str(Path(folder).absolute()) for folder in packages or ()],
         "base_frame": base,
         "flange_frame": flange,
         "gripper": gripper,
@@ -44,7 +46,7 @@ def add(
         "quaternion = [0.0, 0.0, 0.0, 1.0]",
     ]
     output.write_text("\n".join([*lines, *pose, ""]))
-    print(f"{output}: now set T_flange_hand, and the other fields of docs/robots.md if need be.")
+    print(f"{output}: now set T_flange_hand, and home, max_velocity, max_acceleration if need be.")
     check(output)
 
 

@@ -24,6 +24,17 @@ def test_every_option_is_a_flag() -> None:
     assert [flag.name for flag in option_flags()] == list(DetectOptions.model_fields)
 
 
+def test_flags_win_over_the_options_file(file, dummy_server, run, refused, tmp_path) -> None:
+    options = tmp_path / "options.json"
+    options.write_text(json.dumps({"top_k": 4, "seed": 3, "collision": {"mode": "penalise"}}))
+    asked = ("detect", file, "--server", dummy_server.grpc_address, "--json", "--options", options)
+    assert len(json.loads(run(*asked))["grasps"]) == 4
+    assert len(json.loads(run(*asked, "--top-k", 2))["grasps"]) == 2
+    for text, sentence in (("[]", "a JSON object is needed"), ("{", "Expecting property name")):
+        options.write_text(text)
+        assert sentence in refused(*asked)
+
+
 def test_a_table_shows_counts_and_warnings(file: str, dummy_server, run) -> None:
     output = run("detect", file, "--server", dummy_server.http_url, "--top-k", "3")
     assert len(re.findall(r"^\d +0\.\d{3}.* (?:yes|no) *$", output, re.MULTILINE)) == 3

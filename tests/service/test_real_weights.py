@@ -51,13 +51,14 @@ def test_many_options_give_the_same_grasps_everywhere(catalogue, scene, real_ser
     assert expected.grasps
     assert expected.debug is not None
 
-    file = tmp_path / "scene.npz"
+    file, options = tmp_path / "scene.npz", tmp_path / "options.json"
     np.savez_compressed(file, **scene)
+    options.write_text(json.dumps(MANY))
     flags = ["detect", str(file), "--json"]
+    remote = [*flags, "--options", str(options), "--server", real_server.grpc_address]
     for name, value in MANY.items():
         words = [] if name == "debug" else [value if isinstance(value, str) else json.dumps(value)]
         flags += [f"--{name.replace('_', '-')}", *words]
-    remote = [*flags, "--server", real_server.grpc_address]
     body = {name: array.tolist() for name, array in scene.items()} | {"options": MANY}
     documents = [httpx.post(f"{real_server.http_url}/v1/grasps", json=body, timeout=60).json()]
     documents += [json.loads(CliRunner().invoke(main.app, each).stdout) for each in (flags, remote)]

@@ -2,26 +2,37 @@
 
 from pathlib import Path
 
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from launch import LaunchDescription
+from launch import LaunchContext, LaunchDescription
 
 PARAMETERS = Path(__file__).with_name("edgegrasp.yaml")
 TOPICS = ("points", "depth", "camera_info", "mask", "joint_states")
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Arguments: the topics, and a file with the node's parameters."""
+    """Arguments: the topics, a file with the node's parameters, and the server's address.
+
+    An address that is given comes before that of the file.
+    """
     arguments = [DeclareLaunchArgument(name, default_value=name) for name in TOPICS]
-    arguments.append(DeclareLaunchArgument("parameters", default_value=str(PARAMETERS)))
+    arguments += [
+        DeclareLaunchArgument("server", default_value=""),
+        DeclareLaunchArgument("parameters", default_value=str(PARAMETERS)),
+    ]
+    return LaunchDescription([*arguments, OpaqueFunction(function=_node)])
+
+
+def _node(context: LaunchContext) -> list[Node]:
+    server = LaunchConfiguration("server").perform(context)
     node = Node(
         package="edgegrasp_ros2",
         executable="edgegrasp_node",
         name="edgegrasp",
         output="screen",
-        parameters=[LaunchConfiguration("parameters")],
+        parameters=[LaunchConfiguration("parameters"), *([{"server": server}] if server else [])],
         remappings=[(name, LaunchConfiguration(name)) for name in TOPICS],
     )
-    return LaunchDescription([*arguments, node])
+    return [node]
