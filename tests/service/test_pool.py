@@ -66,6 +66,29 @@ async def test_a_request_cancelled_as_it_is_answered_leaves_its_worker_to_the_ne
         await first
 
 
+async def test_a_nursery_that_is_stopped_is_replaced(serve, cloud, monkeypatch) -> None:
+    monkeypatch.setattr("edgegrasp_service.worker.pool.START_SECONDS", 1.0)
+    running = await serve()
+    pool, client = running.server.pool, running.connect("rest")
+    nursery = pool._nursery.pid
+    os.kill(nursery, signal.SIGSTOP)
+    os.kill(pool.pids[0], signal.SIGKILL)
+    await running.until(lambda: not running.server.service.ready)
+    await running.until(lambda: running.server.service.ready)
+    assert pool._nursery.pid != nursery
+    assert (await client.detect(cloud)).fine
+
+
+async def test_a_worker_that_is_stopped_is_replaced(serve, monkeypatch) -> None:
+    for name, seconds in (("BEAT", 0.2), ("PULSE", 1.0)):
+        monkeypatch.setattr(f"edgegrasp_service.worker.pool.{name}_SECONDS", seconds)
+    running = await serve()
+    (before,) = running.server.pool.pids
+    os.kill(before, signal.SIGSTOP)
+    await running.until(lambda: running.server.pool.pids not in ([], [before]))
+    assert running.server.service.ready
+
+
 async def test_workers_killed_under_load(serve, cloud) -> None:
     """Whatever is killed, each answer is of its own cloud, and nothing is lost."""
     running = await serve(workers=2)

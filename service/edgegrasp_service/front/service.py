@@ -67,7 +67,7 @@ class GraspService:
     @property
     def ready(self) -> bool:
         """Whether requests can be answered."""
-        return bool(self.pool.models and self.pool.pids) and not self.stopping.is_set()
+        return bool(self.pool.models) and self.pool.alive and not self.stopping.is_set()
 
     def loaded(self) -> WorkerPool:
         """The workers; raises NotReady while weights are loading or the server is stopping."""

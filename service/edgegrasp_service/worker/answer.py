@@ -101,6 +101,8 @@ class Work:
 
     def answer(self) -> bytes:
         """The body of the answer; may raise any error."""
+        if self.job.method == "Beat":
+            return b"{}"
         if self.job.method == "RecordOutcome":
             self._record_outcome()
             return b"{}"

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
@@ -39,6 +40,10 @@ CRASHES = {signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.
 CRASHED = "one that ended the process that worked on it"
 CRASH_FIX = "Send another cloud or other options; this request is refused for 10 minutes."
 STATUS_SECONDS = 1.0  # seconds to learn how a worker ended
+START_SECONDS = 20.0  # seconds for a worker to fork, if it need not load
+BEAT_SECONDS = 3.0  # seconds between two checks that a worker is alive
+PULSE_SECONDS = 10.0  # seconds for it to answer
+ALIVE_SECONDS = 15.0  # seconds since the latest answer of any worker
 KILL_SECONDS = 0.5  # seconds that a worker may use to finish an abandoned job
 RETRY_SECONDS = 1.0  # seconds after a worker or the nursery failed to start
 
@@ -78,6 +83,13 @@ class WorkerPool:
         # Last in, first out: its caches are warm.
         self._idle: asyncio.LifoQueue[_Worker] = asyncio.LifoQueue()
         self._tasks: set[asyncio.Task[Any]] = set()
+        self._answered = 0.0  # when a worker last answered
+
+    @property
+    def alive(self) -> bool:
+        """Whether a worker answered recently, or is busy, which a deadline limits."""
+        recent = time.monotonic() - self._answered < ALIVE_SECONDS
+        return bool(self._workers) and (self.busy > 0 or recent)
 
     @property
     def pids(self) -> list[int]:
@@ -87,7 +99,7 @@ class WorkerPool:
     @property
     def busy(self) -> int:
         """Number of workers that have a request."""
-        return sum(worker.answer is not None for worker in self._workers)
+        return sum(worker.at_work for worker in self._workers)
 
     async def start(self) -> None:
         """Load weights and start workers; workers of an earlier start finish their request and end.
@@ -114,7 +126,10 @@ class WorkerPool:
         nursery.watch(lambda: self._nursery_lost(nursery))
         for worker in workers:
             self._spawn(self._tend(worker))
-        if old_nursery is not None:
+        self._answered = time.monotonic()
+        if old_nursery is None:
+            self._spawn(self._beat())
+        else:
             old_nursery.close()
         for worker in old_workers:
             if worker.answer is None:  # the others finish their current job
@@ -137,6 +152,15 @@ class WorkerPool:
         if self._nursery is not None:
             self._nursery.close()
 
+    async def _beat(self) -> None:
+        """Check regularly that an idle worker answers; one that does not is killed."""
+        while True:
+            await asyncio.sleep(BEAT_SECONDS)
+            with contextlib.suppress(TimeoutError, EdgeGraspError):
+                async with asyncio.timeout(PULSE_SECONDS):
+                    worker, beat = await self.take(), Job("Beat", "http", b"", 0.0)
+                    await worker.run(beat, time.monotonic() + PULSE_SECONDS)
+
     async def _tend(self, worker: "_Worker") -> None:
         """Offer a worker for jobs until it dies, then replace it."""
         usable, lost = True, False
@@ -153,6 +177,7 @@ class WorkerPool:
                     if await worker.nursery.crashed(worker.pid):
                         worker.finish(HarmfulRequest("request", CRASHED, CRASH_FIX))
                     break
+                self._answered = time.monotonic()
                 worker.finish(answer)
                 if answer.error is not None and answer.error.kind == WORKER_LOST:
                     worker.kill()  # it ran out of memory: its state cannot be trusted
@@ -168,7 +193,12 @@ class WorkerPool:
     async def _replace(self, nursery: "_Nursery") -> None:
         worker = _Worker(nursery)
         try:
-            await worker.start()
+            async with asyncio.timeout(START_SECONDS if self._settings.device == "cpu" else None):
+                await worker.start()
+        except TimeoutError:  # it is stopped or hangs; its death is handled like any other
+            worker.close()
+            nursery.kill()
+            raise InvalidSettings("the process that workers fork from does not answer") from None
         except BaseException:
             worker.close()
             raise
@@ -201,6 +231,7 @@ class _Nursery:
 
     def __init__(self, process: subprocess.Popen[bytes], control: socket.socket) -> None:
         self._process = process
+        self.pid = process.pid
         self._control = control
         # Whether each ended worker, by process id, ended by itself.
         self._crashed: defaultdict[int, asyncio.Future[bool]]
@@ -219,6 +250,7 @@ class _Nursery:
         except BaseException:
             nursery.close()
             raise
+        nursery.pid = ready.pid
         control.setblocking(False)
         return nursery
 
@@ -258,6 +290,11 @@ class _Nursery:
                 raise
         return ours
 
+    def kill(self) -> None:
+        """Kill the nursery, even if it is stopped; `watch` notices."""
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
+
     def close(self) -> None:
         """Kill the nursery; the workers that it forked continue."""
         with contextlib.suppress(RuntimeError, ValueError):
@@ -277,6 +314,7 @@ class _Worker:
         self.answer: asyncio.Future[Answer] | None = None  # of the job that it works on
         self._writer: asyncio.StreamWriter | None = None
         self._killing: asyncio.TimerHandle | None = None
+        self.at_work = False  # on a request
         self.killed = False
 
     async def start(self) -> None:
@@ -307,6 +345,7 @@ class _Worker:
         loop = asyncio.get_running_loop()
         answer = self.answer = loop.create_future()
         answer.add_done_callback(lambda answer: answer.exception())  # nobody may be waiting
+        self.at_work = job.method != "Beat"
         assert self._writer is not None
         try:
             with contextlib.suppress(OSError):  # if it has died, that becomes the answer
@@ -322,6 +361,7 @@ class _Worker:
 
     def finish(self, answer: Answer | EdgeGraspError) -> None:
         """Complete the worker's job, if any, with the answer or an error."""
+        self.at_work = False
         if self._killing is not None:
             self._killing.cancel()
             self._killing = None
