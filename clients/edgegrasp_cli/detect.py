@@ -19,7 +19,7 @@ from edgegrasp_camera.picture import draw_detection
 from edgegrasp_cli.flags import Connection, option_flags, parse_option_flags, takes_flags
 
 if TYPE_CHECKING:
-    from edgegrasp_client import DepthImage, Detection, Model
+    from edgegrasp_client import DepthImage, Model
     from edgegrasp_model.detector import ModelCatalogue
 
 Option = typer.Option
@@ -121,7 +121,7 @@ def detect(
 
         fields = dict(on_mask(pixels(asked.mask), fields))
     waiting = Console(stderr=True).status("Looking for grasps…")
-    with waiting, open_client(asked, [asked.robot] if asked.robot else []) as client:
+    with waiting, open_client(asked) as client:
         detection = client.detect(file, depth_images=images, colors=colors, **fields)
     if asked.picture is not None:
         draw_detection(asked.picture, detection, sent_cloud(file, images), fields, colors)
@@ -159,42 +159,58 @@ def models(*, asked: DetectorFlags) -> None:
     Console().print(table)
 
 
-def open_client(asked: DetectorFlags, robots: Sequence[str] = ()) -> AbstractContextManager[Any]:
-    """A client of a server, or an OwnDetector with these robots if no server is given."""
+def open_client(asked: DetectorFlags) -> AbstractContextManager[Any]:
+    """A client of a server, or an OwnDetector if no server is given."""
     if asked.server:
         return asked.connect(asked.server)
-    return nullcontext(OwnDetector(asked.weights, asked.grippers, asked.device, robots))
+    return nullcontext(OwnDetector(asked.weights, asked.grippers, asked.device))
 
 
 class OwnDetector:
-    """A server's worker in this process, with the interface of `GraspClient`."""
+    """A detector in this process, with the interface of `GraspClient`."""
+
+    robot: str | None = None  # a name or file, in place of the name in a request
 
     def __init__(
-        self,
-        weights: Sequence[Path] = (),
-        grippers: Sequence[Path] = (),
-        device: str = "cpu",
-        robots: Sequence[str] = (),  # names or files
+        self, weights: Sequence[Path] = (), grippers: Sequence[Path] = (), device: str = "cpu"
     ) -> None:
-        from edgegrasp_service.settings import Settings
-
         self._load = weights, grippers, device
-        given = {"robots": tuple(robots), "max_points": sys.maxsize}
-        self._settings = Settings.model_validate(given)
 
-    def detect(self, cloud: Any = None, **fields: Any) -> "Detection":
-        """As of the client; raises the detector's errors."""
-        from edgegrasp.v1.grasp_pb2 import DetectGraspsResponse
-        from edgegrasp_client.over_grpc import read_field, wire_of
-        from edgegrasp_client.requests import Request
-        from edgegrasp_client.results import read_as
-        from edgegrasp_results import Detection
-        from edgegrasp_service.worker.answer import Work
-        from edgegrasp_service.worker.process import Job
+    def detect(
+        self,
+        cloud: Any = None,
+        *,
+        depth_images: Any = None,
+        colors: Any = None,
+        view_ids: Any = None,
+        **options: Any,
+    ) -> Any:
+        """Find grasps in a cloud: an array, a file, or depth images; raises as the detector."""
+        from edgegrasp_client.requests import depth_image_fields, npy_bytes
+        from edgegrasp_model.options import parse_options
+        from edgegrasp_model.request_cloud import File, decode_cloud
 
-        job = Job("DetectGrasps", "grpc", b"".join(wire_of(Request(cloud, fields))))
-        body = Work(job, self._catalogue, self._settings).answer()
-        return read_as(Detection, DetectGraspsResponse.FromString(body), read_field)
+        beside = {"colors": colors, "view_ids": view_ids}
+        fields: dict[str, Any] = {
+            name: File("npy", npy_bytes(of)) for name, of in beside.items() if of is not None
+        }
+        if depth_images is not None:
+            images = enumerate(depth_images)
+            fields["depth_images"] = [depth_image_fields(image, row) for row, image in images]
+        elif isinstance(cloud, Path):
+            fields["cloud"] = File(cloud.suffix[1:].lower(), cloud.read_bytes())
+        else:
+            fields["cloud"] = File("npy", npy_bytes(cloud))
+        sent, parsed = decode_cloud(fields, parse_options(options), sys.maxsize)
+        detector = self._catalogue.get(parsed.model)
+        if parsed.robot is None:
+            return detector.detect(sent, parsed)
+        from edgegrasp_robot import load_robot, plan_picks, with_robot
+
+        robot = load_robot(self.robot or parsed.robot.name)
+        prepared = detector.prepare(sent, with_robot(parsed, robot))
+        detection = detector.finish(prepared, detector.evaluate(prepared))
+        return plan_picks(detection, prepared.scene, sent.points, parsed, robot)
 
     def close(self) -> None:
         """Do nothing; a client would close its connection."""
@@ -251,9 +267,7 @@ def _robot_option(asked: DetectFlags) -> dict[str, Any]:
         raise ValueError(f"{missing[0]}: got nothing. Give {', '.join(given)} together.")
     joints = [float(part) for part in str(asked.joints).split(",") if part]
     pose = value_of_text("--base", str(asked.base))
-    path = Path(str(asked.robot))
-    name = path.stem if path.suffix == ".toml" else asked.robot
-    robot = {"name": name, "joints": joints, "T_base_cloud": pose}
+    robot = {"name": asked.robot, "joints": joints, "T_base_cloud": pose}
     robot["avoid_unseen"] = asked.avoid_unseen
     if asked.place is not None:
         robot["place"] = value_of_text("--place", asked.place)

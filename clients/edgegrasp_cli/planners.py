@@ -61,7 +61,7 @@ def open_planner(
     asked = {"model": model, **options}
     with _server(choice, weights) as address:
         open_client: Callable[[float], Any] = (
-            partial(_one_thread, weights, choice.robot)
+            partial(_OneThread, weights, choice.robot)
             if address is None
             else partial(choice.connect, address)
         )
@@ -113,12 +113,22 @@ def named_planner(name: str) -> Planner:
     return cast("Planner", planner)
 
 
-def _one_thread(weights: Sequence[Path], robot: str | None, timeout: float) -> OwnDetector:
+class _OneThread(OwnDetector):
     """A detector on one thread, whose sums do not depend on the number of threads."""
-    import torch
 
-    torch.set_num_threads(1)
-    return OwnDetector(weights, robots=[robot] if robot else [])
+    def __init__(self, weights: Sequence[Path], robot: str | None, timeout: float) -> None:
+        super().__init__(weights)
+        self.robot = robot
+
+    def detect(self, cloud: Any = None, **options: Any) -> Any:
+        import torch
+
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            return super().detect(cloud, **options)
+        finally:
+            torch.set_num_threads(threads)
 
 
 @dataclass

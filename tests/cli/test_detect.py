@@ -117,7 +117,7 @@ def test_depth_images_that_cannot_be_read(camera_files, file, refused) -> None:
         ((file, *camera_files), "give a cloud file, or --depth and --intrinsics"),
         ((depth, "--intrinsics", "300,300,640,360"), "cx: got 640, outside of an image of 32 x 24"),
         ((depth, "--intrinsics", "300"), "depth_images.0.intrinsics: got 300"),
-        ((depth.removeprefix("--depth="),), "a depth image as one of depth_images"),
+        ((depth.removeprefix("--depth="),), "a depth image as `depth` with `intrinsics`"),
         ((file, mask), "768 values for a cloud of 500 rows"),
     ):
         assert sentence in refused("detect", *flags)
@@ -140,7 +140,7 @@ def test_a_bad_option_is_named(options, sentence, file, dummy_server, refused) -
     ("name", "content", "flags", "sentence"),
     [
         ("absent.npy", None, (), "No such file"),
-        ("cloud.las", b"0 0 0", (), "Give one of: npy, npz, ply, pcd, xyz; a depth image as"),
+        ("cloud.las", b"0 0 0", (), "Send one of: npy, npz, ply, pcd, xyz; a depth image as"),
         ("cloud.npy", b"foreign", (), "cloud: got 7 bytes that are no whole .npy file"),
         ("cloud.npy", b"foreign", ("--top-k", "0"), "options.top_k: got 0."),
     ],

@@ -4,7 +4,6 @@ Every fault of a request is returned as a Problem. This module knows no event lo
 transports.
 """
 
-import math
 import time
 import traceback
 from collections.abc import Iterator, Mapping
@@ -71,7 +70,7 @@ def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
     Raises:
         MemoryError: Out of memory; the process should be replaced.
     """
-    work = Work(job, catalogue, settings, time.monotonic() + job.remaining)
+    work = _Work(job, catalogue, settings, time.monotonic() + job.remaining)
     try:
         return Answer(work.answer(), work.facts)
     except EdgeGraspError as error:
@@ -89,13 +88,13 @@ def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
 
 
 @dataclass
-class Work:
-    """One job while it is being answered; its errors are the detector's."""
+class _Work:
+    """One job while it is being answered."""
 
     job: Job
     catalogue: "ModelCatalogue"
     settings: Settings
-    deadline: float = math.inf  # by time.monotonic
+    deadline: float  # by time.monotonic
     facts: Facts = field(default_factory=Facts)
     options: DetectOptions | None = None  # known once they are parsed
 
