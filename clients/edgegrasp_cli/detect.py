@@ -257,7 +257,7 @@ def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
 
 def _robot_option(asked: DetectFlags) -> dict[str, Any]:
     """The option `robot` from the flags; empty if none of them is given."""
-    from edgegrasp_service.worker.http_bodies import value_of_text
+    from edgegrasp_model.request_cloud import value_of_text
 
     given = {"--robot": asked.robot, "--joints": asked.joints, "--base": asked.base}
     missing = [flag for flag, value in given.items() if value is None]
@@ -290,7 +290,7 @@ def _write_trajectory(file: Path, detection: Any) -> None:
 
 def _depth_images(file: Path | None, asked: DetectFlags) -> "list[DepthImage] | None":
     """The images of --depth with their cameras; None if a cloud is given."""
-    from edgegrasp_service.worker.http_bodies import value_of_text
+    from edgegrasp_model.request_cloud import value_of_text
 
     depths, intrinsics, poses = asked.depth, asked.intrinsics, asked.pose
     if (file is None) != bool(depths):

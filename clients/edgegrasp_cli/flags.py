@@ -166,9 +166,9 @@ def option_flags(*leave_out: str, defaults: bool = True) -> Flags:
 def parse_option_flags(given: Mapping[str, Any]) -> dict[str, Any]:
     """The options from the flags of `option_flags`; raises InvalidRequest for a wrong value."""
     from edgegrasp_model.options import parse_options
-    from edgegrasp_service.worker.http_bodies import options_from_query
+    from edgegrasp_model.request_cloud import options_of_texts
 
-    options = options_from_query(
+    options = options_of_texts(
         (name, value if isinstance(value, str) else json.dumps(value))
         for name, value in given.items()
     )

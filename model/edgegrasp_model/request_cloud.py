@@ -1,12 +1,15 @@
-"""Decode the cloud of a request, in any of its forms, into arrays.
+"""Decode the cloud of a request, in any of its forms, into arrays; and options that are text.
 
 Both transports give the fields of the JSON body. A value is JSON, a `File` from a form or a
 message, or bytes of little-endian numbers from a message. The detector checks the arrays.
 """
 
 import base64
-from collections.abc import Mapping
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -278,3 +281,52 @@ def _depth(depth: object, max_points: int, field: str) -> Array:
         raise InvalidRequest(f"{field}.data", value, "Send the whole image.")
     pixels = np.frombuffer(image.data, dtype)
     return pixels.reshape(image.height, image.width)
+
+
+# Options as text
+
+
+def options_of_texts(items: Iterable[tuple[str, str]]) -> dict[str, Any]:
+    """Decode query parameters or command line values, one per option.
+
+    A value is JSON (`seed=3`, `suppression=null`, `workspace={"min":[0,0,0],"max":[1,1,1]}`),
+    numbers between commas (`viewpoint=0.1,0.2,0.3`), or else the text itself
+    (`sampling=uniform`).
+
+    Raises:
+        InvalidRequest: A parameter occurs twice.
+    """
+    options: dict[str, Any] = {}
+    for name, text in items:
+        if name in options:
+            raise InvalidRequest(f"options.{name}", "two values", "Send it once.")
+        options[name] = value_of_text(name, text)
+    return options
+
+
+def value_of_text(name: str, text: str) -> object:
+    """One value of an option or form part, as `options_of_texts` reads it."""
+    field = DetectOptions.model_fields.get(name)
+    if field is not None and field.annotation is str:
+        return text  # a model may be named 7 or null
+    if name == "gripper" and not text.startswith(("{", "[")) and text != "null":
+        return text  # as may grippers
+    try:
+        return json.loads(text, object_pairs_hook=partial(unique_keys, f"options.{name}"))
+    except (ValueError, RecursionError):
+        pass
+    if "," in text:
+        try:
+            return [float(part) for part in text.split(",")]
+        except ValueError:
+            pass
+    return text
+
+
+def unique_keys(field: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON; raises InvalidRequest for a key that is there twice."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        ((name, count),) = Counter(name for name, _ in pairs).most_common(1)
+        raise InvalidRequest(field, f"{count} times the key {brief(name)}", "Send it once.")
+    return found

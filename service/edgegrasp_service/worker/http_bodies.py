@@ -5,7 +5,6 @@ A request is JSON, a point cloud file, or a form with parts; an answer is JSON.
 
 import io
 import json
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import PurePath
@@ -20,8 +19,15 @@ from werkzeug.http import parse_options_header
 
 from edgegrasp_camera.files import FILE_FORMATS
 from edgegrasp_model.errors import InvalidRequest, brief
-from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.request_cloud import CAMERA, GIVEN, PER_POINT, File
+from edgegrasp_model.request_cloud import (
+    CAMERA,
+    GIVEN,
+    PER_POINT,
+    File,
+    options_of_texts,
+    unique_keys,
+    value_of_text,
+)
 from edgegrasp_results import Detection, Scoring
 from edgegrasp_service.errors import UnsupportedMediaType
 from edgegrasp_service.worker.process import Job
@@ -59,7 +65,7 @@ def read_request(job: Job) -> dict[str, Any]:
         raise InvalidRequest("query", value, "Send each option once.") from None
     if media_type in FILE_TYPES:
         file = File(FILE_TYPES[media_type], job.body)
-        return {"cloud": file, "options": options_from_query(parameters)}
+        return {"cloud": file, "options": options_of_texts(parameters)}
     if parameters:
         fix = "Send options in the part `options`."
         raise InvalidRequest(parameters[0][0], "a query parameter", fix)
@@ -115,57 +121,9 @@ def read_json(field: str, text: bytes) -> Any:
         value = f"{lists} lists and objects in {len(text)} bytes"
         raise InvalidRequest(field, value, "Send lists that hold numbers.")
     try:
-        return json.loads(text, object_pairs_hook=partial(_object, field))
+        return json.loads(text, object_pairs_hook=partial(unique_keys, field))
     except (ValueError, RecursionError) as error:
         raise InvalidRequest(field, f"no valid JSON ({error})", "Send a JSON object.") from None
-
-
-def _object(field: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        ((name, count),) = Counter(name for name, _ in pairs).most_common(1)
-        raise InvalidRequest(field, f"{count} times the key {brief(name)}", "Send it once.")
-    return found
-
-
-# Options in a query
-
-
-def options_from_query(items: Iterable[tuple[str, str]]) -> dict[str, Any]:
-    """Decode query parameters or command line values, one per option.
-
-    A value is JSON (`seed=3`, `suppression=null`, `workspace={"min":[0,0,0],"max":[1,1,1]}`),
-    numbers between commas (`viewpoint=0.1,0.2,0.3`), or else the text itself
-    (`sampling=uniform`).
-
-    Raises:
-        InvalidRequest: A parameter occurs twice.
-    """
-    options: dict[str, Any] = {}
-    for name, text in items:
-        if name in options:
-            raise InvalidRequest(f"options.{name}", "two values", "Send it once.")
-        options[name] = value_of_text(name, text)
-    return options
-
-
-def value_of_text(name: str, text: str) -> object:
-    """One value of an option or form part, as `options_from_query` reads it."""
-    field = DetectOptions.model_fields.get(name)
-    if field is not None and field.annotation is str:
-        return text  # a model may be named 7 or null
-    if name == "gripper" and not text.startswith(("{", "[")) and text != "null":
-        return text  # as may grippers
-    try:
-        return json.loads(text, object_pairs_hook=partial(_object, f"options.{name}"))
-    except (ValueError, RecursionError):
-        pass
-    if "," in text:
-        try:
-            return [float(part) for part in text.split(",")]
-        except ValueError:
-            pass
-    return text
 
 
 # Forms

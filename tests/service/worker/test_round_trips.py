@@ -11,7 +11,7 @@ from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client.over_grpc import fill
 from edgegrasp_client.requests import plain_options
 from edgegrasp_model.options import DetectOptions, parse_options
-from edgegrasp_service.worker.http_bodies import options_from_query
+from edgegrasp_model.request_cloud import options_of_texts
 from edgegrasp_service.worker.messages import plain_options as options_from_message
 
 POSE = np.eye(4).ravel().tolist()
@@ -85,7 +85,7 @@ def through_query(fields: dict[str, Any]) -> DetectOptions:
         name: value if isinstance(value, str) else json.dumps(value)
         for name, value in plain_options(fields).items()
     }
-    return parse_options(options_from_query(texts.items()))
+    return parse_options(options_of_texts(texts.items()))
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
