@@ -1,4 +1,4 @@
-"""Clouds as files and as PointCloud2, written plainly: what readers are tested with."""
+"""Clouds as files and as PointCloud2, and images, written plainly: what readers are tested with."""
 
 import io
 import struct
@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
+from PIL import Image
 
 from edgegrasp_camera.clouds import POINT_TYPES
 
@@ -22,6 +23,12 @@ def npy(array: np.ndarray, **options: object) -> bytes:
 def npz(compressed: bool = True, **arrays: np.ndarray) -> bytes:
     stream = io.BytesIO()
     (np.savez_compressed if compressed else np.savez)(stream, **arrays)
+    return stream.getvalue()
+
+
+def png(pixels: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "png")
     return stream.getvalue()
 
 

@@ -1,6 +1,15 @@
-"""Many options of a request at once, with which the weights that ship find grasps."""
+"""Many options of a request at once, with which the weights that ship find grasps; a gripper."""
 
 from typing import Any
+
+OWN_GRIPPER: dict[str, Any] = {
+    "max_opening": 0.07,
+    "tip_z": 0.1,
+    "contact_z": 0.09,
+    "tcp_z": 0.08,
+    "hand": {"boxes": [[[-0.1, -0.1, -0.1], [0.1, 0.1, 0.05]]]},
+    "finger": {"boxes": [[[-0.01, 0.0, 0.05], [0.01, 0.01, 0.1]]]},
+}
 
 MANY: dict[str, Any] = {
     "gripper": "robotiq-2f-140",

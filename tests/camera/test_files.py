@@ -1,6 +1,5 @@
 import io
 import struct
-import tracemalloc
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -9,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
-from tests.cloud_files import lzf_literals, npy, npz, pcd, ply, xyz
+from tests.checks import bounded_memory, refusal
+from tests.cloud_files import lzf_literals, npy, npz, pcd, ply, png, xyz
 
 from edgegrasp_camera.files import read_file, read_png
 from edgegrasp_model.errors import InvalidRequest
@@ -55,48 +54,14 @@ def test_truncated_files_are_refused(name: str, data: st.DataObject) -> None:
         name, 1
     )
     cut = data.draw(st.integers(0, needed))
-    with pytest.raises(InvalidRequest) as caught:
+    with refusal("cloud"):
         read_file(name[:3], whole[:cut], MANY)
-    assert caught.value.field == "cloud"
 
 
 @pytest.mark.parametrize("name", GOOD_FILES)
 def test_too_many_points_are_refused(name: str) -> None:
-    with pytest.raises(PayloadTooLarge) as caught:
+    with refusal("cloud", "40 points", "39", PayloadTooLarge):
         read_file(name[:3], GOOD_FILES[name], max_points=39)
-    assert caught.value.value == "40 points"
-    assert "39" in caught.value.fix
-
-
-@pytest.mark.parametrize(
-    ("data", "value"),
-    [
-        (npz(a=POINTS, b=POINTS), "a, b"),
-        (npz(), "no array points"),
-    ],
-)
-def test_an_archive_must_say_which_array(data: bytes, value: str) -> None:
-    with pytest.raises(InvalidRequest) as caught:
-        read_file("npz", data, MANY)
-    assert value in caught.value.value
-    assert "points=points" in caught.value.fix
-
-
-@pytest.mark.parametrize(
-    "header",
-    [
-        b"element face 3\nproperty float x\n",
-        b"element vertex -3\nproperty float x\nproperty float y\nproperty float z\n",
-        b"element vertex 1\nproperty float x\nproperty float y\n",
-        b"element vertex 1\nproperty list uchar int x\nproperty float y\nproperty float z\n",
-        b"",
-    ],
-)
-def test_ply_headers_without_points(header: bytes) -> None:
-    data = b"ply\nformat binary_little_endian 1.0\n" + header + b"end_header\n" + bytes(100)
-    with pytest.raises(InvalidRequest) as caught:
-        read_file("ply", data, MANY)
-    assert "vertices" in caught.value.fix
 
 
 def compressed_pcd(header: str, columns: bytes, packed: bytes | None = None) -> bytes:
@@ -123,62 +88,109 @@ def test_a_compressed_pcd_with_a_second_header_in_its_comments() -> None:
         read_file("pcd", short, MANY)
 
 
-@pytest.mark.parametrize(
-    "packed",
-    [
-        b"",
-        b"\x1f" + bytes(32),  # ends early
-        b"\x0b" + bytes(12) + b"\x20\x0c",  # a reference before the start
-        b"\x0b" + bytes(12) + b"\xe0\xff",  # a reference cut off
-        b"\x0b" + bytes(12) + b"\xe0\xff\x00",  # more than is promised
-        b"\x0b" + bytes(11),  # a run cut off
-    ],
-)
-def test_lzf_that_does_not_give_what_it_promises(packed: bytes) -> None:
-    header = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 1\nPOINTS 2\n"
-    with pytest.raises(InvalidRequest):
-        read_file("pcd", compressed_pcd(header, bytes(24), packed), MANY)
+def npy_of(descr: str, shape: str, body: bytes = b"") -> bytes:
+    """A file of what its header says, whatever that is."""
+    header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}\n".encode()
+    return b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header + body
 
 
-# Small files that took their worker with them.
+def npy_of_text(version: int) -> bytes:
+    """A file whose header is a deep expression."""
+    text = b"-" * 9900 + b"1"
+    size = struct.pack("<H" if version == 1 else "<I", len(text))
+    return b"\x93NUMPY" + bytes([version, 0]) + size + text
 
 
-@pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
-def test_npz_members_are_stored_or_deflated(method: int) -> None:
+def npz_packed_by(method: int) -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", method) as archive:
         archive.writestr("points.npy", npy(POINTS))
-    data = stream.getvalue().replace(b"\x5d\0\0\x80\0", b"\x5d\xff\xff\xff\xff")
-    with pytest.raises(InvalidRequest, match="savez"):
-        read_file("npz", data, MANY)
+    return stream.getvalue().replace(b"\x5d\0\0\x80\0", b"\x5d\xff\xff\xff\xff")
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_deeply_nested_npy_headers_are_refused(version: int) -> None:
-    text = b"-" * 9900 + b"1"
-    size = struct.pack("<H" if version == 1 else "<I", len(text))
-    with pytest.raises(InvalidRequest, match="writes"):
-        read_file("npy", b"\x93NUMPY" + bytes([version, 0]) + size + text, MANY)
+def pcd_of_count(count: str, points: int) -> bytes:
+    counts = f"COUNT 1 1 1 2 {count}".encode()
+    return pcd(POINTS, "ascii", points).replace(b"COUNT 1 1 1 2 1", counts)
+
+
+def ply_of(header: bytes) -> bytes:
+    return b"ply\nformat binary_little_endian 1.0\n" + header + b"end_header\n" + bytes(100)
+
+
+TWO_POINTS = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 1\nPOINTS 2\n"
+BAD_FILES = [  # and what is said of their value, and of what to send
+    ("npz", npz(a=POINTS, b=POINTS), "a, b", "points=points"),
+    ("npz", npz(), "no array points", "points=points"),
+    *(
+        ("npz", npz_packed_by(method), "", "savez")
+        for method in (zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2)
+    ),
+    ("npy", npy_of_text(1), "", "writes"),
+    ("npy", npy_of_text(2), "", "writes"),
+    *(
+        ("npy", npy_of(descr, shape, bytes(12)), "", "")
+        for descr, shape in (
+            ("'<f4'", "(True, 3)"),
+            ("'<f4'", "(-1, 3)"),
+            ("'<f4'", "(99999999999999999999999999, 0, 3)"),
+            ("'<f4'", "(1" + ", 1" * 99 + ")"),
+            ("('<f4',(3,))", "(1,)"),
+            ("'|O'", "(1, 3)"),
+            ("'|V0'", "(1, 3)"),
+        )
+    ),
+    *(
+        ("ply", ply_of(header), "", "vertices")
+        for header in (
+            b"element face 3\nproperty float x\n",
+            b"element vertex -3\nproperty float x\nproperty float y\nproperty float z\n",
+            b"element vertex 1\nproperty float x\nproperty float y\n",
+            b"element vertex 1\nproperty list uchar int x\nproperty float y\nproperty float z\n",
+            b"",
+        )
+    ),
+    *(
+        ("pcd", pcd_of_count(count, points), "", "")
+        for count in ("1" * 5000, "1" * 4000, "99999999", "-1")
+        for points in (-1, 0)
+    ),
+    *(
+        ("pcd", compressed_pcd(TWO_POINTS, bytes(24), packed), "", "")
+        for packed in (
+            b"",
+            b"\x1f" + bytes(32),  # ends early
+            b"\x0b" + bytes(12) + b"\x20\x0c",  # a reference before the start
+            b"\x0b" + bytes(12) + b"\xe0\xff",  # a reference cut off
+            b"\x0b" + bytes(12) + b"\xe0\xff\x00",  # more than is promised
+            b"\x0b" + bytes(11),  # a run cut off
+        )
+    ),
+    ("xyz", b"", "no line of numbers", ""),
+    ("xyz", b"# only\n", "no line of numbers", ""),
+    ("xyz", b"0 0 0\n0 0\n", "from 3 to 2 at row 2", ""),
+    ("xyz", b"0 0 0 1 0 0\n", "6 numbers in a line", ""),
+    ("xyz", b"0 0 a\n", "'a'", ""),
+]
+
+
+@pytest.mark.parametrize("row", range(len(BAD_FILES)))
+def test_a_bad_file_is_refused_by_value_and_fix(row: int) -> None:
+    file_format, data, value, fix = BAD_FILES[row]
+    with refusal("cloud", value, fix):
+        read_file(file_format, data, MANY)
 
 
 def test_a_png_of_very_many_chunks() -> None:
     whole = png(IMAGES["depths"])
     empty = struct.pack(">I", 0) + b"tEXt" + struct.pack(">I", zlib.crc32(b"tEXt"))
-    with pytest.raises(InvalidRequest, match="chunks") as caught:
+    with refusal("depth", "chunks"):
         read_png(whole[:33] + empty * 200_000 + whole[33:], MANY, "depth")
-    assert caught.value.field == "depth"
     assert read_png(whole[:33] + empty * 20 + whole[33:], MANY, "depth").shape == (6, 10)
 
 
 NORMALS = np.random.default_rng(2).normal(size=(40, 3)).astype(np.float32)
 COLORS = np.random.default_rng(3).integers(0, 256, (40, 3)).astype(np.uint8)
 IDS = np.arange(40, dtype=np.int32) % 5
-
-
-def png(pixels: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "png")
-    return stream.getvalue()
 
 
 IMAGES = {
@@ -196,10 +208,9 @@ def test_png_images_are_read_whole_or_refused(name: str) -> None:
     np.testing.assert_array_equal(pixels, IMAGES[name])
     assert pixels.dtype == IMAGES[name].dtype
     for cut in range(0, len(whole) - 24, 7):  # checksums follow the pixels
-        with pytest.raises(InvalidRequest) as caught:
+        with refusal(name):
             read_png(whole[:cut], MANY, name)
-        assert caught.value.field == name
-    with pytest.raises(PayloadTooLarge):
+    with refusal(name, kind=PayloadTooLarge):
         read_png(whole, 59, name)
 
 
@@ -207,11 +218,8 @@ def test_a_png_of_huge_size_is_not_unpacked() -> None:
     small = bytearray(png(IMAGES["depths"]))
     small[16:24] = struct.pack(">II", 60_000, 60_000)
     small[29:33] = struct.pack(">I", zlib.crc32(small[12:29]))
-    tracemalloc.start()
-    with pytest.raises((InvalidRequest, PayloadTooLarge)):
+    with bounded_memory(MIB), refusal("depth"):
         read_png(bytes(small), MANY, "depth")
-    assert tracemalloc.get_traced_memory()[1] < MIB
-    tracemalloc.stop()
 
 
 def test_an_archive_of_a_depth_image_and_what_is_not_read() -> None:
@@ -225,7 +233,7 @@ def test_an_archive_of_a_depth_image_and_what_is_not_read() -> None:
         assert cloud.warnings == ("arrays of the file that are not read: labels.",)
     (warning,) = read_file("npz", npz(points=POINTS, colours=POINTS), MANY).warnings
     assert "colours" in warning
-    with pytest.raises(InvalidRequest, match=r"cloud\.intrinsics"):
+    with refusal("cloud.intrinsics"):
         read_file("npz", npz(depth=depth, intrinsics=np.ones(3)), MANY)
 
 
@@ -234,9 +242,8 @@ def test_arrays_beside_points_in_an_npz_file_are_read() -> None:
     cloud = read_file("npz", npz(points=POINTS, **arrays), MANY)
     for name, array in arrays.items():
         np.testing.assert_array_equal(getattr(cloud, name), array)
-    with pytest.raises(PayloadTooLarge) as caught:
+    with refusal("segment_ids", kind=PayloadTooLarge):
         read_file("npz", npz(points=POINTS, segment_ids=np.zeros(1001, np.int32)), MANY)
-    assert caught.value.field == "segment_ids"
 
 
 @pytest.mark.parametrize("kind", ["F", "U"])
@@ -292,57 +299,6 @@ def test_organised_clouds_keep_their_shape() -> None:
         read_file("npy", npy(organised), 39)
     with pytest.raises(PayloadTooLarge):
         decode_points(organised.tolist(), 39)
-
-
-@pytest.mark.parametrize(
-    ("data", "value"),
-    [
-        (b"", "no line of numbers"),
-        (b"# only\n", "no line of numbers"),
-        (b"0 0 0\n0 0\n", "from 3 to 2 at row 2"),
-        (b"0 0 0 1 0 0\n", "6 numbers in a line"),
-        (b"0 0 a\n", "'a'"),
-    ],
-)
-def test_bad_xyz_files_are_refused(data: bytes, value: str) -> None:
-    with pytest.raises(InvalidRequest) as caught:
-        read_file("xyz", data, MANY)
-    assert value in caught.value.value
-
-
-# What headers say and no array can be.
-
-
-def npy_of(header: str, body: bytes = b"") -> bytes:
-    text = header.encode() + b"\n"
-    return b"\x93NUMPY\1\0" + struct.pack("<H", len(text)) + text + body
-
-
-@pytest.mark.parametrize(
-    ("descr", "shape"),
-    [
-        ("'<f4'", "(True, 3)"),
-        ("'<f4'", "(-1, 3)"),
-        ("'<f4'", "(99999999999999999999999999, 0, 3)"),
-        ("'<f4'", "(1" + ", 1" * 99 + ")"),
-        ("('<f4',(3,))", "(1,)"),
-        ("'|O'", "(1, 3)"),
-        ("'|V0'", "(1, 3)"),
-    ],
-)
-def test_npy_headers_of_no_array_are_refused(descr: str, shape: str) -> None:
-    header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}"
-    with pytest.raises(InvalidRequest) as caught:
-        read_file("npy", npy_of(header, bytes(12)), MANY)
-    assert caught.value.field == "cloud"
-
-
-@pytest.mark.parametrize("count", ["1" * 5000, "1" * 4000, "99999999", "-1"])
-def test_impossible_counts_of_a_pcd_are_refused(count: str) -> None:
-    for points in (-1, 0):
-        data = pcd(POINTS, "ascii", points).replace(b"COUNT 1 1 1 2 1", b"COUNT 1 1 1 2 %a" % count)
-        with pytest.raises(InvalidRequest):
-            read_file("pcd", data.replace(b"'", b""), MANY)
 
 
 def test_a_comment_that_names_the_end_of_the_header() -> None:
@@ -414,9 +370,7 @@ BOMBS: dict[str, Callable[[], bytes]] = {  # the format is the first word
     "npz lies": npz_that_lies,
     "npz members": npz_of_many_members,
     "npz two directories": hidden_directory,
-    "npy shape": lambda: npy_of(
-        "{'descr': '<f8', 'fortran_order': False, 'shape': (999999999999, 3)}"
-    ),
+    "npy shape": lambda: npy_of("'<f8'", "(999999999999, 3)"),
     "npy header": lambda: npy_header(8 * MIB),
     "ply header": lambda: b"ply\n" + b"\n" * (8 * MIB) + b"end_header\n",
     "ply count": lambda: PLY.format(1_999_999).encode() + b"0 0 0",
@@ -434,11 +388,5 @@ BOMBS: dict[str, Callable[[], bytes]] = {  # the format is the first word
 @pytest.mark.parametrize("name", BOMBS)
 def test_bombs_in_files_are_refused_within_the_memory_of_the_body(name: str) -> None:
     file_format, data = name.split()[0], BOMBS[name]()
-    tracemalloc.start()
-    try:
-        with pytest.raises((InvalidRequest, PayloadTooLarge)):
-            read_file(file_format, data, 2_000_000)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak < 2 * len(data) + 16 * MIB, f"{peak / MIB:.1f} MiB for {len(data) / MIB:.1f} MiB"
+    with bounded_memory(2 * len(data) + 16 * MIB), refusal("cloud"):
+        read_file(file_format, data, 2_000_000)

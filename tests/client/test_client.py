@@ -1,14 +1,16 @@
 """One API, either transport, synchronous or not: the same values and the same exceptions."""
 
 import dataclasses
+import itertools
 import os
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from tests.cloud_files import ply
-from tests.many_options import MANY
+from tests.many_options import MANY, OWN_GRIPPER
 
 import edgegrasp_client
 from edgegrasp_client import (
@@ -16,6 +18,7 @@ from edgegrasp_client import (
     Detection,
     GraspClient,
     InvalidRequestError,
+    StreamRequest,
     object_in_scene,
     on_mask,
 )
@@ -57,14 +60,11 @@ def test_files_and_arrays_give_the_same(client, cloud, tmp_path: Path) -> None:
 # As arrays and numbers of NumPy too.
 ALL_OPTIONS: dict[str, Any] = MANY | {
     "model": "dummy",
-    "gripper": {
+    "gripper": OWN_GRIPPER
+    | {
         "name": "mine",
         "max_opening": np.float32(0.07),
-        "tip_z": 0.1,
-        "contact_z": 0.09,
-        "tcp_z": 0.08,
-        "hand": {"boxes": [[[-0.1, -0.1, -0.1], [0.1, 0.1, 0.05]]]},
-        "finger": {"boxes": np.array([[[-0.01, 0.0, 0.05], [0.01, 0.01, 0.1]]])},
+        "finger": {"boxes": np.array(OWN_GRIPPER["finger"]["boxes"])},
         "swing": None,
     },
     "num_approach_points": np.int64(12),
@@ -176,3 +176,54 @@ def test_an_object_is_cut_out_of_the_scene_that_repeats_it() -> None:
         far = np.linalg.norm(cloud[segment_ids == 0] - 0.1, axis=1)
         assert far.min() > 0.07
         assert 0.97 * (~wanted).sum() < len(far) <= (~wanted).sum()
+
+
+# One stream of clouds, over either transport, synchronous or not.
+
+
+def test_answers_are_those_of_single_requests(client, cloud) -> None:
+    requests = [StreamRequest(cloud, seed=seed, top_k=3) for seed in range(6)]
+    answers = list(client.detect_stream(requests))
+    assert len(answers) == 6
+    for seed, answer in enumerate(answers):
+        assert answer.request_id == str(seed)
+        alone = client.detect(cloud, seed=seed, top_k=3)
+        found = answer.result()
+        assert [grasp.score for grasp in found.grasps] == [grasp.score for grasp in alone.grasps]
+        assert found.counts == alone.counts
+
+
+def test_what_cannot_be_sent_ends_the_stream_after_what_went_before(client, cloud) -> None:
+    requests = [StreamRequest(cloud), StreamRequest("nowhere.ply"), StreamRequest(cloud)]
+    with pytest.raises(InvalidRequestError, match="nowhere"):
+        list(client.detect_stream(requests))
+    with pytest.raises(InvalidRequestError, match="Give a cloud"):
+        StreamRequest()
+
+
+def test_requests_are_read_as_they_are_sent(dummy_server, cloud) -> None:
+    """A controller's clouds have no end; leaving the answers ends the stream."""
+    taken: list[int] = []
+
+    def clouds() -> Iterator[StreamRequest]:
+        for number in itertools.count():
+            taken.append(number)
+            yield StreamRequest(cloud)
+
+    for address in (dummy_server.grpc_address, dummy_server.http_url):
+        taken.clear()
+        with GraspClient(address) as client:
+            answers = client.detect_stream(clouds())
+            assert [next(answers).request_id for _ in range(5)] == list("01234")
+            answers.close()
+            assert len(taken) >= 5
+
+
+async def test_an_asynchronous_source(dummy_server, cloud, transport: str) -> None:
+    async def clouds() -> AsyncIterator[StreamRequest]:
+        for number in range(4):
+            yield StreamRequest(cloud, request_id=f"cloud {number}")
+
+    async with AsyncGraspClient(dummy_server.address(transport)) as client:
+        found = [answer.request_id async for answer in client.detect_stream(clouds())]
+    assert found == [f"cloud {number}" for number in range(4)]

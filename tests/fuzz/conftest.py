@@ -1,15 +1,14 @@
 """Fuzzing: short in `make test`, long in `make fuzz` (--hypothesis-profile=fuzz)."""
 
 import base64
-import tracemalloc
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import hypothesis
 import numpy as np
 from hypothesis import strategies as st
+from tests.checks import bounded_memory
 from tests.cloud_files import npy, npz, pcd, ply, point_cloud2, xyz
 
 given = hypothesis.given  # `make fuzz` sets the profile with many examples
@@ -149,18 +148,6 @@ DEPTH_IMAGE = {
 }  # fmt: skip
 DEPTH_ROWS = DEPTH_IMAGE | {"depth": np.full((5, 8), 0.4).tolist()}
 POINT_CLOUD2 = point_cloud2(POINTS)
-
-
-@contextmanager
-def bounded_memory(allowed: int) -> Iterator[None]:
-    """Fail if more bytes are held at once, beyond those held before."""
-    tracemalloc.start()
-    try:
-        yield
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak <= allowed, f"{peak} bytes at once where {allowed} are allowed"
 
 
 def decodes_or_refuses(work: Callable[[], object], size: int, max_points: int) -> None:

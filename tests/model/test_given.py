@@ -1,6 +1,7 @@
 """Edges and hand poses that a caller gives."""
 
 import numpy as np
+from tests.many_options import OWN_GRIPPER
 
 from edgegrasp_model.given import FLIP
 from edgegrasp_model.options import DetectOptions
@@ -87,14 +88,8 @@ def test_edges_along_the_normal_or_deeper_than_the_fingers_define_no_grasp() -> 
     both = detector().score(sent, ask(support=None), edges=np.array([[a, c], [c, a]]))
     assert both.evaluations[0].reason == NoGrasp.NO_DIRECTION
     assert both.evaluations[1].grasp is not None
-    short = {
-        "max_opening": PANDA.max_opening,
-        "tip_z": PANDA.palm_z + 0.02,
-        "contact_z": PANDA.palm_z + 0.015,
-        "tcp_z": 0.1,
-        "hand": {"boxes": PANDA.hand_boxes},
-        "finger": {"boxes": [[[-0.01, 0, 0.05], [0.01, 0.02, PANDA.palm_z + 0.02]]]},
-    }
+    finger = {"boxes": [[[-0.01, 0, 0.05], [0.01, 0.02, 0.07]]]}
+    short = OWN_GRIPPER | {"tip_z": 0.07, "contact_z": 0.065, "finger": finger}
     deep = detector().score(sent, ask(support=None, gripper=short), edges=np.array([[c, a]]))
     assert deep.evaluations[0].reason == NoGrasp.TOO_DEEP
 

@@ -1,6 +1,7 @@
 """The ball networks, what all networks share, and their configuration."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,12 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls, edge_grasps
+from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_description import Surroundings
 from edgegrasp_model.networks import layers
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network
-from edgegrasp_model.networks.config import EDGEGRASP_SMALL
+from edgegrasp_model.networks.config import EDGEGRASP_SMALL, HAND, NetworkConfig
+from edgegrasp_model.networks.hand import HandBatch
+from edgegrasp_model.networks.import_checkpoint import import_checkpoint
+from edgegrasp_model.options import SupportPlane
+from edgegrasp_model.scene.cloud import Cloud
 
-from .scenes import SEED, TINY, RandomScene
+from .scenes import PANDA, SEED, TINY, RandomScene
 
 architectures = pytest.mark.parametrize("architecture", ["edgegrasp", "vn-edgegrasp"])
 has_onednn = pytest.mark.skipif(
@@ -95,3 +103,148 @@ def test_neither_single_precision_nor_recorded_gradients_change_a_score(architec
 def test_a_batch_without_grasps_has_no_scores(architecture):
     empty = replace(RandomScene.of_seed(1), edges=np.empty((0, 2), dtype=np.int64))
     assert scores(build_network(TINY[architecture]), empty.batch(torch.float32)).shape == (0,)
+
+
+# What a hand sees of the cloud in its own frame, and the network that scores it by that.
+
+
+UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)
+CAMERA = np.array([0.3, 0.2, 0.5], dtype=np.float32)
+
+
+def scene(seed: int) -> tuple[Cloud, Candidates]:
+    """A cloud with edge grasps of 60 random pairs."""
+    rng = np.random.default_rng(seed)
+    points = (rng.uniform(-0.5, 0.5, (150, 3)) * (0.06, 0.05, 0.07)).astype(np.float32)
+    cloud = Cloud(points, points / np.linalg.norm(points, axis=1, keepdims=True))
+    return cloud, edge_grasps(cloud, *rng.integers(150, size=(2, 60)), PANDA)
+
+
+def plane(up: np.ndarray, offset: float) -> SupportPlane:
+    return SupportPlane(normal=tuple(up.tolist()), offset=offset)
+
+
+def look(
+    cloud: Cloud,
+    candidates: Candidates,
+    camera: np.ndarray | None = CAMERA,
+    support: SupportPlane | None = None,
+    limit: int = 400,
+    gripper: Gripper = PANDA,
+) -> HandBatch:
+    support = support or plane(UP, -0.05)
+    up = np.array(support.normal, dtype=np.float32)
+    cameras = None if camera is None else camera[None]
+    around = Surroundings(cloud, up, support, cameras)
+    return HandBatch.of_hands(around, candidates, gripper, limit)
+
+
+def hand_scores(batch: HandBatch, config: NetworkConfig = TINY["hand"]) -> torch.Tensor:
+    with torch.inference_mode():
+        return build_network(config).eval()(batch)
+
+
+def test_the_order_of_the_points_and_what_follows_them_mean_nothing() -> None:
+    batch = look(*scene(3))
+    draws = torch.rand(batch.points.shape[:2], generator=torch.Generator().manual_seed(1))
+    order = draws.argsort(dim=1)
+    there = torch.arange(400) < batch.point_count[:, None]
+    order = order.gather(1, (~there.gather(1, order)).int().argsort(dim=1, stable=True))
+    shuffled = replace(batch, points=batch.points.gather(1, order[:, :, None].expand(-1, -1, 6)))
+    assert not torch.equal(shuffled.points, batch.points)
+    torch.testing.assert_close(hand_scores(shuffled), hand_scores(batch), atol=1e-5, rtol=1e-4)
+    filled = batch.points.clone()
+    filled[~there] = 7.0
+    torch.testing.assert_close(hand_scores(replace(batch, points=filled)), hand_scores(batch))
+    nothing = replace(batch, point_count=torch.zeros_like(batch.point_count))
+    assert hand_scores(nothing).isfinite().all()
+
+
+def test_an_older_network_reads_the_numbers_that_it_knows() -> None:
+    batch, older = look(*scene(2)), replace(HAND, description_size=61)
+    fewer = replace(batch, description=batch.description[:, :61].contiguous())
+    assert torch.equal(hand_scores(batch, older), hand_scores(fewer, older))
+
+
+def test_a_hand_s_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it() -> None:
+    batch = look(*scene(0))
+    together = hand_scores(batch, HAND)
+    for rows in (slice(1), slice(3), slice(20, 37), slice(None, None, 2)):
+        parts = batch.description[rows], batch.points[rows], batch.point_count[rows]
+        assert torch.equal(hand_scores(HandBatch(*parts), HAND), together[rows])
+
+
+def test_weights_that_were_changed_are_those_that_score() -> None:
+    batch = look(*scene(5))
+    changed, fresh = (build_network(TINY["hand"]).eval() for _ in range(2))
+    with torch.inference_mode():
+        before = changed(batch)
+    with torch.no_grad():
+        for weight in changed.parameters():
+            weight += 0.01
+    fresh.load_state_dict(changed.state_dict())
+    with torch.inference_mode():
+        assert not torch.equal(changed(batch), before)
+        assert torch.equal(changed(batch), fresh(batch))
+
+
+RADIUS = 0.05  # of the reference
+scenes = pytest.mark.parametrize(
+    "scene", ["packed_00", "packed_03", "pile_04", "pile_07", "pile_09"]
+)
+
+
+@pytest.fixture(scope="module")
+def vn_network(shared_dir: Path) -> torch.nn.Module:
+    return import_checkpoint(shared_dir / "reference" / "vn_edge_grasp")[0]
+
+
+@pytest.fixture(scope="module")
+def random_network(shared_dir: Path) -> torch.nn.Module:
+    return import_checkpoint(shared_dir / "reference" / "edge_grasp_random")[0]
+
+
+def golden_batch(shared_dir: Path, scene: str) -> tuple[BallBatch, np.ndarray]:
+    """The scored edge grasps of a golden scene, and the authors' VN logits.
+
+    Asserts that our balls hold the points that theirs do.
+    """
+    golden = np.load(shared_dir / "reference" / "golden" / f"{scene}.npz")
+    crop = crop_balls(golden["points"], golden["approach_index"], RADIUS)
+    approach_row = golden["approach_index"][crop.ball_of_point]
+    ours = np.column_stack((approach_row, crop.ball_rows)).tolist()
+    assert sorted(ours) == sorted(golden["ball_edges"].tolist())
+    row_of = {tuple(pair): row for row, pair in enumerate(ours)}
+    scored = golden["ball_edges"][golden["edge_rows"]]
+    batch = BallBatch.from_cloud(
+        golden["points"],
+        golden["normals"],
+        golden["approach_index"],
+        crop,
+        contact=np.array([row_of[tuple(pair)] for pair in scored.tolist()]),
+        approach=golden["approach"],
+        depth=golden["depth"],
+    )
+    return batch, golden["logit"]
+
+
+def logits(network: torch.nn.Module, batch: BallBatch) -> np.ndarray:
+    with torch.no_grad():
+        return network(batch).numpy()
+
+
+@scenes
+def test_vn_logits_correlate_and_the_best_grasp_is_the_same(shared_dir, vn_network, scene) -> None:
+    batch, golden = golden_batch(shared_dir, scene)
+    scores = logits(vn_network, batch)
+    assert np.corrcoef(scores, golden)[0, 1] >= 0.995
+    assert scores.argmax() == golden.argmax()
+    # Where no choice of a vector falls the other way by rounding, the logits are the same.
+    assert np.median(np.abs(scores - golden)) < 1e-4
+
+
+@scenes
+def test_edgegrasp_logits_are_the_same(shared_dir, random_network, scene) -> None:
+    batch, _ = golden_batch(shared_dir, scene)
+    golden = np.load(shared_dir / "reference" / "edge_grasp_random" / "logits.npz")[scene]
+    np.testing.assert_allclose(logits(random_network, batch), golden, rtol=0, atol=1e-3)

@@ -5,9 +5,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from tests.checks import refusal
 
 from edgegrasp_model.options import parse_options
-from edgegrasp_model.scene.cloud import CloudInput
+from edgegrasp_model.results import SUPPORT
+from edgegrasp_model.scene.cloud import CloudInput, check_cloud
+from edgegrasp_model.scene.scene import build_scene, select_points
+from edgegrasp_model.scene.segment import FIXED, Segmentation
+from edgegrasp_model.scene.support import Seen, choose_support
 from edgegrasp_results import Detection
 
 from .rendered import (
@@ -18,6 +23,7 @@ from .rendered import (
     boxes_on_table,
     camera,
     render,
+    seen_box,
     seen_in_world,
     table,
     to_world,
@@ -236,3 +242,156 @@ def test_the_walls_of_a_bin_whose_inside_is_the_workspace_are_not_grasped() -> N
         workspace={"min": (-0.18, -0.14, 0.0), "max": (0.18, 0.14, 0.2)},
     )
     assert_grasped(found, inside, np.eye(4))
+
+
+# What holds for every scene, however its objects are distinguished from the background.
+
+
+PANEL = box((0.0, 0.22, 0.06), (0.3, 0.015, 0.06))  # too long for an object, thin enough for a hand
+
+
+@pytest.mark.parametrize("roll", [0.5, np.pi])
+def test_a_camera_turned_about_its_axis_sees_the_same_objects(roll: float) -> None:
+    scene, pose = [table(), *boxes_on_table(4)], camera(0.6, -1.2, 0.9)
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]]
+    places, planes = [], []
+    for T_world_camera in (pose, pose @ turn):
+        found = detect(render(scene, T_world_camera))
+        centers = np.array([one.center for one in found.objects])
+        places.append(to_world(T_world_camera, centers))
+        assert found.support is not None
+        planes.append(T_world_camera[:3, :3] @ found.support.normal)
+    assert len(places[0]) == len(places[1]) == 4
+    apart = np.linalg.norm(places[0][:, None] - places[1], axis=2).min(axis=1)
+    assert apart.max() < 0.01
+    np.testing.assert_allclose(planes[0], planes[1], atol=0.02)
+
+
+def test_new_noise_leaves_the_number_of_objects() -> None:
+    scene, pose = [table(), *BACKGROUND["wall"], *boxes_on_table(5)], camera(0.7, -1.3, 0.9)
+    assert {len(detect(render(scene, pose, seed)).objects) for seed in range(4)} == {4}
+
+
+def test_a_thinned_cloud_without_rows_shows_the_same_objects() -> None:
+    pose = camera(0.6, -1.2, 0.9)
+    cloud = render([table(), *boxes_on_table(6)], pose).reshape(-1, 3)
+    some = np.random.default_rng(0).choice(np.flatnonzero(np.isfinite(cloud[:, 0])), 20_000, False)
+    found = detect(cloud[some])
+    assert len(found.objects) >= 3
+    assert found.grasps
+
+
+def test_a_mask_of_the_caller_wins() -> None:
+    objects, pose = boxes_on_table(2), camera(0.75, -1.5, 0.9)
+    boxes = [PANEL, table(), *objects]
+    cloud = render(boxes, pose)
+    mask = seen_box(boxes, pose) == 0
+    assert detect(cloud).objects
+    segments = mask.astype(np.int32)
+    (panel,) = detect(CloudInput(cloud, segment_ids=segments)).objects
+    assert panel.number == 1
+    region = {"include": [{"kind": "mask", "mask": mask}]}
+    held = detect(cloud, approach_region=region, contact_region=region, min_score=0.0)
+    on_panel = cloud.reshape(-1, 3)[mask]
+    for grasp in held.grasps:
+        for point in (grasp.approach_point, grasp.contact_point):
+            assert np.linalg.norm(on_panel - point, axis=1).min() < 0.006
+
+
+def test_segments_stand_on_what_lies_below_them_not_on_the_top_of_a_carton() -> None:
+    carton, small = (
+        box((-0.3, -0.3, 0.15), (0.4, 0.5, 0.15)),
+        box((0.3, 0.2, 0.05), (0.02, 0.02, 0.05)),
+    )
+    boxes, pose = [small, carton, table(0.8, 0.7)], camera(0.9, -np.pi / 2, 0.9)
+    segments = (seen_box(boxes, pose) == 0).astype(np.int32)
+    found = detect(CloudInput(render(boxes, pose), segment_ids=segments))
+    assert found.support is not None
+    assert found.grasps
+    height = (small.center - pose[:3, 3]) @ pose[:3, :3] @ found.support.normal
+    assert height - found.support.offset == pytest.approx(small.half[2], abs=0.005)
+
+
+def test_every_row_is_labelled_with_an_object_the_support_or_neither() -> None:
+    objects, pose = boxes_on_table(7), camera(0.7, -1.2, 0.85)
+    boxes = [table(), *objects]
+    found = detect(render(boxes, pose), debug=True)
+    assert found.debug is not None
+    labels, number = found.debug.labels, seen_box(boxes, pose)
+    assert set(labels[labels >= 0].tolist()) == {one.number for one in found.objects}
+    assert (labels[number == 0] == SUPPORT).mean() > 0.95
+    assert (labels[number == -1] < 0).all()
+
+
+CAMERA = np.array([0.0, -0.5, 0.4])
+PLANE = {"normal": (0.0, 0.0, 1.0), "offset": 0.05, "max_depth_error": 0.12}
+
+
+def table_with_box(rng: np.random.Generator, table: int = 2000, on_table: int = 1000) -> np.ndarray:
+    """A table at z = 0.05, and on it a box with a level lid 0.06 above."""
+    flat = rng.uniform(-0.15, 0.15, (table, 3)) * (1, 1, 0)
+    box = rng.uniform(-0.05, 0.05, (on_table, 3)) + np.array([0, 0, 0.05])
+    box[: on_table // 2, 2] = 0.06
+    points = np.concatenate([flat, box]) + np.array([0, 0, 0.05])
+    return points + rng.normal(0, 0.001, points.shape)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_floor_of_a_bin_counts_and_not_the_table_beside_it(seed: int) -> None:
+    """Its floor is 12 mm over a table that is seen to one side, with as many points."""
+    rng = np.random.default_rng(seed)
+    floor = rng.uniform((-0.2, -0.15, 0.012), (0.2, 0.15, 0.012), (4000, 3))
+    table = rng.uniform((0.22, -0.3, 0.0), (0.6, 0.3, 0.0), (4000, 3))
+    held = rng.uniform((-0.04, -0.04, 0.02), (0.04, 0.04, 0.06), (500, 3))
+    points = np.concatenate([floor, table, held])
+    points = (points + rng.normal(0, 0.001, points.shape)).astype(np.float32)
+    number = np.repeat([FIXED, 0], [8000, 500])
+    up, of_object = np.array([0.0, 0.0, 1.0]), (number == 0).astype(np.float32)
+    shown = Segmentation(number, of_object, 1 - of_object, np.ones(1), up)
+    seen, inside = Seen(points, np.array([0.0, -0.5, 0.8])), np.ones(len(points), dtype=bool)
+    found = choose_support(seen, inside, shown, number == 0, parse_options({}), [])
+    assert found is not None
+    assert np.abs(found.plane.heights(floor[np.abs(floor[:, 0]) < 0.1])).max() < 0.001
+
+
+def seen_wrong(points: np.ndarray, factor: float, camera: np.ndarray = CAMERA) -> np.ndarray:
+    """The points as a camera sees them whose depths are wrong by a factor."""
+    return (camera + factor * (points - camera)).astype(np.float32)
+
+
+def built(points: np.ndarray, **support: object) -> tuple[np.ndarray, list[str]]:
+    """What is left above the plane, in the cloud's frame, and the warnings."""
+    warnings: list[str] = []
+    workspace = {"min": (-0.15, -0.15, 0.055), "max": (0.15, 0.15, 0.3)}
+    where = {"viewpoint": CAMERA.tolist(), "workspace": workspace, "objects": "off"}
+    options = parse_options({"support": PLANE | support} | where)
+    selected = select_points(check_cloud(points.astype(np.float32)), options, {}, warnings)
+    found = build_scene(selected, options, 0.004, {})
+    assert found is not None
+    return found.points_in_cloud, warnings
+
+
+def test_a_scene_is_the_same_after_wrong_depths_where_that_is_asked_for() -> None:
+    points = table_with_box(np.random.default_rng(4))
+    (right, quiet), (corrected, said) = built(points), built(seen_wrong(points, 1.06))
+    assert (len(quiet), len(said)) == (0, 1)
+    assert abs(len(right) - len(corrected)) < 0.05 * len(right)
+    np.testing.assert_allclose(right.max(axis=0), corrected.max(axis=0), atol=0.004)
+    np.testing.assert_allclose(right.min(axis=0), corrected.min(axis=0), atol=0.004)
+    wrong, quiet = built(seen_wrong(points, 1.06), max_depth_error=0.0)
+    assert quiet == []
+    assert abs(wrong[:, 2].max() - right[:, 2].max()) > 0.008
+
+
+def test_a_table_that_was_cut_away_is_missed() -> None:
+    points = table_with_box(np.random.default_rng(5), table=0)[500:]
+    _, warnings = built(points[points[:, 2] > 0.08])
+    assert len(warnings) == 1
+    assert "options.support.max_depth_error (0.12)" in warnings[0]
+
+
+def test_depths_need_a_camera() -> None:
+    cloud = check_cloud(table_with_box(np.random.default_rng(7)).astype(np.float32))
+    with refusal("options.viewpoint"):
+        select_points(cloud, parse_options({"support": PLANE}), {}, [])

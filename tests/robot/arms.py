@@ -86,13 +86,16 @@ def picks_of(
     options=None,
     place=None,
     avoid_unseen=False,
+    changed=lambda scene, detection: (scene, detection),
+    until=np.inf,
     **given,
 ):
     """The detection with the arm's plans."""
     scene, cloud, detection = scene_of(robot, T_base_cloud, **given)
+    scene, detection = changed(scene, detection)
     asked = {"name": robot.name, "T_base_cloud": T_base_cloud.tolist(), "plan": plan}
     asked |= {"place": place, "avoid_unseen": avoid_unseen}
     asked["joints"] = (robot.home if joints is None else np.asarray(joints)).tolist()
     parsed = parse_options({"robot": asked, **(options or {})})
     with_robot(parsed, robot)
-    return plan_picks(detection, scene, cloud, parsed, robot)
+    return plan_picks(detection, scene, cloud, parsed, robot, until)

@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("roboplan", reason="the extra robot is not installed")
 
-from tests.robot.arms import BOXES, TURNED, picks_of, scene_of
+from tests.checks import refusal
+from tests.robot.arms import BOXES, HALF, TURNED, picks_of, surface
 
-from edgegrasp_model.errors import InvalidRequest, StartCollision
+from edgegrasp_model.errors import StartCollision
 from edgegrasp_model.options import parse_options
-from edgegrasp_robot import plan_picks
 
 CLOSE, CLOSE_ANGLE = 1e-3, np.deg2rad(0.2)  # metres, radians
 
@@ -184,20 +184,25 @@ def test_obstacles_may_touch_each_other(fr3):
 
 def test_the_arm_itself_is_no_object(fr3):
     """The camera sees the hand, and takes it for an object."""
-    scene, cloud, detection = scene_of(fr3)
     hand = fr3.hand_pose(fr3.home)[:3, 3] + np.random.default_rng(0).uniform(-0.02, 0.02, (50, 3))
     seen = (hand - TURNED[:3, 3]) @ TURNED[:3, :3]
-    scene = replace(
-        scene,
-        points_in_cloud=np.concatenate([scene.points_in_cloud, seen.astype(np.float32)]),
-        object_of_point=np.append(scene.object_of_point, np.full(50, 7)),
-    )
-    grasps = [replace(detection.grasps[0], object=7), *detection.grasps]
-    robot = {"name": "fr3", "T_base_cloud": TURNED.tolist(), "joints": fr3.home.tolist()}
-    options = parse_options({"robot": robot})
-    found = plan_picks(replace(detection, grasps=grasps), scene, cloud, options, fr3)
+
+    def with_hand(scene, detection):
+        grasps = [replace(detection.grasps[0], object=7), *detection.grasps]
+        return with_points(scene, seen, 7), replace(detection, grasps=grasps)
+
+    found = picks_of(fr3, changed=with_hand)
     assert [grasp.object for grasp in found.grasps] == [0, 1, 2]
     assert found.counts["on_arm"] == 1
+
+
+def with_points(scene, points, number):
+    """A scene with more points (N, 3) of an object, which its cloud lacks."""
+    return replace(
+        scene,
+        points_in_cloud=np.concatenate([scene.points_in_cloud, points.astype(np.float32)]),
+        object_of_point=np.append(scene.object_of_point, np.full(len(points), number)),
+    )
 
 
 def test_reach_has_joints_and_no_motion(fr3):
@@ -208,39 +213,33 @@ def test_reach_has_joints_and_no_motion(fr3):
 
 
 def test_no_time_gives_no_motion_and_says_so(fr3):
-    scene, cloud, detection = scene_of(fr3)
-    robot = {"name": "fr3", "T_base_cloud": TURNED.tolist(), "joints": fr3.home.tolist()}
-    options = parse_options({"robot": robot})
-    found = plan_picks(detection, scene, cloud, options, fr3, until=0.0)
+    found = picks_of(fr3, until=0.0)
     assert [grasp.arm for grasp in found.grasps] == [None] * len(BOXES)
     assert "time ran out" in found.warnings[-1]
 
 
 def test_out_of_time_is_within_reach_without_a_motion(fr3, monkeypatch):
-    scene, cloud, detection = scene_of(fr3, boxes=BOXES[:1])
-    robot = {"name": "fr3", "T_base_cloud": TURNED.tolist(), "joints": fr3.home.tolist()}
     clock = count()
     monkeypatch.setattr("time.monotonic", lambda: next(clock))
     # It is asked before each grasp, and before a motion.
-    found = plan_picks(detection, scene, cloud, parse_options({"robot": robot}), fr3, until=2.5)
+    found = picks_of(fr3, boxes=BOXES[:1], until=2.5)
     assert found.grasps[0].arm.reachable
     assert found.grasps[0].arm.trajectory is None
     assert "1 grasps within reach have no trajectory" in found.warnings[0]
 
 
 def test_a_hand_that_is_the_same_turned_comes_the_nearer_way(robot):
-    (grasp, plan), *_ = plans_of(picks_of(robot))
-    scene, cloud, detection = scene_of(robot)
     half = np.array([-1, -1, 1, 1], np.float32)
-    grasps = [
-        replace(one, T_cloud_hand=one.T_cloud_hand * half, T_cloud_tcp=one.T_cloud_tcp * half)
-        for one in detection.grasps
-    ]
-    asked = {"name": robot.name, "T_base_cloud": TURNED.tolist(), "joints": robot.home.tolist()}
-    options = parse_options({"robot": asked})
-    (other, same), *_ = plans_of(
-        plan_picks(replace(detection, grasps=grasps), scene, cloud, options, robot)
-    )
+
+    def turned(scene, detection):
+        grasps = [
+            replace(one, T_cloud_hand=one.T_cloud_hand * half, T_cloud_tcp=one.T_cloud_tcp * half)
+            for one in detection.grasps
+        ]
+        return scene, replace(detection, grasps=grasps)
+
+    (grasp, plan), *_ = plans_of(picks_of(robot))
+    (other, same), *_ = plans_of(picks_of(robot, changed=turned))
     np.testing.assert_allclose(other.T_cloud_hand, grasp.T_cloud_hand, atol=1e-6)
     np.testing.assert_array_equal(same.grasp_joints, plan.grasp_joints)
 
@@ -248,78 +247,128 @@ def test_a_hand_that_is_the_same_turned_comes_the_nearer_way(robot):
 @pytest.mark.parametrize(("share", "motions"), [(0.03, 1), (0.3, 0)])
 def test_strays_over_an_object_do_not_hold_it_down(fr3, share, motions):
     """Some of its points are seen once more, 12 cm higher."""
-    scene, cloud, detection = scene_of(fr3, boxes=BOXES[:1])
-    own = np.arange(len(scene.points_in_cloud))[:: round(1 / share)]
-    up = np.linalg.inv(TURNED)[:3, 2].astype(np.float32)
-    over = scene.points_in_cloud[own] + 0.12 * up
-    scene = replace(
-        scene,
-        points_in_cloud=np.concatenate([scene.points_in_cloud, over]),
-        object_of_point=np.append(scene.object_of_point, np.full(len(over), -1)),
-    )
-    robot = {"name": "fr3", "T_base_cloud": TURNED.tolist(), "joints": fr3.home.tolist()}
-    lift = {"retreat_length": 0.15, "retreat_direction": "up"}
-    options = parse_options({"robot": robot, "collision": lift})
-    found = plan_picks(detection, scene, cloud, options, fr3)
+    up = np.linalg.inv(TURNED)[:3, 2]
+
+    def with_strays(scene, detection):
+        strays = scene.points_in_cloud[:: round(1 / share)] + 0.12 * up
+        return with_points(scene, strays, -1), detection
+
+    lift = {"collision": {"retreat_length": 0.15, "retreat_direction": "up"}}
+    found = picks_of(fr3, boxes=BOXES[:1], options=lift, changed=with_strays)
     assert found.counts["with_trajectory"] == motions
 
 
 def test_a_colliding_hand_gets_no_motion(fr3):
-    scene, cloud, detection = scene_of(fr3)
-    grasps = [replace(grasp, collision_free=False) for grasp in detection.grasps]
-    robot = {"name": "fr3", "T_base_cloud": TURNED.tolist(), "joints": fr3.home.tolist()}
-    found = plan_picks(
-        replace(detection, grasps=grasps), scene, cloud, parse_options({"robot": robot}), fr3
-    )
+    def colliding(scene, detection):
+        grasps = [replace(grasp, collision_free=False) for grasp in detection.grasps]
+        return scene, replace(detection, grasps=grasps)
+
+    found = picks_of(fr3, changed=colliding)
     assert not any(grasp.arm.reachable for grasp in found.grasps)
     assert found.counts["hand_collision"] == len(BOXES)
 
 
-REFUSED = {
-    "too few joints": ({"joints": [0.0] * 3}, "options.robot.joints", "Send 7"),
-    "beyond a limit": ({"joints": [3, 0, 0, -2, 0, 2, 0]}, "options.robot.joints.0", "fr3_joint1"),
-    "in the table": (
-        {"joints": [0.0, 1.3, 0.0, -1.0, 0.0, 2.2, 0.8]}, "options.robot.joints", "touch",
-    ),
-    "in itself": (
-        {"joints": [0.0, -1.7, 0.0, -3.0, 0.0, 0.6, 0.0]}, "options.robot.joints", "touch",
-    ),
-    "unseen by nobody": ({"avoid_unseen": True}, "options.robot.avoid_unseen", "viewpoint"),
-    "in an object": ({"boxes": ((0.08, 0.0, 0.1),)}, "options.robot.T_base_cloud", "object"),
-}  # fmt: skip
+START_IN_THE_TABLE = [0.0, 1.3, 0.0, -1.0, 0.0, 2.2, 0.8]
+START_IN_ITSELF = [0.0, -1.7, 0.0, -3.0, 0.0, 0.6, 0.0]
+REFUSED = [  # what changes, and what is said: a field, of its value, of the fix
+    ({"joints": [0.0] * 3}, "robot.joints", "", "Send 7"),
+    ({"joints": [3, 0, 0, -2, 0, 2, 0]}, "robot.joints.0", "", "fr3_joint1"),
+    ({"joints": START_IN_THE_TABLE}, "robot.joints", "touch", ""),
+    ({"joints": START_IN_ITSELF}, "robot.joints", "touch", ""),
+    ({"avoid_unseen": True}, "robot.avoid_unseen", "", "viewpoint"),
+    ({"boxes": ((0.08, 0.0, 0.1),)}, "robot.T_base_cloud", "object", ""),
+    ({"options": {"collision": "ignore"}}, "collision.mode", "", ""),
+    ({"options": {"gripper": "barrett"}}, "gripper", "", ""),
+]
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_a_robot_that_cannot_be_there_is_refused(fr3, case):
-    changed, field, word = REFUSED[case]
-    with pytest.raises(InvalidRequest) as error:
-        picks_of(fr3, **changed)
-    assert error.value.field == field
-    assert word in str(error.value)
+def test_a_robot_that_cannot_be_there_is_refused(fr3):
+    for changed, field, value, fix in REFUSED:
+        with refusal(f"options.{field}", value, fix):
+            picks_of(fr3, **changed)
     assert len(plans_of(picks_of(fr3))) == len(BOXES)  # nothing of it is left
 
 
 def test_the_start_s_collision_names_link_and_obstacle(fr3):
     with pytest.raises(StartCollision, match=r"(fr3_link\d|the hand) and the support touch"):
-        picks_of(fr3, joints=[0.0, 1.3, 0.0, -1.0, 0.0, 2.2, 0.8])
+        picks_of(fr3, joints=START_IN_THE_TABLE)
 
 
 @pytest.mark.parametrize("pose", [np.full(16, np.nan), np.zeros(16), 2 * np.eye(4)])
 def test_a_pose_that_is_none_is_refused(pose):
     robot = {"name": "fr3", "T_base_cloud": pose.ravel().tolist(), "joints": [0.0] * 7}
-    with pytest.raises(InvalidRequest) as error:
+    with refusal("options.robot.T_base_cloud."):
         parse_options({"robot": robot})
-    assert error.value.field.startswith("options.robot.T_base_cloud")
+
+
+TRAY = {"min": [0.3, -0.5, 0.0], "max": [0.6, -0.3, 0.3]}
+
+
+def placed(grasp, plan):
+    """Points (N, 3) of a grasp's object where it is put down, base frame."""
+    x, y, half = BOXES[grasp.object]
+    T = plan.T_base_place @ np.linalg.inv(TURNED @ grasp.T_cloud_hand)
+    return surface(x, y, half) @ T[:3, :3].T + T[:3, 3]
+
+
+def test_objects_are_put_into_a_region_in_one_motion(robot):
+    detection = picks_of(robot, place={"region": TRAY})
+    assert detection.counts["with_trajectory"] == len(BOXES)
+    for grasp, plan in plans_of(detection):
+        motion = plan.trajectory
+        assert_motion(robot, motion)
+        there = motion.positions[motion.release_row]
+        assert np.abs(motion.velocities[motion.release_row]).max() < 1e-6
+        np.testing.assert_allclose(there, plan.place_joints, atol=1e-6)
+        assert_pose(robot.hand_pose(there), plan.T_base_place)
+        points = placed(grasp, plan)
+        assert (points > np.array(TRAY["min"]) - 0.002).all()
+        assert (points < np.array(TRAY["max"]) + 0.002).all()
+        assert points[:, 2].min() < 0.01
+
+
+def test_an_object_is_put_in_a_pose(fr3):
+    pose = np.eye(4)
+    pose[:3, 3] = 0.4, -0.35, 0.08
+    place = {"T_base_object": pose.tolist()}
+    ((grasp, plan),) = plans_of(picks_of(fr3, boxes=BOXES[:1], place=place, plan="reach"))
+    middle = (placed(grasp, plan).min(axis=0) + placed(grasp, plan).max(axis=0)) / 2
+    np.testing.assert_allclose(middle, pose[:3, 3], atol=0.002)
+    assert plan.trajectory is None
+
+
+def test_what_stands_in_the_region_is_not_met(fr3):
+    there = surface(0.45, -0.4, 0.06)
+    detection = picks_of(fr3, boxes=BOXES[:1], more=[there], place={"region": TRAY})
+    ((grasp, plan),) = plans_of(detection)
+    gap = np.abs(placed(grasp, plan)[:, None, :2] - there[None, :, :2]).max(axis=2)
+    assert gap.min() > 0.0
+    assert np.abs(plan.T_base_place[:2, 3] - (0.45, -0.4)).max() > HALF
 
 
 @pytest.mark.parametrize(
-    ("options", "field"),
+    "region",
     [
-        ({"collision": "ignore"}, "options.collision.mode"),
-        ({"gripper": "barrett"}, "options.gripper"),
+        {"min": [0.3, -0.5, 0.0], "max": [0.33, -0.3, 0.3]},  # narrower than the object
+        {"min": [1.5, -0.5, 0.0], "max": [1.8, -0.3, 0.3]},  # beyond the arm
     ],
 )
-def test_options_that_do_not_go_with_an_arm_are_refused(fr3, options, field):
-    with pytest.raises(InvalidRequest) as error:
-        picks_of(fr3, options=options)
-    assert error.value.field == field
+def test_without_a_place_nothing_is_within_reach(fr3, region):
+    detection = picks_of(fr3, place={"region": region})
+    assert detection.counts["no_place"] == len(BOXES)
+    assert detection.counts["reachable"] == 0
+    assert "arm's reach" in detection.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("place", "field"),
+    [
+        ({}, "options.robot.place"),
+        ({"region": TRAY, "T_base_object": np.eye(4).tolist()}, "options.robot.place"),
+        ({"T_base_object": np.zeros((4, 4)).tolist()}, "options.robot.place.T_base_object"),
+        ({"region": {"min": TRAY["max"], "max": TRAY["min"]}}, "options.robot.place.region"),
+    ],
+)
+def test_a_place_that_is_none_is_refused(fr3, place, field):
+    with refusal(field):
+        picks_of(fr3, place=place)

@@ -1,6 +1,5 @@
 """The same request gives the same answer, whatever transport and format it comes by."""
 
-import io
 import json
 from collections.abc import Iterator
 from typing import Any
@@ -11,8 +10,7 @@ import jsonschema
 import numpy as np
 import pytest
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
-from PIL import Image
-from tests.cloud_files import npy, npz, xyz
+from tests.cloud_files import npy, npz, png, xyz
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_service.front.http import DOCUMENT
@@ -78,12 +76,6 @@ def test_every_way_in_gives_the_same_grasps(cloud: np.ndarray, channel, http) ->
     assert all(grasps_of(answer) == expected for answer in answers)
 
 
-def png_of(pixels: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "png")
-    return stream.getvalue()
-
-
 def test_a_form_of_camera_files(http) -> None:
     depth = np.random.default_rng(0).integers(4000, 6000, (24, 32)).astype(np.uint16)
     camera = [60.0, 50.0, 15.5, 11.5]
@@ -91,9 +83,9 @@ def test_a_form_of_camera_files(http) -> None:
     image = {"depth": (depth / 10000).tolist(), "intrinsics": camera}
     expected = http.post("/v1/grasps", json={"depth_images": [image]}).json()
     labels = (depth > 5000).astype(np.uint8)
-    png = {"depth": ("depth.png", png_of(depth)), "segment_ids": ("labels.png", png_of(labels))}
+    images = {"depth": ("depth.png", png(depth)), "segment_ids": ("labels.png", png(labels))}
     array = {"depth": ("depth.npy", npy(depth))}
-    for files, text in ((png, "60,50,15.5,11.5"), (array, json.dumps(nested))):
+    for files, text in ((images, "60,50,15.5,11.5"), (array, json.dumps(nested))):
         parts = {"intrinsics": text, "depth_scale": "0.0001"}
         answer = http.post("/v1/grasps", files=files, data=parts)
         assert answer.status_code == 200, answer.text
@@ -107,7 +99,7 @@ def test_a_form_of_camera_files(http) -> None:
         ({"intrinsics": "60,50"}, "depth_images.0.intrinsics"),
         ({"intrinsics": "60,50,15.5,11.5", "depth_images": "[]"}, "depth_images"),
     ):
-        problem = check(http.post("/v1/grasps", files=png, data=parts), "Problem")
+        problem = check(http.post("/v1/grasps", files=images, data=parts), "Problem")
         assert problem["field"] == field
 
 

@@ -2,17 +2,19 @@
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.programs import run
 
-from edgegrasp_sim.camera import look_at
-from edgegrasp_sim.engine import Intrinsics, choose_engine, make_world
+from edgegrasp_sim.camera import look_at, points_of
+from edgegrasp_sim.engine import Intrinsics, World, choose_engine, make_world
 from edgegrasp_sim.engine.urdf import read_obj, read_urdf
 from edgegrasp_sim.objects import ObjectModel
 from edgegrasp_sim.scene import load_object
+from edgegrasp_sim.sensor import SENSORS, STRUCTURED_LIGHT
 from edgegrasp_sim.surroundings import OPEN_TABLE
 
 CUBE = ObjectModel("cube", Path(__file__).parent / "cube.urdf")  # 0.05 m
@@ -94,3 +96,85 @@ def test_both_engines_see_the_same() -> None:
             images.append(world.render_depth(T_world_camera, Intrinsics()))
     differs = np.abs(images[0] - images[1]) > 2e-4
     assert differs.mean() < 0.002  # some pixels on edges
+
+
+CENTRE = np.array([0.15, 0.12, 0.10])
+HALF = np.array([0.03, 0.04, 0.05])
+CAMERA = Intrinsics()
+
+
+def distance_to_box(points: np.ndarray) -> np.ndarray:
+    outside = np.abs(points - CENTRE) - HALF
+    return np.linalg.norm(np.maximum(outside, 0.0), axis=1) + np.minimum(outside.max(axis=1), 0.0)
+
+
+@pytest.mark.parametrize(("aside", "azimuth"), [(0.5, 0.0), (0.5, 1.0), (0.5, 4.0), (0.0, 0.0)])
+def test_a_box_appears_where_it_is(world: World, aside: float, azimuth: float) -> None:
+    target = np.array([0.15, 0.15, 0.1])
+    away = [aside * np.cos(azimuth), aside * np.sin(azimuth), 0.5]  # or straight above
+    eye = target + np.array(away)
+    world.add_box(2 * HALF, CENTRE, friction=0.5)
+    T_world_camera = look_at(eye, target)
+    points = points_of(world.render_depth(T_world_camera, CAMERA), T_world_camera, CAMERA)
+    assert len(points) > 1000
+    assert np.abs(distance_to_box(points)).max() < 1e-4
+    # The top is seen from edge to edge, so that no pixel is shifted sideways either.
+    top = points[points[:, 2] > CENTRE[2] + HALF[2] - 1e-4]
+    assert top[:, :2].min(axis=0) == pytest.approx(CENTRE[:2] - HALF[:2], abs=1.5e-3)
+    assert top[:, :2].max(axis=0) == pytest.approx(CENTRE[:2] + HALF[:2], abs=1.5e-3)
+
+
+DEPTH_CAMERA = Intrinsics()
+FAULTLESS = replace(
+    STRUCTURED_LIGHT, baseline=0.0, window=1, fattening=0.0, noise_floor=0.0, noise_growth=0.0,
+    warp=0.0, disparity_step=0.0, grazing=180.0, missing=0.0,
+)  # fmt: skip
+
+
+def wall(depth: float) -> np.ndarray:
+    return np.full((240, 320), depth)
+
+
+def box_before_wall() -> np.ndarray:
+    depth = wall(1.0)
+    depth[80:160, 120:200] = 0.8
+    return depth
+
+
+def seen(sensor, depth: np.ndarray, seed: int = 0) -> np.ndarray:
+    return sensor.apply(depth, DEPTH_CAMERA, np.random.default_rng(seed))
+
+
+def test_a_camera_without_faults_sees_what_is_there_and_nothing_beyond_its_range() -> None:
+    depth = box_before_wall()
+    depth[:, 300:] = DEPTH_CAMERA.far
+    image = seen(FAULTLESS, depth)
+    assert np.isnan(image[:, 300:]).all()
+    np.testing.assert_allclose(image[:, :300], depth[:, :300], atol=1e-6)
+
+
+@pytest.mark.parametrize("pixels", [1, 4])
+def test_noise_grows_with_the_square_of_the_depth(pixels: int) -> None:
+    noisy = replace(FAULTLESS, noise_growth=0.002, noise_pixels=pixels)
+    spread = [seen(noisy, wall(depth)).std() for depth in (0.5, 1.0, 1.5)]
+    assert spread == pytest.approx([0.0005, 0.002, 0.0045], rel=0.15)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_what_the_projector_does_not_light_is_missing_on_its_other_side(side: float) -> None:
+    missing = np.isnan(seen(replace(FAULTLESS, baseline=side * 0.075), box_before_wall()))
+    beside = [slice(100, 120), slice(200, 220)]  # to the left of the box, and to the right
+    shadow, lit = beside if side > 0 else reversed(beside)
+    width = 0.075 * DEPTH_CAMERA.focal_length * (1 / 0.8 - 1)  # pixels
+    assert missing[90:150, shadow].sum(axis=1) == pytest.approx(np.full(60, width), abs=2)
+    assert not missing[90:150, lit].any()
+    assert not missing[:70].any()
+
+
+@pytest.mark.parametrize("kind", SENSORS)
+def test_the_same_seed_gives_the_same_image(kind: str) -> None:
+    depth = box_before_wall()
+    image = seen(SENSORS[kind], depth)
+    np.testing.assert_array_equal(image, seen(SENSORS[kind], depth))
+    assert not np.array_equal(image, seen(SENSORS[kind], depth, seed=1), equal_nan=True)
+    assert np.nanmedian(np.abs(image - depth)) < 0.005

@@ -1,3 +1,4 @@
+import json
 import re
 from pathlib import Path
 
@@ -5,10 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from edgegrasp_model.networks.checkpoint import load_checkpoint
+from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector
+from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
+from edgegrasp_model.options import DetectOptions
+from edgegrasp_training.examples import pack_balls, pack_hands, tried_grasps
 from edgegrasp_training.options import TrainingOptions
+from edgegrasp_training.outcomes import fit, read_outcomes, recalibrate
 from edgegrasp_training.recipes import RECIPES, recipe
+from edgegrasp_training.teacher import GRASPS_PER_BALL, Teacher
 from edgegrasp_training.training import Trainer
 from edgegrasp_training.views import find_views, split_by_scene
 
@@ -100,3 +106,102 @@ def test_every_recipe_can_be_built_and_an_unknown_one_lists_them() -> None:
         assert recipe(name).name == name
     with pytest.raises(ValueError, match=re.escape(", ".join(RECIPES))):
         recipe("edgegrasp-huge")
+
+
+@pytest.fixture(scope="module")
+def weights(make_trainer, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A hand network that learned which grasps of the made-up views hold."""
+    folder = tmp_path_factory.mktemp("guide")
+    trainer = make_trainer(folder, name="guide")
+    trainer.run(ignore)
+    trainer.finish({}, "")
+    return folder / "guide.safetensors"
+
+
+@pytest.fixture(scope="module")
+def teacher(weights: Path) -> Teacher:
+    return Teacher(weights, 0.04)
+
+
+def test_a_teacher_scores_candidates_above_the_table(made_up_view, views, teacher) -> None:
+    view = made_up_view(0)
+    labels = teacher.soft_labels(views[0])
+    balls, count = np.unique(labels.approach_index, return_counts=True)
+    assert 6 < len(balls) <= 24
+    assert set(np.unique(view.approach_index)) <= set(balls.tolist())
+    assert 0 < count.max() <= GRASPS_PER_BALL
+    toward, chance = labels.approach[:, 2].astype(float), labels.chance.astype(float)
+    assert chance[toward > 0.6].mean() > 1.5 * chance[toward < 0.2].mean()
+
+
+def test_loss_falls_with_a_teacher_who_is_named_in_card_and_checkpoint(
+    make_trainer, teacher: Teacher, tmp_path: Path
+) -> None:
+    run = make_trainer(tmp_path, "balls", teacher=teacher)
+    before = run.evaluate()
+    run.run(ignore)
+    after = run.finish({}, "edgegrasp train data --teacher guide.safetensors")
+    assert after.loss < 0.9 * before.loss
+    _, metadata = load_checkpoint(tmp_path / "tiny.safetensors")
+    digest = teacher.metadata.digest
+    assert metadata.training["teacher"] == "guide"
+    assert metadata.training["teacher_digest"] == digest
+    card = (tmp_path / "tiny.md").read_text()
+    assert "| teacher | guide |" in card
+    assert digest in card
+
+
+def test_only_hands_teach_and_only_balls_are_taught(make_trainer, networks, teacher, tmp_path):
+    metadata = CheckpointMetadata("tiny", networks["balls"], voxel_size=0.0045, gripper="panda")
+    save_checkpoint(tmp_path / "tiny.safetensors", build_network(networks["balls"]), metadata)
+    with pytest.raises(ValueError, match="teacher: got a network of architecture 'edgegrasp'"):
+        Teacher(tmp_path / "tiny.safetensors", 0.04)
+    with pytest.raises(ValueError, match="tiny learns from labels alone"):
+        make_trainer(tmp_path / "run", "hands", teacher=teacher)
+
+
+@pytest.mark.parametrize("name", ["balls", "vn", "hands"])
+def test_the_new_weights_answer_the_fitted_probability(name, networks, made_up_view, tmp_path):
+    config, old = networks[name], tmp_path / "old.safetensors"
+    metadata = CheckpointMetadata("old", config, 0.0045, "panda", temperature=1.5)
+    network = build_network(config, torch.Generator().manual_seed(0))
+    save_checkpoint(old, network, metadata)
+    network, metadata = load_checkpoint(old)
+    lines = [
+        {"digest": metadata.digest, "score": 0.9, "held": number % 3 == 0} for number in range(60)
+    ]
+    lines.append({"digest": "of other weights", "score": 0.9, "held": True})
+    file = tmp_path / "outcomes.jsonl"
+    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert recalibrate(old, file, tmp_path).startswith("60 outcomes, 0.33 held")
+    new, recalibrated = load_checkpoint(tmp_path / "old-robot.safetensors")
+    assert recalibrated.training["recalibrated_from_digest"] == metadata.digest
+    scale, shift = fit(read_outcomes(file, metadata.digest))
+    assert shift < -0.5
+    grasps = tried_grasps(made_up_view(1), config)
+    pack = pack_hands if name == "hands" else pack_balls
+    batch = pack(grasps, grasps.balls(), config).batch
+    with torch.inference_mode():
+        before, after = network(batch), new(batch)
+    expected = scale * before / metadata.temperature + shift
+    torch.testing.assert_close(after / recalibrated.temperature, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_the_order_of_grasps_stays_and_few_outcomes_warn(tmp_path: Path) -> None:
+    (old,) = (one for one in WEIGHTS_FOLDER.glob("edgegrasp-plus.safetensors"))
+    before = GraspDetector.load(old)
+    lines = [{"digest": before.metadata.digest, "score": 0.9, "held": row == 0} for row in range(9)]
+    file = tmp_path / "outcomes.jsonl"
+    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert "Warning: fewer than 25 outcomes" in recalibrate(old, file, tmp_path)
+    after = GraspDetector.load(tmp_path / "edgegrasp-plus-robot.safetensors")
+    box = np.random.default_rng(0).uniform(-1, 1, (4000, 3)) * (0.02, 0.03, 0.05)
+    boxes = np.concatenate([box, box @ np.diag([1, 0.6, 1]) + (0.15, 0, 0)])
+    alone = {"support": None, "objects": "off", "order": "highest", "min_score": 0.0}
+    options = DetectOptions(viewpoint=(0.0, -0.3, 0.5), **alone)
+    for asked in (options, options.model_copy(update={"order": "score"})):
+        first, second = (one.detect(boxes, asked).grasps for one in (before, after))
+        assert len(first) > 5
+        for one, other in zip(first, second, strict=True):
+            np.testing.assert_array_equal(one.T_cloud_hand, other.T_cloud_hand)
+        assert second[0].score < first[0].score - 0.1

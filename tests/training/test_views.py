@@ -5,10 +5,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from scipy.special import expit
 
 from edgegrasp_model.gripper import gripper_fields, load_gripper
+from edgegrasp_model.hand_description import Surroundings
+from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
+from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
+from edgegrasp_model.networks.hand import HandBatch
+from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_sim.objects import CLUTTER, ObjectSet
-from edgegrasp_training.views import find_views, load_view, scene_of, split_by_scene
+from edgegrasp_training.evaluation import evaluate_scores, reliability, score_views
+from edgegrasp_training.examples import pack_balls, pack_hands, tried_grasps
+from edgegrasp_training.recipes import LENGTH_UNIT
+from edgegrasp_training.views import (
+    TABLE,
+    UP,
+    WORKSPACE,
+    find_views,
+    load_view,
+    scene_of,
+    split_by_scene,
+)
 
 SAMPLE = Path(__file__).parents[2] / "examples" / "labelled_views"
 
@@ -68,3 +86,86 @@ def test_no_test_object_is_in_the_data_of_the_shipped_weights(shared_dir, kind) 
     kept_apart = ObjectSet.from_folder(shared_dir / "objects", kind, "test").models
     assert not {name for name, _ in listed} & {model.name for model in kept_apart}
     assert not {digest for _, digest in listed} & {model.digest for model in kept_apart}
+
+
+Networks = dict[str, NetworkConfig]
+
+
+def test_packed_balls_hold_each_tried_grasp_and_its_contact(made_up_view, networks) -> None:
+    balls = networks["balls"]
+    grasps = tried_grasps(made_up_view(1), balls)
+    batch, label, weight = pack_balls(grasps, grasps.balls(), balls)
+    assert len(label) == len(grasps.label) == len(batch.contact)
+    assert (weight == 1).all()
+    contact = grasps.cloud.points[grasps.candidates.contact_index]
+    edge = contact - grasps.cloud.points[grasps.candidates.approach_index]
+    found = batch.points[batch.contact].numpy() * LENGTH_UNIT
+    np.testing.assert_allclose(found, edge @ grasps.turn.T, atol=1e-6)
+    depth = batch.depth.numpy() * LENGTH_UNIT
+    np.testing.assert_allclose(depth, grasps.candidates.depth, atol=1e-6)
+    some = pack_balls(grasps, grasps.balls()[:2], balls)
+    assert some.batch.num_balls == 2
+    assert 0 < len(some.label) < len(label)
+
+
+def test_packed_hands_are_what_the_detector_would_pack_and_vary(made_up_view, networks) -> None:
+    view, hands = made_up_view(1), networks["hands"]
+    grasps = tried_grasps(view, hands)
+    batch, label, _ = pack_hands(grasps, grasps.balls()[:2], hands)
+    rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, grasps.balls()[:2]))
+    np.testing.assert_array_equal(label.numpy(), grasps.label[rows])
+    side = near_workspace_side(view.points, WORKSPACE, UP, view.points)
+    known = TABLE, view.camera_position[None], side, view.numbered_objects()
+    around = Surroundings(grasps.cloud, UP, *known)
+    candidates = grasps.candidates.take(rows)
+    exact = HandBatch.of_hands(around, candidates, load_gripper(), hands.hand_points)
+    torch.testing.assert_close(batch.description, exact.description, atol=2e-3, rtol=2e-3)
+    torch.testing.assert_close(batch.point_count, exact.point_count)
+    varied = pack_hands(grasps, grasps.balls()[:2], hands, np.random.default_rng(0)).batch
+    assert not torch.equal(varied.points, batch.points)
+    there = torch.arange(hands.hand_points) < varied.point_count[:, None]
+    assert (varied.points[there].abs().sum(dim=1) > 0).all()
+    assert (varied.points[~there] == 0).all()
+
+
+def test_a_grasp_that_stays_when_shaken_is_worth_a_little_more(made_up_view, networks) -> None:
+    view, balls = made_up_view(1), networks["balls"]
+    firm = np.where(view.success == 1, np.arange(len(view.success)) % 2, view.success)
+    shaken = tried_grasps(replace(view, firm=firm.astype(np.int8)), balls).label
+    unknown = tried_grasps(view, balls).label
+    assert set(shaken.tolist()) == {0.0, 1.0, np.float32(0.8)}
+    assert len(set(unknown.tolist())) == 2
+    np.testing.assert_array_equal(unknown > 0.5, shaken > 0.5)
+    assert 0.8 < unknown.max() < 1
+
+
+# Figures of scores, and weights compared on labelled views.
+
+
+def test_the_temperature_undoes_overconfidence() -> None:
+    rng = np.random.default_rng(0)
+    honest = rng.normal(size=20_000)
+    label = (rng.random(20_000) < expit(honest)).astype(float)
+    found = evaluate_scores((honest * 3).astype(np.float32), label.astype(np.float32))
+    assert found.temperature == pytest.approx(3, rel=0.1)
+    ranges = reliability(expit(found.logit / found.temperature), found.label)
+    assert all(each.score == pytest.approx(each.held, abs=0.05) for each in ranges.values())
+    assert sum(each.number for each in ranges.values()) == 20_000
+
+
+def test_views_are_scored_by_hand_networks_alone(made_up_view, networks, tmp_path: Path) -> None:
+    made_up_view(1).save(tmp_path / "pile_0-000000_0.npz")
+    made_up_view(2).save(tmp_path / "table_0-000001_0.npz")
+    paths = sorted(tmp_path.glob("*.npz"))
+    files = {}
+    for name in ("hands", "balls"):
+        files[name] = tmp_path / f"{name}.safetensors"
+        metadata = CheckpointMetadata(name, networks[name], 0.0045, "panda")
+        save_checkpoint(files[name], build_network(networks[name]), metadata)
+    scored = score_views(paths, [files["hands"], files["hands"]])
+    assert set(scored.kind.tolist()) == {"pile", "table"}
+    assert scored.logit.shape == (2, len(scored.held))
+    np.testing.assert_array_equal(*scored.logit)
+    assert 0 < scored.held.mean() < 1
+    with pytest.raises(ValueError, match="hand networks"):
+        score_views(paths, [files["balls"]])

@@ -2,13 +2,14 @@
 
 import base64
 import json
-import tracemalloc
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.checks import bounded_memory
 from tests.cloud_files import npy
+from tests.many_options import OWN_GRIPPER
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client.over_grpc import fill
@@ -104,15 +105,6 @@ def spoiled(row: int, value: float) -> np.ndarray:
     return cloud
 
 
-GRIPPER = {
-    "max_opening": 0.08,
-    "tip_z": 0.1,
-    "contact_z": 0.09,
-    "tcp_z": 0.1,
-    "hand": {"boxes": [[[-0.1, -0.1, -0.1], [0.1, 0.1, 0.05]]]},
-    "finger": {"boxes": [[[-0.01, 0.0, 0.05], [0.01, 0.01, 0.1]]]},
-}
-
 POSE = np.eye(4).ravel().tolist()
 HELD = {"id": 7, "T_cloud_hand": POSE}
 
@@ -188,8 +180,8 @@ CASES = {
     ),
     "approach direction of nothing": option("approach_direction", {}, "", "{", "cone"),
     "gripper without fingertips": option(
-        "gripper", {name: GRIPPER[name] for name in GRIPPER if name != "tip_z"}, ".tip_z",
-        "nothing", "required",
+        "gripper", {name: OWN_GRIPPER[name] for name in OWN_GRIPPER if name != "tip_z"},
+        ".tip_z", "nothing", "required",
     ),
     # What an earlier answer found.
     "grasps of two with one id": option(
@@ -437,11 +429,6 @@ def test_many_empty_messages_are_counted_not_read(field, body, grpc_) -> None:
     """Two bytes each on the wire, and once half a kilobyte each in Python."""
     content = grasp_pb2.ScoreGraspsRequest(points=POINTS.tobytes(), **body).SerializeToString()
     method = "ScoreGrasps" if field in ("edges", "hand_poses") else "DetectGrasps"
-    tracemalloc.start()
-    try:
+    with bounded_memory(2_000_000):
         error = grpc_.problem(method, content)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
     assert (error.kind, error.field, error.value) == ("invalid-request", field, f"{MANY} of them")
-    assert peak < 2_000_000

@@ -32,3 +32,26 @@ def test_grasps_are_on_what_a_mask_or_the_cloud_of_an_object_marks(real_server) 
         assert len(contacts) == 5
         away = [bar.distance(to_world(pose, contacts)) for bar in HANDLE]
         assert (np.min(away, axis=0) < 0.008).all()
+
+
+# Grasps on the rim of a bowl that is wider than the hand opens.
+
+
+RADIUS, RIM = 0.06, 0.055  # metres; the hand opens by 0.08
+TURNS = np.arange(24) * np.pi / 12
+WALL = [
+    box((RADIUS * np.cos(a), RADIUS * np.sin(a), RIM / 2), (0.0015, 0.0085, RIM / 2), a)
+    for a in TURNS
+]
+FLOOR = box((0, 0, 0.002), (0.05, 0.05, 0.002))
+
+
+def test_the_rim_of_a_bowl_is_grasped_with_one_finger_inside(real_server) -> None:
+    scene, pose = [*WALL, FLOOR, table()], camera(0.8, 0.5, 0.5)
+    image = depth_image(render(scene, pose))
+    with GraspClient(real_server.grpc_address) as client:
+        best = client.detect(depth_images=[image]).grasps[0]
+    assert best.score > 0.5
+    tips = best.T_cloud_tcp @ np.array([[0, side, 0, 1] for side in (0.04, -0.04)]).T
+    inside, outside = sorted(np.linalg.norm(to_world(pose, tips[:3].T)[:, :2], axis=1))
+    assert inside < RADIUS < outside
