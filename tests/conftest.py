@@ -16,6 +16,7 @@ os.environ["OMP_NUM_THREADS"] = "1"  # two test processes and their servers shar
 
 import numpy as np
 import pytest
+import trustme
 from benchmarks import serve_dummy
 from hypothesis import HealthCheck, settings
 
@@ -113,6 +114,14 @@ def dummy_server(start_dummy) -> Iterator[RunningServer]:
         yield server
 
 
+@pytest.fixture(scope="session")
+def catalogue() -> Any:
+    """The weights that ship, in this process."""
+    from edgegrasp_model.detector import ModelCatalogue
+
+    return ModelCatalogue.load()
+
+
 @pytest.fixture(params=["grpc", "rest"])
 def transport(request: pytest.FixtureRequest) -> str:
     return str(request.param)
@@ -122,3 +131,22 @@ def transport(request: pytest.FixtureRequest) -> str:
 def cloud() -> np.ndarray:
     rng = np.random.default_rng(0)
     return rng.uniform(-0.1, 0.1, (500, 3)).astype(np.float32)
+
+
+@pytest.fixture(scope="session")
+def pem(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Files: a CA, a server's and a client's certificates and keys of it, and those of another."""
+    folder = tmp_path_factory.mktemp("pem")
+    files: dict[str, Path] = {}
+    for prefix in ("", "other_"):
+        authority = trustme.CA()
+        files[f"{prefix}ca"] = folder / f"{prefix}ca.pem"
+        authority.cert_pem.write_to_path(files[f"{prefix}ca"])
+        for name in ("server", "client"):
+            issued = authority.issue_cert("127.0.0.1", "localhost")
+            files[f"{prefix}{name}"] = folder / f"{prefix}{name}.pem"
+            files[f"{prefix}{name}_key"] = folder / f"{prefix}{name}_key.pem"
+            chain = b"".join(blob.bytes() for blob in issued.cert_chain_pems)
+            files[f"{prefix}{name}"].write_bytes(chain)
+            issued.private_key_pem.write_to_path(files[f"{prefix}{name}_key"])
+    return files

@@ -38,11 +38,6 @@ def assert_same_grasps(found: dict[str, np.ndarray], expected: dict[str, np.ndar
             pytest.fail(f"grasp {row} is gone, among others of its score")
 
 
-@pytest.fixture(scope="module")
-def catalogue() -> ModelCatalogue:
-    return ModelCatalogue.load()
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_detector_answers_as_recorded(name: str, catalogue: ModelCatalogue) -> None:
     assert_same(record(answer(CASES[name](), catalogue)), load(name))

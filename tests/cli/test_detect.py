@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import trustme
 from PIL import Image
 
 from edgegrasp_cli.flags import option_flags
@@ -164,22 +163,14 @@ def test_models_are_listed_from_a_server_or_from_here(dummy_server, run, refused
     assert "edgegrasp models: " in refused("models", "--server", "127.0.0.1:1")
 
 
-@pytest.fixture
-def pem(tmp_path: Path) -> dict[str, str]:
-    """Files: a CA, and a certificate of it for this machine."""
-    authority = trustme.CA()
-    issued = authority.issue_cert("127.0.0.1")
-    authority.cert_pem.write_to_path(tmp_path / "ca.pem")
-    issued.private_key_and_cert_chain_pem.write_to_path(tmp_path / "own.pem")
-    return {name: str(tmp_path / f"{name}.pem") for name in ("ca", "own")}
-
-
 def test_a_server_with_tls_and_tokens(file, pem, run, refused, tmp_path, start_dummy, monkeypatch):
     token = tmp_path / "token"
     token.write_text("user-token-0123456789\n")
-    certificates = ("--tls-certificate", pem["own"], "--tls-key", pem["own"])
-    flags = (*certificates, "--tls-client-ca", pem["ca"], "--token-file", str(token))
-    with start_dummy(*flags) as server:
+    names = ("certificate", ""), ("key", "_key")
+    own, certificates = (
+        [f"--tls-{name}={pem[who + end]}" for name, end in names] for who in ("server", "client")
+    )
+    with start_dummy(*own, f"--tls-client-ca={pem['ca']}", f"--token-file={token}") as server:
         for address in (server.grpc_address, server.http_url):
             asked = ("--server", address, *certificates, "--tls-ca", pem["ca"])
             document = json.loads(run("detect", file, *asked, "--token-file", token, "--json"))

@@ -15,6 +15,7 @@ from mcp.server.mcpserver.exceptions import ToolError, UnexpectedToolError
 
 from edgegrasp.oip import open_inference_pb2 as messages
 from edgegrasp_cli import mcp, open_inference
+from edgegrasp_client import GraspClientError
 from edgegrasp_client.requests import cloud_file, depth_image_fields
 
 from .conftest import POINTS, VALUES, changed, given, mutated
@@ -52,12 +53,12 @@ def infer(body: bytes, header: str | None = None) -> None:
 @contextlib.contextmanager
 def refused() -> Iterator[None]:
     """What is inside may be refused as the caller's fault."""
-    refusal = None
     try:
         yield
-    except open_inference.RefusedError as error:
-        refusal = error
-    assert refusal is None or (400 <= refusal.status < 500 and str(refusal).encode())
+    except GraspClientError as error:
+        _, status, why = open_inference.refusal(error)
+        assert 400 <= status < 500
+        assert why.encode()
 
 
 @given(changed(INFER) | VALUES)

@@ -32,12 +32,17 @@ class Reply:
     kind: str = ""
     field: str = ""
     retry_after: float | None = None
+    detail: str = ""
     counts: dict[str, int] = dataclasses.field(default_factory=dict)
-    scores: list[float] = dataclasses.field(default_factory=list)
+    digest: str = ""  # of the first weights, after a reload
 
     @property
     def fine(self) -> bool:
         return self.code in ("OK", "200")
+
+
+def bearer(token: str | None) -> dict[str, str]:
+    return {"authorization": f"Bearer {token}"} if token else {}
 
 
 class Grpc:
@@ -61,16 +66,25 @@ class Grpc:
         message = grasp_pb2.ScoreGraspsRequest(points=points.tobytes(), edges=edges)
         return await self._answer(self.stub.ScoreGrasps, message, timeout)
 
-    async def _answer(self, method: Any, message: Any, timeout: float | None) -> Reply:
+    async def reload(self, token: str | None = None) -> Reply:
+        return await self._answer(
+            self.stub.ReloadModels, grasp_pb2.ReloadModelsRequest(), None, bearer(token)
+        )
+
+    async def _answer(
+        self, method: Any, message: Any, timeout: float | None, headers: Any = ()
+    ) -> Reply:
         try:
-            body = await method(message, timeout=timeout)
+            body = await method(message, timeout=timeout, metadata=tuple(dict(headers).items()))
         except aio.AioRpcError as error:
             trailers = dict(error.trailing_metadata() or ())
             detail = grasp_pb2.ErrorDetail.FromString(trailers.get("edgegrasp-error-bin", b""))
             retry_after = detail.retry_after if detail.HasField("retry_after") else None
-            return Reply(error.code().name, detail.kind, detail.field, retry_after)
-        scores = [grasp.score for grasp in getattr(body, "grasps", [])]
-        return Reply("OK", counts=dict(body.counts), scores=scores)
+            told = error.code().name, detail.kind, detail.field, retry_after
+            return Reply(*told, error.details() or "")
+        if isinstance(body, grasp_pb2.ReloadModelsResponse):
+            return Reply("OK", digest=body.models[0].digest)
+        return Reply("OK", counts=dict(body.counts))
 
     async def close(self) -> None:
         await self.channel.close(None)
@@ -87,26 +101,31 @@ class Rest:
     async def detect(
         self, points: np.ndarray, timeout: float | None = None, **options: Any
     ) -> Reply:
-        return await self._answer("/v1/grasps", points, timeout, {"options": options})
+        body = {"points": points.tolist(), "options": options}
+        return await self._answer("/v1/grasps", body, timeout)
 
     async def score(self, points: np.ndarray, timeout: float | None = None) -> Reply:
-        return await self._answer("/v1/grasps:score", points, timeout, {"edges": [[0, 1]] * 3})
+        body = {"points": points.tolist(), "edges": [[0, 1]] * 3}
+        return await self._answer("/v1/grasps:score", body, timeout)
+
+    async def reload(self, token: str | None = None) -> Reply:
+        return await self._answer("/v1/models:reload", {}, None, bearer(token))
 
     async def _answer(
-        self, path: str, points: np.ndarray, timeout: float | None, fields: dict[str, Any]
+        self, path: str, body: Any, timeout: float | None, headers: Any = ()
     ) -> Reply:
-        headers = {} if timeout is None else {"X-Request-Timeout": str(timeout)}
-        body = {"points": points.tolist()} | fields
+        headers = dict(headers) | ({} if timeout is None else {"X-Request-Timeout": str(timeout)})
         response = await self.http.post(path, json=body, headers=headers)
         found = response.json()
         if response.is_success:
-            scores = [grasp["score"] for grasp in found.get("grasps", [])]
-            return Reply("200", counts=found["counts"], scores=scores)
+            digest = found["models"][0]["digest"] if "models" in found else ""
+            return Reply("200", counts=found.get("counts", {}), digest=digest)
         kind = found["type"].removeprefix("urn:edgegrasp:error:")
         retry_after = found["retry_after"]
         if retry_after is not None:
             assert response.headers["retry-after"] == str(int(retry_after))
-        return Reply(str(response.status_code), kind, found["field"], retry_after)
+        told = str(response.status_code), kind, found["field"], retry_after
+        return Reply(*told, found["detail"])
 
     async def close(self) -> None:
         await self.http.aclose()
@@ -177,6 +196,13 @@ class Running:
 
     def address(self, transport: str) -> str:
         return self.server.grpc_address if transport == "grpc" else self.server.http_url
+
+    async def speak(self, data: bytes) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        """A connection to the HTTP port on which this has been sent."""
+        host, port = self.server.http_url.removeprefix("http://").split(":")
+        reader, writer = await asyncio.open_connection(host, int(port))
+        writer.write(data)
+        return reader, writer
 
     def metrics(self) -> str:
         return self.server.metrics.page("")[0].decode()

@@ -184,9 +184,8 @@ async def test_nobody_is_read_before_there_is_a_place(serve, cloud) -> None:
         # As a stream, this client may send its message whenever it likes: never.
         call = channel.stream_unary("/edgegrasp.v1.GraspService/DetectGrasps")()
         assert await call.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-        host, port = running.server.http_url.removeprefix("http://").split(":")
-        reader, writer = await asyncio.open_connection(host, int(port))
-        writer.write(b"POST /v1/grasps HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000\r\n\r\n")
+        said = b"POST /v1/grasps HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000\r\n\r\n"
+        reader, writer = await running.speak(said)
         head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), 20)
         assert b" 429 " in head
         assert b"connection: close" in head

@@ -225,9 +225,8 @@ async def test_bodies_that_trickle_give_their_places_back(serve, cloud, transpor
                 call = channel.stream_unary("/edgegrasp.v1.GraspService/DetectGrasps")()
                 held.append(asyncio.ensure_future(call.code()))
             else:
-                host, port = running.server.http_url.removeprefix("http://").split(":")
-                reader, writer = await asyncio.open_connection(host, int(port))
-                writer.write(HEAD.encode() + b"Content-Length: 1000000\r\n\r\nX")
+                body = b"Content-Length: 1000000\r\n\r\nX"
+                reader, writer = await running.speak(HEAD.encode() + body)
                 held.append(asyncio.ensure_future(reader.readline()))
                 writers.append(writer)
         await running.until(lambda: running.waiting == 4)

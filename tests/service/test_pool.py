@@ -222,9 +222,7 @@ HEAD += b"Content-Length: 1000\r\n"
 
 async def test_a_client_that_vanishes_mid_body_leaves_its_place(serve) -> None:
     running = await serve(max_queue_length=0)
-    host, port = running.server.http_url.removeprefix("http://").split(":")
-    _, writer = await asyncio.open_connection(host, int(port))
-    writer.write(HEAD + b'\r\n{"points": [')
+    _, writer = await running.speak(HEAD + b'\r\n{"points": [')
     await writer.drain()
     await running.until(lambda: running.waiting == 1)
     writer.close()
@@ -234,9 +232,7 @@ async def test_a_client_that_vanishes_mid_body_leaves_its_place(serve) -> None:
 
 async def test_a_body_that_never_ends_is_given_up_at_the_deadline(serve) -> None:
     running = await serve()
-    host, port = running.server.http_url.removeprefix("http://").split(":")
-    reader, writer = await asyncio.open_connection(host, int(port))
-    writer.write(HEAD + b'X-Request-Timeout: 0.2\r\n\r\n{"points": [')
+    reader, writer = await running.speak(HEAD + b'X-Request-Timeout: 0.2\r\n\r\n{"points": [')
     assert b" 504 " in await asyncio.wait_for(reader.readline(), 20)
     writer.close()
     await running.until(lambda: running.ended == ["deadline-exceeded"])

@@ -24,11 +24,6 @@ from edgegrasp_service.worker.process import Job
 
 
 @pytest.fixture(scope="module")
-def catalogue() -> ModelCatalogue:
-    return ModelCatalogue.load()
-
-
-@pytest.fixture(scope="module")
 def scene() -> dict[str, np.ndarray]:
     """A box on a table, as the arrays of an .npz file."""
     points = box_on_table(3000, table=True)

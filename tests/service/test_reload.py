@@ -12,43 +12,13 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from grpc import aio
 
-from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import AsyncGraspClient, GraspClient
 from edgegrasp_model.detector import WEIGHTS_FOLDER
 
 USER = "user-token-0123456789"
 ADMIN = "admin-token-0123456789"
 NEW = "new-token-0123456789"
-
-
-class Admin:
-    """Asks one transport for a reload; the same answers from both."""
-
-    def __init__(self, server: Any, transport: str) -> None:
-        self._server, self._transport = server, transport
-
-    async def reload(self, token: str | None = ADMIN) -> tuple[str, str]:
-        """The digest, or the kind of error; and the detail."""
-        headers = {"authorization": f"Bearer {token}"} if token else {}
-        if self._transport == "rest":
-            async with httpx.AsyncClient(base_url=self._server.http_url, timeout=20) as http:
-                answer = await http.post("/v1/models:reload", headers=headers)
-            body = answer.json()
-            if answer.is_success:
-                return body["models"][0]["digest"], ""
-            return body["type"].removeprefix("urn:edgegrasp:error:"), body["detail"]
-        async with aio.insecure_channel(self._server.grpc_address) as channel:
-            stub = grasp_pb2_grpc.GraspServiceStub(channel)
-            try:
-                request = grasp_pb2.ReloadModelsRequest()
-                answer = await stub.ReloadModels(request, metadata=tuple(headers.items()))
-            except aio.AioRpcError as error:
-                trailers = dict(error.trailing_metadata())
-                detail = grasp_pb2.ErrorDetail.FromString(trailers["edgegrasp-error-bin"])
-                return detail.kind, error.details() or ""
-            return answer.models[0].digest, ""
 
 
 async def digest(server: Any) -> str:
@@ -59,7 +29,7 @@ async def digest(server: Any) -> str:
 async def test_a_reload_changes_the_digest(serve, transport: str) -> None:
     running = await serve(admin_tokens=[ADMIN])
     assert await digest(running.server) == "1"
-    assert await Admin(running.server, transport).reload() == ("2", "")
+    assert (await running.connect(transport).reload(ADMIN)).digest == "2"
     assert await digest(running.server) == "2"
     page = running.metrics()
     assert 'edgegrasp_reloads_total{outcome="succeeded"} 1.0' in page
@@ -71,27 +41,28 @@ async def test_a_reload_changes_the_digest(serve, transport: str) -> None:
 
 async def test_bad_weights_leave_the_old_ones(serve, transport: str, cloud: np.ndarray) -> None:
     running = await serve(admin_tokens=[ADMIN])
-    admin = Admin(running.server, transport)
+    admin = running.connect(transport)
     running.stages.fail("weights", "mine.safetensors: truncated")
-    kind, detail = await admin.reload()
-    assert (kind, "mine.safetensors: truncated" in detail) == ("reload-failed", True)
+    reply = await admin.reload(ADMIN)
+    assert reply.kind == "reload-failed"
+    assert "mine.safetensors: truncated" in reply.detail
     running.stages.mend("weights")
     running.stages.fail("load", "kill")  # as where there is no memory for both
-    assert (await admin.reload())[0] == "reload-failed"
+    assert (await admin.reload(ADMIN)).kind == "reload-failed"
     assert await digest(running.server) == "1"
     async with AsyncGraspClient(running.server.grpc_address) as client:
         assert len((await client.detect(cloud)).grasps) == 10
     assert 'edgegrasp_reloads_total{outcome="failed"} 2.0' in running.metrics()
-    assert await admin.reload() == ("3", "")
+    assert (await admin.reload(ADMIN)).digest == "3"
 
 
 async def test_only_an_admin_token_reloads(serve, transport: str) -> None:
     running = await serve(tokens=[USER], admin_tokens=[ADMIN])
-    admin = Admin(running.server, transport)
-    kinds = [(await admin.reload(token))[0] for token in (None, USER, USER + "x", ADMIN)]
-    assert kinds == ["unauthenticated", "permission-denied", "unauthenticated", "2"]
+    admin = running.connect(transport)
+    kinds = [(await admin.reload(token)).kind for token in (None, USER, USER + "x", ADMIN)]
+    assert kinds == ["unauthenticated", "permission-denied", "unauthenticated", ""]
     running = await serve(tokens=[USER])  # nobody may
-    assert (await Admin(running.server, transport).reload(USER))[0] == "permission-denied"
+    assert (await running.connect(transport).reload(USER)).kind == "permission-denied"
 
 
 async def test_no_spelling_of_the_address_comes_around_the_token(serve) -> None:
@@ -113,7 +84,7 @@ async def test_answers_keep_coming_while_weights_load(serve, transport, cloud) -
         AsyncGraspClient(server.http_url) as by_http,
     ):
         running.stages.shut("load")
-        reload = asyncio.create_task(Admin(server, transport).reload())
+        reload = asyncio.create_task(running.connect(transport).reload(ADMIN))
         for client in (by_grpc, by_http) * 5:
             assert len((await client.detect(cloud)).grasps) == 10
         assert not reload.done()
@@ -127,19 +98,19 @@ async def test_answers_keep_coming_while_weights_load(serve, transport, cloud) -
 
         asking = asyncio.gather(ask(by_grpc), ask(by_http), ask(by_grpc))
         running.stages.open("load")
-        assert (await reload)[0] == "2"
+        assert (await reload).digest == "2"
         assert sum(await asking) >= 3
 
 
 async def test_one_reload_at_a_time(serve) -> None:
     running = await serve(admin_tokens=[ADMIN])
     running.stages.shut("load")
-    admin = Admin(running.server, "grpc")
-    reloads = [asyncio.create_task(admin.reload()) for _ in range(4)]
+    admin = running.connect("grpc")
+    reloads = [asyncio.create_task(admin.reload(ADMIN)) for _ in range(4)]
     await asyncio.wait(reloads, return_when=asyncio.FIRST_COMPLETED)
     running.stages.open("load")
-    kinds = sorted([(await reload)[0] for reload in reloads])
-    assert kinds == ["2", "reload-failed", "reload-failed", "reload-failed"]
+    kinds = sorted([(await reload).kind for reload in reloads])
+    assert kinds == ["", "reload-failed", "reload-failed", "reload-failed"]
     assert await digest(running.server) == "2"
 
 
@@ -149,7 +120,7 @@ async def test_what_was_begun_with_the_old_weights_ends_with_them(serve, cloud) 
     running.stages.shut("finish")
     asked = asyncio.create_task(client.detect(cloud))
     await running.until(lambda: running.stages.begun["finish"] == 1)
-    assert (await Admin(running.server, "rest").reload())[0] == "2"
+    assert (await running.connect("rest").reload(ADMIN)).digest == "2"
     running.stages.open("finish")
     assert (await asked).fine
     assert (await client.detect(cloud)).fine
@@ -159,14 +130,15 @@ async def test_tokens_are_read_anew(serve, tmp_path: Path, transport: str) -> No
     file = tmp_path / "tokens"
     file.write_text(USER)
     running = await serve(token_file=file, admin_tokens=[ADMIN])
-    admin, address = Admin(running.server, transport), running.address(transport)
+    admin, address = running.connect(transport), running.address(transport)
     file.write_text("short")
-    kind, detail = await admin.reload()
-    assert (kind, "token_file" in detail) == ("reload-failed", True)
+    reply = await admin.reload(ADMIN)
+    assert reply.kind == "reload-failed"
+    assert "token_file" in reply.detail
     async with AsyncGraspClient(address, token=USER) as client:
         await client.models()
     file.write_text(NEW)
-    assert (await admin.reload())[1] == ""
+    assert (await admin.reload(ADMIN)).fine
     async with AsyncGraspClient(address, token=NEW) as client:
         await client.models()
     async with AsyncGraspClient(address, token=USER) as client:

@@ -1,0 +1,72 @@
+"""Both networks against the logits of the authors' code on five observed scenes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from edgegrasp_model.candidates.edge_grasps import crop_balls
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.import_checkpoint import import_checkpoint
+
+RADIUS = 0.05  # of the reference
+scenes = pytest.mark.parametrize(
+    "scene", ["packed_00", "packed_03", "pile_04", "pile_07", "pile_09"]
+)
+
+
+@pytest.fixture(scope="module")
+def vn_network(shared_dir: Path) -> torch.nn.Module:
+    return import_checkpoint(shared_dir / "reference" / "vn_edge_grasp")[0]
+
+
+@pytest.fixture(scope="module")
+def random_network(shared_dir: Path) -> torch.nn.Module:
+    return import_checkpoint(shared_dir / "reference" / "edge_grasp_random")[0]
+
+
+def golden_batch(shared_dir: Path, scene: str) -> tuple[BallBatch, np.ndarray]:
+    """The scored edge grasps of a golden scene, and the authors' VN logits.
+
+    Asserts that our balls hold the points that theirs do.
+    """
+    golden = np.load(shared_dir / "reference" / "golden" / f"{scene}.npz")
+    crop = crop_balls(golden["points"], golden["approach_index"], RADIUS)
+    approach_row = golden["approach_index"][crop.ball_of_point]
+    ours = np.column_stack((approach_row, crop.ball_rows)).tolist()
+    assert sorted(ours) == sorted(golden["ball_edges"].tolist())
+    row_of = {tuple(pair): row for row, pair in enumerate(ours)}
+    scored = golden["ball_edges"][golden["edge_rows"]]
+    batch = BallBatch.from_cloud(
+        golden["points"],
+        golden["normals"],
+        golden["approach_index"],
+        crop,
+        contact=np.array([row_of[tuple(pair)] for pair in scored.tolist()]),
+        approach=golden["approach"],
+        depth=golden["depth"],
+    )
+    return batch, golden["logit"]
+
+
+def logits(network: torch.nn.Module, batch: BallBatch) -> np.ndarray:
+    with torch.no_grad():
+        return network(batch).numpy()
+
+
+@scenes
+def test_vn_logits_correlate_and_the_best_grasp_is_the_same(shared_dir, vn_network, scene) -> None:
+    batch, golden = golden_batch(shared_dir, scene)
+    scores = logits(vn_network, batch)
+    assert np.corrcoef(scores, golden)[0, 1] >= 0.995
+    assert scores.argmax() == golden.argmax()
+    # Where no choice of a vector falls the other way by rounding, the logits are the same.
+    assert np.median(np.abs(scores - golden)) < 1e-4
+
+
+@scenes
+def test_edgegrasp_logits_are_the_same(shared_dir, random_network, scene) -> None:
+    batch, _ = golden_batch(shared_dir, scene)
+    golden = np.load(shared_dir / "reference" / "edge_grasp_random" / "logits.npz")[scene]
+    np.testing.assert_allclose(logits(random_network, batch), golden, rtol=0, atol=1e-3)
