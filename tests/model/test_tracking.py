@@ -40,13 +40,6 @@ def test_an_object_is_found_where_it_was_moved_to(millimetres: Any, degrees: flo
     assert apart.max() < 0.003
 
 
-def test_an_object_that_is_gone_is_not_found() -> None:
-    before, _ = box_corner(0)
-    points, normals = box_corner(1)
-    surface = Surface(points + 1.0, normals, cKDTree(points + 1.0))
-    assert registered(before, surface)[1] == 0.0
-
-
 def grasp(score: float, x: float, free: bool = True) -> Grasp:
     pose = np.eye(4, dtype=np.float32)
     pose[0, 3] = x
