@@ -17,6 +17,8 @@ from pydantic import Field
 from edgegrasp_camera.files import pixels, sent_cloud
 from edgegrasp_camera.picture import draw_detection
 from edgegrasp_cli.flags import Connection, option_flags, parse_option_flags, takes_flags
+from edgegrasp_model.options import parse_options
+from edgegrasp_model.request_cloud import File, decode_cloud, value_of_text
 
 if TYPE_CHECKING:
     from edgegrasp_client import DepthImage, Model
@@ -187,8 +189,6 @@ class OwnDetector:
     ) -> Any:
         """Find grasps in a cloud: an array, a file, or depth images; raises as the detector."""
         from edgegrasp_client.requests import depth_image_fields, npy_bytes
-        from edgegrasp_model.options import parse_options
-        from edgegrasp_model.request_cloud import File, decode_cloud
 
         beside = {"colors": colors, "view_ids": view_ids}
         fields: dict[str, Any] = {
@@ -257,8 +257,6 @@ def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
 
 def _robot_option(asked: DetectFlags) -> dict[str, Any]:
     """The option `robot` from the flags; empty if none of them is given."""
-    from edgegrasp_model.request_cloud import value_of_text
-
     given = {"--robot": asked.robot, "--joints": asked.joints, "--base": asked.base}
     missing = [flag for flag, value in given.items() if value is None]
     if len(missing) == len(given):
@@ -290,8 +288,6 @@ def _write_trajectory(file: Path, detection: Any) -> None:
 
 def _depth_images(file: Path | None, asked: DetectFlags) -> "list[DepthImage] | None":
     """The images of --depth with their cameras; None if a cloud is given."""
-    from edgegrasp_model.request_cloud import value_of_text
-
     depths, intrinsics, poses = asked.depth, asked.intrinsics, asked.pose
     if (file is None) != bool(depths):
         raise ValueError("give a cloud file, or --depth and --intrinsics")
