@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from tests.cloud_files import npy, npz, pcd, ply, png, xyz
 from tests.end_to_end.test_tracking import STEP, image
 from tests.programs import run
 
@@ -221,17 +220,16 @@ def scenes(folder: Path) -> Iterator[tuple[int, list[Path]]]:
     rng = np.random.default_rng(0)
     points = rng.uniform(0.3, 0.5, (640, 3)).astype(np.float32)
     colors = rng.integers(0, 256, (640, 3), dtype=np.uint8)
-    for number, (name, write) in enumerate(
-        {
-            "npy": npy,
-            "npz": lambda points: npz(points=points, colors=colors[: len(points)]),
-            "xyz": xyz,
-            "ply": lambda points: ply(points, "ascii"),
-            "pcd": lambda points: pcd(points, "ascii"),
-        }.items(),
-        start=601,
-    ):
-        (folder / f"cloud.{name}").write_bytes(write(points[:number]))
+    np.save(folder / "cloud.npy", points[:601])
+    np.savez_compressed(folder / "cloud.npz", points=points[:602], colors=colors[:602])
+    np.savetxt(folder / "cloud.xyz", points[:603])
+    rows = [f"{x} {y} {z}\n" for x, y, z in points]
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat ascii 1.0\nelement vertex 604\n{axes}end_header\n"
+    (folder / "cloud.ply").write_text(head + "".join(rows[:604]))
+    head = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 605\nHEIGHT 1\n"
+    (folder / "cloud.pcd").write_text(f"{head}POINTS 605\nDATA ascii\n{''.join(rows[:605])}")
+    for number, name in enumerate(("npy", "npz", "xyz", "ply", "pcd"), start=601):
         yield number, [folder / f"cloud.{name}"]
     depth, camera = rng.integers(400, 600, (20, 30)).astype(np.uint16), (30.0, 30.0, 15.0, 10.0)
     rgb = colors[:600].reshape(20, 30, 3)
@@ -239,8 +237,8 @@ def scenes(folder: Path) -> Iterator[tuple[int, list[Path]]]:
     yield 600, [folder / "camera.npz"]
     depth, rgb = depth.reshape(15, 40), rgb.reshape(15, 40, 3)
     depth[0, 0] = 0  # a hole
-    (folder / "depth.png").write_bytes(png(depth))
-    (folder / "color.png").write_bytes(png(rgb))
+    Image.fromarray(depth).save(folder / "depth.png")
+    Image.fromarray(rgb).save(folder / "color.png")
     yield 599, [folder / "depth.png", folder / "color.png"]
 
 
