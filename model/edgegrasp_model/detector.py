@@ -38,6 +38,7 @@ from edgegrasp_model.ranking import (
     detected_objects,
     found_support,
     grasps_in_cloud,
+    judged_together,
     select,
 )
 from edgegrasp_model.results import NoGrasp, Pace
@@ -206,7 +207,9 @@ class GraspDetector:
         counts, grasps, debug = prepared.counts, [], None
         sample = None if scored is None else scored.sample
         with prepared.timed("ranking"):
-            logits = np.empty(0, dtype=np.float32) if scored is None else scored.logits
+            logits = np.empty(0, dtype=np.float32)
+            if scored is not None and scene is not None:
+                logits = judged_together(scored.logits, scored.sample, scene, gripper)
             score, outcome = self._probability(logits), np.empty(0, dtype=np.int8)
             if scene is not None and not scene.approach_allowed.any():
                 prepared.warnings.append(NO_APPROACH_POINT)

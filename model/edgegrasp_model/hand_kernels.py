@@ -113,6 +113,22 @@ def non_max_suppression(
     return order[kept], order[dropped]
 
 
+def mean_of_alike(
+    values: Float32, T_cloud_tcp: Float32, number: Int64, near: float, angle: float
+) -> Float32:
+    """The mean value (E,) of the other hands on the same object that are like each one.
+
+    Those are within `near` metres of it, T_cloud_tcp (E, 4, 4), and `angle` radians; half a turn
+    about the approach counts as none. `number` (E,) are the objects. Without any, its own value.
+    """
+    turn = np.ascontiguousarray(T_cloud_tcp[:, :3, :3])
+    place = np.ascontiguousarray(T_cloud_tcp[:, :3, 3])
+    limits = np.array([near**2, 1.0 + 2.0 * np.cos(angle)], dtype=np.float32)
+    mean = values.copy()
+    _average_alike(values, place, turn, number, limits, mean)
+    return mean
+
+
 def _to_hand(T_cloud_hand: Float32) -> tuple[Float32, Float32]:
     """Rotations (E, 3, 3) and translations (E, 3) from the cloud's frame to hand frames."""
     turn = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
@@ -432,6 +448,27 @@ def _suppress(
             kept[m] = True
             xs[found], ys[found], zs[found], rows[found] = px, py, pz, row
             found += 1
+
+
+@compiled("contract")
+def _average_alike(
+    values: Float32, place: Float32, turn: Float32, number: Int64, limits: Float32, mean: Float32
+) -> None:
+    total, count = np.zeros(len(values)), np.zeros(len(values), np.int64)
+    for i in range(len(values)):
+        for j in range(i):
+            x, y, z = place[j] - place[i]
+            if number[i] != number[j] or x * x + y * y + z * z >= limits[0]:
+                continue
+            along = (turn[i] * turn[j]).sum(axis=0)  # cosines of matching axes
+            if along[2] + abs(along[0] + along[1]) > limits[1]:
+                total[i] += values[j]
+                total[j] += values[i]
+                count[i] += 1
+                count[j] += 1
+    for i in range(len(values)):
+        if count[i]:
+            mean[i] = total[i] / count[i]
 
 
 @compiled("contract")

@@ -15,7 +15,7 @@ from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_description import seen_part
-from edgegrasp_model.hand_kernels import non_max_suppression
+from edgegrasp_model.hand_kernels import mean_of_alike, non_max_suppression
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Outcome, Ungraspable
 from edgegrasp_model.scene.cloud import UP
@@ -30,7 +30,28 @@ SURE_SCORE = 0.9  # score from which the order `highest` goes by height (the pap
 HIDDEN = 0.004  # metres of unseen space into which an object may extend
 FLAT = 0.012  # metres of visible height below which the support may block grasps
 DRAWBACK, FAR = 0.01, 0.1  # of a rating; metres from an object's middle
+# Hands that are judged together: metres and radians apart; weight of a hand's own logit; factor
+# that calibrates the average.
+ALIKE, ALIKE_ANGLE, OWN, SHARPER = 0.03, math.radians(30), 0.3, 1.3
 OUTCOMES = list(Outcome)
+
+
+def judged_together(
+    logits: Float32,  # (E,) of the scored candidates
+    sample: Sample,
+    scene: Scene,
+    gripper: Gripper,
+) -> Float32:
+    """The logits (E,), averaged over hands that are alike.
+
+    The best of many logits is too high by chance, and a robot's pose is never exact: where hands
+    like it slip, a hand slips too.
+    """
+    candidates = sample.candidates
+    number = scene.object_of_point[candidates.contact_index]
+    T_cloud_tcp = candidates.T_cloud_hand @ gripper.T_hand_tcp
+    others = mean_of_alike(logits, T_cloud_tcp, number, ALIKE, ALIKE_ANGLE)
+    return np.float32(SHARPER) * (np.float32(OWN) * logits + np.float32(1.0 - OWN) * others)
 
 
 def select(
