@@ -119,12 +119,12 @@ def mean_of_alike(
     """The mean value (E,) of the other hands on the same object that are like each one.
 
     Those are within `near` metres of it, T_cloud_tcp (E, 4, 4), and `angle` radians; half a turn
-    about the approach counts as none. `number` (E,) are the objects. Without any, its own value.
+    about the approach counts as none. `number` (E,) are the objects. NaN where there is none.
     """
     turn = np.ascontiguousarray(T_cloud_tcp[:, :3, :3])
     place = np.ascontiguousarray(T_cloud_tcp[:, :3, 3])
     limits = np.array([near**2, 1.0 + 2.0 * np.cos(angle)], dtype=np.float32)
-    mean = values.copy()
+    mean = np.empty_like(values)
     _average_alike(values, place, turn, number, limits, mean)
     return mean
 
@@ -467,8 +467,7 @@ def _average_alike(
                 count[i] += 1
                 count[j] += 1
     for i in range(len(values)):
-        if count[i]:
-            mean[i] = total[i] / count[i]
+        mean[i] = total[i] / count[i] if count[i] else np.nan
 
 
 @compiled("contract")

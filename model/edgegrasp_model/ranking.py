@@ -51,7 +51,8 @@ def judged_together(
     number = scene.object_of_point[candidates.contact_index]
     T_cloud_tcp = candidates.T_cloud_hand @ gripper.T_hand_tcp
     others = mean_of_alike(logits, T_cloud_tcp, number, ALIKE, ALIKE_ANGLE)
-    return np.float32(SHARPER) * (np.float32(OWN) * logits + np.float32(1.0 - OWN) * others)
+    averaged = np.float32(SHARPER * OWN) * logits + np.float32(SHARPER * (1.0 - OWN)) * others
+    return np.where(np.isnan(others), logits, averaged)
 
 
 def select(
