@@ -87,7 +87,6 @@ def test_unknown_command() -> None:
         ("edgegrasp_sim.report", ["replay", "attempt", "FOLDER"], "service,sim"),
         ("edgegrasp_cli.serve", ["serve"], "service"),
         ("matplotlib", ["detect", "absent.ply", "--picture", "grasps.png"], "service,view"),
-        ("open3d", ["train-scene", "FOLDER", "--run", "FOLDER"], "open3d,train"),
     ],
 )
 def test_a_missing_package_names_the_extra(missing, words, extra, refused, monkeypatch) -> None:
