@@ -11,6 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 import torch
+from scipy.special import expit
 from torch import nn
 
 from edgegrasp_camera.arrays import Array, Float32, Float64, Floats, Int64
@@ -207,17 +208,19 @@ class GraspDetector:
         counts, grasps, debug = prepared.counts, [], None
         sample = None if scored is None else scored.sample
         with prepared.timed("ranking"):
-            logits = np.empty(0, dtype=np.float32)
+            logits, outcome = np.empty(0, dtype=np.float32), np.empty(0, dtype=np.int8)
             if scored is not None and scene is not None:
-                logits = judged_together(scored.logits, scored.sample, scene, gripper)
-            score, outcome = self._probability(logits), np.empty(0, dtype=np.int8)
+                logits = self._before_outcomes(scored.logits)
+                logits = judged_together(logits, scored.sample, scene, gripper)
+            scale, shift = self._outcomes
+            score = expit(scale * logits + shift)
             if scene is not None and not scene.approach_allowed.any():
                 prepared.warnings.append(NO_APPROACH_POINT)
             elif scored is not None and len(logits) == 0:
                 prepared.warnings.append(NO_CANDIDATE)
             elif scene is not None and sample is not None:
                 found = object_probability(scene, sample.candidates.contact_index)
-                score, ratings = score * found, self._rating(logits) * found
+                score, ratings = score * found, expit(logits) * found
                 rows, outcome = select(scene, sample, score, ratings, gripper, options, counts)
                 best, free = sample.candidates.take(rows), sample.collision_free[rows]
                 clear = clearances(scene, best.T_cloud_hand, gripper)
@@ -356,16 +359,18 @@ class GraspDetector:
 
     def _probability(self, logits: Floats) -> Float64:
         """Calibrated probabilities (E,) of logits (E,)."""
-        scaled = logits.astype(np.float64) / self.metadata.temperature
-        probability: Float64 = 1.0 / (1.0 + np.exp(-scaled))
-        return probability
+        return np.asarray(expit(logits.astype(np.float64) / self.metadata.temperature))
 
-    def _rating(self, logits: Floats) -> Float64:
-        """The probabilities (E,) as they were before outcomes of a robot rescaled them."""
+    @property
+    def _outcomes(self) -> tuple[float, float]:
+        """Scale and shift of calibrated logits, fitted to outcomes of a robot."""
         scale, shift = self.metadata.training.get("outcomes_scale_shift", (1.0, 0.0))
-        scaled = logits.astype(np.float64) / self.metadata.temperature
-        rating: Float64 = 1.0 / (1.0 + np.exp(-(scaled - shift) / scale))
-        return rating
+        return scale, shift
+
+    def _before_outcomes(self, logits: Float32) -> Float32:
+        """Calibrated logits (E,) as they were before outcomes of a robot rescaled them."""
+        scale, shift = self._outcomes
+        return ((logits / self.metadata.temperature - shift) / scale).astype(np.float32)
 
     @property
     def sees_hands(self) -> bool:
@@ -400,7 +405,7 @@ class GraspDetector:
         """The numbers of the objects that have a grasp of this rating."""
         if scored is None or prepared.scene is None:
             return NOTHING
-        held = self._rating(scored.logits) >= least
+        held = expit(self._before_outcomes(scored.logits)) >= least
         if prepared.options.collision.mode != "ignore":
             held &= scored.sample.collision_free
         approach_index = scored.sample.candidates.approach_index[held]
