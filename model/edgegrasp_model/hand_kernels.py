@@ -104,12 +104,8 @@ def non_max_suppression(
     turn about the approach counts as none. Returns the rows kept, in order, and the duplicates
     dropped.
     """
-    turn = np.ascontiguousarray(T_cloud_tcp[:, :3, :3])
-    place = np.ascontiguousarray(T_cloud_tcp[:, :3, 3])
-    least_trace = 1.0 + 2.0 * np.cos(angle) if angle < np.pi else -np.inf
-    limits = np.array([near**2, least_trace], dtype=np.float32)
     kept, dropped = np.zeros((2, len(order)), dtype=np.bool_)
-    _suppress(order, place, turn, limits, most, kept, dropped)
+    _suppress(order, *_compared(T_cloud_tcp, near, angle), most, kept, dropped)
     return order[kept], order[dropped]
 
 
@@ -121,12 +117,17 @@ def mean_of_alike(
     Those are within `near` metres of it, T_cloud_tcp (E, 4, 4), and `angle` radians; half a turn
     about the approach counts as none. `number` (E,) are the objects. NaN where there is none.
     """
+    mean = np.empty_like(values)
+    _average_alike(values, number, *_compared(T_cloud_tcp, near, angle), mean)
+    return mean
+
+
+def _compared(T_cloud_tcp: Float32, near: float, angle: float) -> tuple[Float32, Float32, Float32]:
+    """Places (E, 3), rotations (E, 3, 3), and limits (2,): squared distance, `_likeness`."""
     turn = np.ascontiguousarray(T_cloud_tcp[:, :3, :3])
     place = np.ascontiguousarray(T_cloud_tcp[:, :3, 3])
-    limits = np.array([near**2, 1.0 + 2.0 * np.cos(angle)], dtype=np.float32)
-    mean = np.empty_like(values)
-    _average_alike(values, place, turn, number, limits, mean)
-    return mean
+    least_trace = 1.0 + 2.0 * np.cos(angle) if angle < np.pi else -np.inf
+    return place, turn, np.array([near**2, least_trace], dtype=np.float32)
 
 
 def _to_hand(T_cloud_hand: Float32) -> tuple[Float32, Float32]:
@@ -423,6 +424,14 @@ def _between_pads(
 
 
 @compiled("contract")
+def _likeness(one: Float32, other: Float32) -> np.float32:
+    """Trace of the rotation between two (3, 3); half a turn about z counts as none."""
+    along = (one * other).sum(axis=0)  # cosines of matching axes
+    likeness: np.float32 = along[2] + abs(along[0] + along[1])
+    return likeness
+
+
+@compiled("contract")
 def _suppress(
     order: Int64,
     place: Float32,
@@ -439,11 +448,10 @@ def _suppress(
         px, py, pz = place[row]
         for k in range(found):
             x, y, z = xs[k] - px, ys[k] - py, zs[k] - pz
-            if x * x + y * y + z * z < limits[0]:
-                along = (turn[row] * turn[rows[k]]).sum(axis=0)  # cosines of matching axes
-                if along[2] + abs(along[0] + along[1]) > limits[1]:
-                    dropped[m] = True
-                    break
+            near = x * x + y * y + z * z < limits[0]
+            if near and _likeness(turn[row], turn[rows[k]]) > limits[1]:
+                dropped[m] = True
+                break
         if found < most and not dropped[m]:
             kept[m] = True
             xs[found], ys[found], zs[found], rows[found] = px, py, pz, row
@@ -452,16 +460,15 @@ def _suppress(
 
 @compiled("contract")
 def _average_alike(
-    values: Float32, place: Float32, turn: Float32, number: Int64, limits: Float32, mean: Float32
+    values: Float32, number: Int64, place: Float32, turn: Float32, limits: Float32, mean: Float32
 ) -> None:
     total, count = np.zeros(len(values)), np.zeros(len(values), np.int64)
     for i in range(len(values)):
+        px, py, pz = place[i]
         for j in range(i):
-            x, y, z = place[j] - place[i]
-            if number[i] != number[j] or x * x + y * y + z * z >= limits[0]:
-                continue
-            along = (turn[i] * turn[j]).sum(axis=0)  # cosines of matching axes
-            if along[2] + abs(along[0] + along[1]) > limits[1]:
+            x, y, z = place[j, 0] - px, place[j, 1] - py, place[j, 2] - pz
+            near = number[i] == number[j] and x * x + y * y + z * z < limits[0]
+            if near and _likeness(turn[i], turn[j]) > limits[1]:
                 total[i] += values[j]
                 total[j] += values[i]
                 count[i] += 1
