@@ -22,6 +22,8 @@ from edgegrasp_model.networks.config import (
 )
 from edgegrasp_model.networks.edgegrasp import GRASP_WIDTH
 
+# Of the authors' evaluation, metres.
+VOXEL_SIZE, CROP_RADIUS, GRIPPER = 0.0045, 0.05, "panda"
 # The prefix of each file here, then their parts by our names.
 _FILES = {
     "local": "local_emd_model",
@@ -62,17 +64,10 @@ _VN_PARTS = {
 }
 
 
-def import_checkpoint(
-    directory: Path,
-    *,
-    voxel_size: float = 0.0045,
-    crop_radius: float = 0.05,
-    gripper: str = "panda",
-) -> tuple[nn.Module, CheckpointMetadata]:
+def import_checkpoint(directory: Path) -> tuple[nn.Module, CheckpointMetadata]:
     """Read a checkpoint in the authors' layout; with a `std` file it is a VN network.
 
-    Voxel size and crop radius, metres, are those of the authors' evaluation. Returns what
-    `save_checkpoint` takes; InvalidCheckpoint: a file is missing, or does not fit.
+    Returns what `save_checkpoint` takes; InvalidCheckpoint: a file is missing, or does not fit.
     """
     numbers = [
         int(match[1])
@@ -86,7 +81,7 @@ def import_checkpoint(
         )
     number = numbers[0]
     is_vn = (directory / f"std-ckpt-{number}.pt").exists()
-    config = replace(VN_EDGEGRASP if is_vn else EDGEGRASP, crop_radius=crop_radius)
+    config = replace(VN_EDGEGRASP if is_vn else EDGEGRASP, crop_radius=CROP_RADIUS)
     theirs = {
         f"{part}.{name}": weight
         for part, stem in _FILES.items()
@@ -105,8 +100,8 @@ def import_checkpoint(
     metadata = CheckpointMetadata(
         name=config.architecture,
         network=config,
-        voxel_size=voxel_size,
-        gripper=gripper,
+        voxel_size=VOXEL_SIZE,
+        gripper=GRIPPER,
         training={"source": "imported from the authors' layout", "checkpoint": number},
     )
     return network.eval(), metadata
