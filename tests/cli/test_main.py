@@ -103,6 +103,16 @@ def test_a_missing_engine_is_named(command: str, refused, monkeypatch, tmp_path:
     assert "is installed: pip install 'edgegrasp[sim]'" in said or "pip install mujoco" in said
 
 
+def test_training_the_scene_network_names_its_extras() -> None:
+    words = ["edgegrasp", "train-scene", "FOLDER", "--run", "FOLDER"]
+    program = (
+        f"import sys; sys.modules['open3d'] = None; sys.argv = {words}; "
+        "from edgegrasp_cli.main import main; main()"
+    )
+    said = run_program(sys.executable, "-c", program, code=1).stderr
+    assert "pip install 'edgegrasp[open3d,train]'" in said
+
+
 def test_the_command_line_is_an_extra() -> None:
     program = "import sys; sys.modules['typer'] = None; import edgegrasp_cli.main"
     said = run_program(sys.executable, "-c", program, code=1).stderr
