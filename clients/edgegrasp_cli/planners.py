@@ -23,7 +23,6 @@ GROUP = "edgegrasp.planners"  # entry points under which packages may name their
 SHIPPED = ("server", "in-process")
 CONNECT_SECONDS, REQUEST_SECONDS = 30.0, 300.0
 SUFFIX = ".safetensors"
-MAX_DEPTH_ERROR = 0.12  # depth error for views that show the table; more than any protocol's noise
 
 
 class ChosenPlanner(NamedTuple):
@@ -194,8 +193,8 @@ def request_options(
     low, high = observation.workspace.tolist()
     positions = observation.camera_positions.tolist()
     support: dict[str, Any] = {"normal": (0.0, 0.0, 1.0), "offset": observation.table_height}
-    if observation.table == "seen":
-        support["max_depth_error"] = MAX_DEPTH_ERROR
+    if rules.max_depth_error:
+        support["max_depth_error"] = rules.max_depth_error
     options: dict[str, Any] = {
         "seed": seed,
         "num_approach_points": rules.num_approach_points,

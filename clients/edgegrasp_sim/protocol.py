@@ -87,6 +87,8 @@ class PlanningRules:
     num_approach_points: int  # approach points sampled
     num_candidates: int  # candidates scored at most
     min_score: float  # no grasp is made that scores less
+    # Greatest relative error of depths, which a planner corrects by the known table.
+    max_depth_error: float = 0.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -114,8 +116,9 @@ class Protocol:
         """All constants but engine and kind, which a result names by itself; ready for JSON."""
         table = asdict(self)
         del table["engine"], table["kind"]
-        if not self.noise.sensor:  # so that earlier results can be resumed
-            del table["noise"]["sensor"]
+        for section, name in (("noise", "sensor"), ("planning", "max_depth_error")):
+            if not table[section][name]:  # so that earlier results can be resumed
+                del table[section][name]
         return table
 
 

@@ -391,6 +391,22 @@ def test_a_table_that_was_cut_away_is_missed() -> None:
     assert "options.support.max_depth_error (0.12)" in warnings[0]
 
 
+def test_parts_of_a_table_that_was_cut_off_show_the_scale() -> None:
+    """Depths too small by 5 % lift the table 2 cm over the height at which the cloud was cut."""
+    points = table_with_box(np.random.default_rng(6))
+    seen = seen_wrong(points, 0.95)
+    (right, _), (corrected, said) = built(points), built(seen[seen[:, 2] > 0.055])
+    assert "multiplied by 1.05" in said[0]
+    np.testing.assert_allclose(right.max(axis=0), corrected.max(axis=0), atol=0.004)
+
+
+def test_the_flat_top_of_an_object_is_no_table_by_which_depths_are_scaled() -> None:
+    top = np.random.default_rng(8).uniform((-0.07, -0.07, 0.07), (0.07, 0.07, 0.07), (2000, 3))
+    left, warnings = built(top)
+    assert "are taken as they are" in warnings[0]
+    np.testing.assert_allclose(left[:, 2], 0.07, atol=0.001)
+
+
 def test_depths_need_a_camera() -> None:
     cloud = check_cloud(table_with_box(np.random.default_rng(7)).astype(np.float32))
     with refusal("options.viewpoint"):

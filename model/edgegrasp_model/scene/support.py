@@ -36,6 +36,7 @@ SUPPORT_STREAM = 2  # random stream of one request
 NEAR = 0.01  # metres from the plane within which points belong to it
 FLAT = 0.35  # of NEAR: largest median distance of a plane's points (a wall's is 0.5)
 MIN_SHARE = 0.1  # of the points that the plane must hold
+LEAST_SCALED_AREA = 0.035  # square metres of it that must be seen; flat tops of objects are smaller
 
 
 @dataclass(frozen=True)
@@ -155,9 +156,7 @@ def _fitted(
         return None
     found = measured(part, _close_to(plane, part.points, around), THICK)
     places = found.frame.points(part.points)
-    cells = np.floor(places[np.abs(places[:, 2]) < MOST_MARGIN, :2] / CELL)
-    count = len(np.unique(cells @ (1.0, 1e6)))  # many times as fast as unique rows
-    return found if count * CELL**2 > LEAST_AREA else None
+    return found if _area(places[np.abs(places[:, 2]) < MOST_MARGIN]) > LEAST_AREA else None
 
 
 def _close_to(plane: SupportPlane, points: Float32, objects: Float32) -> SupportPlane:
@@ -344,11 +343,24 @@ def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> floa
         window = held[start : start + width]
         if window.max() >= enough:
             scale = _middle(factors, float(tried[start + int(window.argmax())]), reach)
-            if scale is not None:
+            if scale is not None and _covers(points, viewpoint, plane, scale):
                 return scale
             start += width - 1
         start += 1
     return None
+
+
+def _covers(points: Floats, viewpoint: Float64, plane: SupportPlane, scale: float) -> bool:
+    """Whether scaled points (N, 3) that lie in the plane cover more than an object's flat top."""
+    scaled = viewpoint + scale * (points[thinned(len(points))] - viewpoint)
+    near = scaled[np.abs(plane.heights(scaled)) < NEAR]
+    return _area(CanonicalFrame.of_scene(near, plane.normal, None).points(near)) > LEAST_SCALED_AREA
+
+
+def _area(places: Float64) -> float:
+    """Square metres that points (N, 3) cover, seen along z."""
+    cells = np.floor(places[:, :2] / CELL)
+    return len(np.unique(cells @ (1.0, 1e6))) * CELL**2  # many times as fast as unique rows
 
 
 def _middle(factors: Float64, scale: float, reach: float) -> float | None:
