@@ -294,8 +294,8 @@ class RansacPlane(Strict):
 class AutoPlane(Strict):
     """The plane of the points near objects that are classified as support.
 
-    Where `up` is sent, it lies within 30 degrees of the level. None found: a warning, and objects
-    without a support plane.
+    Where `up` is sent, it lies within 30 degrees of the level. None found: a warning, and one under
+    the lowest points where `up` is known, or +z because no camera is the origin; else none.
     """
 
     kind: Literal["auto"] = "auto"

@@ -181,6 +181,22 @@ def test_without_a_support_in_view_everything_is_an_object_and_the_answer_says_s
     assert any("no support plane" in warning for warning in found.warnings)
 
 
+@pytest.mark.parametrize("camera_known", [True, False])
+def test_a_support_is_assumed_under_a_cloud_that_was_cut_off_above_it(camera_known: bool) -> None:
+    """In a robot's or a world's frame z is up, so that no hand reaches under the objects."""
+    boxes, T_world_camera = boxes_on_table(2), camera(0.8, -1.5, 0.6)
+    points = seen_in_world([table(), *boxes], T_world_camera)
+    viewpoint = T_world_camera[:3, 3].tolist() if camera_known else None
+    found = detect(points[points[:, 2] > 0.005], viewpoint=viewpoint)
+    assert any("one is assumed under the lowest points" in each for each in found.warnings)
+    assert found.support is not None
+    np.testing.assert_allclose(found.support.normal, (0, 0, 1), atol=1e-6)
+    assert 0.0 < found.support.offset < 0.006
+    assert found.grasps
+    assert min(grasp.contact_point[2] for grasp in found.grasps) > 0.005
+    assert max(grasp.approach_direction[2] for grasp in found.grasps) < 0.11
+
+
 def test_a_plane_far_from_the_sent_up_is_no_support() -> None:
     T_world_camera = camera(0.6, -1.5, 0.7)
     cloud = render([table(), *boxes_on_table(1)], T_world_camera)

@@ -25,6 +25,8 @@ NEAR_OBJECTS, FAR_WEIGHT = 0.15, 0.1  # metres around an object; what points cou
 CLOSE, CLOSER = 0.08, (0.008, 0.005, 0.004)  # metres around an object; from the plane there
 FEWEST = 60  # points that a plane is fitted to, and by which its residual is measured
 CELL = 0.02  # metres, in which surfaces are counted
+CUT_OFF = 0.2  # share of points classified as support under which a cloud was cut off above it
+LOWEST, UNDER = 0.5, 0.003  # percent and metres: an assumed support lies so far under the points
 LEAST_AREA = 0.008  # square metres of a support that are seen; the top of an object is smaller
 USUAL_DISTANCE = 0.7  # metres to a camera that is not known
 BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
@@ -127,10 +129,15 @@ def choose_support(
         else:
             assert shown is not None
             found = _fitted(seen, shown, objects, up, rng)
+            if found is None and (found := _assumed(seen, shown, options)) is not None:
+                warnings.append(
+                    "no support plane is seen: one is assumed under the lowest points. Send "
+                    "support, and null if there is none."
+                )
         if found is None:
             warnings.append(
-                "no support plane is seen: objects are returned without one. Send support, or the "
-                "true up, if there is one in view."
+                "no support plane is seen: objects are returned without one, and hands may reach "
+                "under them. Send support or up."
             )
     if found is not None and seen.viewpoint is not None and found.plane.heights(seen.viewpoint) < 0:
         warnings.append(
@@ -157,6 +164,26 @@ def _fitted(
     found = measured(part, _close_to(plane, part.points, around), THICK)
     places = found.frame.points(part.points)
     return found if _area(places[np.abs(places[:, 2]) < MOST_MARGIN]) > LEAST_AREA else None
+
+
+def _assumed(seen: Seen, shown: Segmentation, options: DetectOptions) -> Support | None:
+    """A support under the lowest points of a cloud that was cut off above it, if up is known.
+
+    Unless a camera is the origin, the frame is of a robot or a world, whose z is up.
+    """
+    up, cameras = options.known_up, options.viewpoint
+    if (
+        up is None
+        and shown.up[2] > 0
+        and (cameras is None or np.reshape(cameras, (-1, 3)).any(axis=1).all())
+    ):
+        up = np.array([0.0, 0.0, 1.0])
+    if up is None or (shown.support > 0.5).mean() > CUT_OFF:
+        return None
+    x, y, z = up.tolist()
+    height = seen.points.astype(np.float64) @ up
+    offset = float(np.percentile(height, LOWEST)) - UNDER
+    return measured(seen, SupportPlane(normal=(x, y, z), offset=offset), 0.0)
 
 
 def _close_to(plane: SupportPlane, points: Float32, objects: Float32) -> SupportPlane:
