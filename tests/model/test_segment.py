@@ -197,6 +197,18 @@ def test_a_support_is_assumed_under_a_cloud_that_was_cut_off_above_it(camera_kno
     assert max(grasp.approach_direction[2] for grasp in found.grasps) < 0.11
 
 
+@pytest.mark.parametrize("count", [20_000, 8_000])
+def test_a_sparse_cloud_of_the_whole_view_shows_the_same_objects(count: int) -> None:
+    boxes, T_world_camera = boxes_on_table(2), camera(0.8, -1.5, 0.6)
+    points = seen_in_world([table(), *boxes, *BACKGROUND["floor"]], T_world_camera)
+    viewpoint = T_world_camera[:3, 3].tolist()
+    dense = detect(points, viewpoint=viewpoint)
+    some = np.random.default_rng(0).choice(len(points), count, replace=False)
+    sparse = detect(points[some], viewpoint=viewpoint)
+    held = {grasp.object for grasp in sparse.grasps}
+    assert len(held) == len({grasp.object for grasp in dense.grasps}) == len(boxes)
+
+
 def test_a_plane_far_from_the_sent_up_is_no_support() -> None:
     T_world_camera = camera(0.6, -1.5, 0.7)
     cloud = render([table(), *boxes_on_table(1)], T_world_camera)

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.kernels import compiled
@@ -13,6 +14,7 @@ NEAREST = 0.05  # metres from the viewpoint
 COVERED = 0.5  # percent of the points that may lie beyond each side of the image
 COARSE = 40  # cells across the view in which the density of points is measured
 SPACING = 1.25  # pixels between neighbouring points, so that few pixels stay empty
+COARSEST = 0.003  # metres, of a pixel at the median depth; those of sparser clouds are divided
 DENSE = 3  # points per pixel; more add nothing
 SURFACE = 0.02  # metres; a point nearer by this much hides another of the same pixel
 
@@ -43,7 +45,8 @@ def range_image(
         low, high = _view(apart @ turn.T)
         turn = _camera_axes(np.array([*(low + high) / 2, 1.0]) @ turn, downward)
     low, high = _view(apart @ turn.T)
-    pixel_size = _pixel_size(apart @ turn.T, low, high, len(points))
+    finest = float(np.sqrt((high - low).prod() / (WIDTH * HEIGHT)))
+    pixel_size = max(finest, _spacing(apart @ turn.T, low, high, len(points)))
     width, height = (int(np.ceil(side / MULTIPLE)) * MULTIPLE for side in (high - low) / pixel_size)
     middle = (low + high) / 2
     image = np.full((height, width, 3), np.nan, dtype=np.float32)
@@ -52,9 +55,12 @@ def range_image(
     _render(some, viewpoint, turn, corner, pixel_size, image)
     filled = image.copy()
     _fill_holes(image, filled)
+    coarse = float(np.median(apart @ turn[2])) * pixel_size / COARSEST
+    if (times := min(round(pixel_size / finest), int(np.ceil(coarse)))) > 1:
+        filled, pixel_size = _enlarged(filled[..., 2], times, corner, pixel_size / times)
     T_cloud_camera = np.eye(4)
     T_cloud_camera[:3, :3], T_cloud_camera[:3, 3] = turn.T, viewpoint
-    return RangeImage(filled, float(pixel_size), T_cloud_camera, corner)
+    return RangeImage(filled, pixel_size, T_cloud_camera, corner)
 
 
 def _camera_axes(sight: Float64, downward: list[Float64]) -> Float64:
@@ -84,15 +90,28 @@ def _view(points: Float64) -> tuple[Float64, Float64]:
     ).round(9)
 
 
-def _pixel_size(points: Float64, low: Float64, high: Float64, count: int) -> float:
-    """Side of a pixel at z = 1: as fine as the points allow and the network needs."""
-    side = high - low
-    finest = float(np.sqrt(side.prod() / (WIDTH * HEIGHT)))
+def _spacing(points: Float64, low: Float64, high: Float64, count: int) -> float:
+    """Side of a pixel at z = 1 that leaves few pixels without one of `count` points like (N, 3)."""
     ahead = points[points[:, 2] > NEAREST]
-    cell = max(float(side.max()) / COARSE, 1e-6)
+    cell = max(float((high - low).max()) / COARSE, 1e-6)
     place = ((ahead[:, :2] / ahead[:, 2:] - low) / cell).astype(np.int64)
     occupied = len(np.unique(place[:, 0] * 4096 + place[:, 1])) * cell * cell
-    return max(finest, SPACING * float(np.sqrt(occupied / max(count, 1))))
+    return SPACING * float(np.sqrt(occupied / max(count, 1)))
+
+
+def _enlarged(
+    depth: Float32, times: int, corner: Float64, pixel_size: float
+) -> tuple[Float32, float]:
+    """The image of a sparse cloud with pixels as fine as the network knows, and their side.
+
+    Depths are interpolated on a surface, and repeated beside its edges.
+    """
+    nearest = depth.repeat(times, axis=0).repeat(times, axis=1)
+    between = ndimage.zoom(depth, times, order=1, mode="nearest", grid_mode=True)
+    smooth = np.abs(between - nearest) < SURFACE  # false for NaN
+    z = np.where(smooth, between, nearest)
+    y, x = (np.indices(z.shape) + 0.5) * pixel_size + corner[::-1, None, None]
+    return np.stack([x * z, y * z, z], axis=-1).astype(np.float32), pixel_size
 
 
 @compiled("contract")
