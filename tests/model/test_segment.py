@@ -209,6 +209,15 @@ def test_a_sparse_cloud_of_the_whole_view_shows_the_same_objects(count: int) -> 
     assert len(held) == len({grasp.object for grasp in dense.grasps}) == len(boxes)
 
 
+@pytest.mark.parametrize("place", [(0.0, 0.0), (0.1, -0.05), (-0.08, 0.1)])
+def test_a_small_object_alone_on_a_table_is_found(place: tuple[float, float]) -> None:
+    small = box((*place, 0.009), (0.012, 0.009, 0.009), 0.5)
+    T_world_camera = camera(0.8, -1.5, 0.7)
+    found = detect(render([table(), small], T_world_camera))
+    assert len(found.objects) == 1
+    assert_grasped(found, [small], T_world_camera)
+
+
 def test_a_plane_far_from_the_sent_up_is_no_support() -> None:
     T_world_camera = camera(0.6, -1.5, 0.7)
     cloud = render([table(), *boxes_on_table(1)], T_world_camera)

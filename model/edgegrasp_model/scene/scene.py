@@ -186,8 +186,9 @@ def _recognised(
     if support is not None:
         likely = (shown.object + shown.support)[above] > LIKELY
         number = with_risen(number, plan, height[above], margin[above], likely)
-        if math.isnan(support.growth):
-            number = with_clusters(number, plan)
+        cut_off = math.isnan(support.growth)
+        if cut_off or not (number >= 0).any():
+            number = with_clusters(number, plan, likely | cut_off)
             confidence |= dict.fromkeys(
                 range(len(confidence), number.max(initial=-1) + 1), UNRECOGNISED
             )

@@ -301,13 +301,14 @@ def with_risen(
     return number
 
 
-def with_clusters(number: Int64, plan: Float64) -> Int64:
-    """The numbers (N,), with clusters of points outside of recognised objects as further objects.
+def with_clusters(number: Int64, plan: Float64, among: Bools) -> Int64:
+    """The numbers (N,), with clusters of other points as further objects.
 
     For clouds whose support was cut off, in which the network sees objects without what they stand
-    on. `plan` (N, 2) are metres along the support.
+    on, and for a small object alone on a table, which it overlooks. `plan` (N, 2) are metres along
+    the support, `among` (N,) are the points that may belong to an object.
     """
-    rows = np.flatnonzero(number < 0)
+    rows = np.flatnonzero((number < 0) & among)
     if len(rows) == 0:
         return number
     cell = np.floor((plan[rows] - plan[rows].min(axis=0)) / BESIDE).astype(np.int64)
