@@ -294,8 +294,9 @@ class RansacPlane(Strict):
 class AutoPlane(Strict):
     """The plane of the points near objects that are classified as support.
 
-    Where `up` is sent, it lies within 30 degrees of the level. None found: a warning, and one under
-    the lowest points where `up` is known, or +z because no camera is the origin; else none.
+    Where `up` is sent, it lies within 30 degrees of the level. None is seen: a warning, and
+    one is assumed under a cloud that was cut off above it, else none. Up is then `up`, +z if no
+    camera is the origin, or what the lower edge of the cloud shows.
     """
 
     kind: Literal["auto"] = "auto"

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
 from edgegrasp_model.errors import InvalidRequest
@@ -26,6 +26,10 @@ CLOSE, CLOSER = 0.08, (0.008, 0.005, 0.004)  # metres around an object; from the
 FEWEST = 60  # points that a plane is fitted to, and by which its residual is measured
 CELL = 0.02  # metres, in which surfaces are counted
 CUT_OFF = 0.2  # share of points classified as support under which a cloud was cut off above it
+ALL_OBJECTS = 0.8  # share of points of objects above which nothing else is left of a cloud
+LOOKS_DOWN = 0.17  # least sine of the angle at which a camera looks down on a cloud that was cut
+TOUCHED, CANDIDATES = 0.006, 40  # metres from a plane that touches a cloud; such planes compared
+UPRIGHT = 0.9  # how much more a plane counts that is level in an upright image
 LOWEST, UNDER = 0.5, 0.003  # percent and metres: an assumed support lies so far under the points
 LEAST_AREA = 0.008  # square metres of a support that are seen; the top of an object is smaller
 USUAL_DISTANCE = 0.7  # metres to a camera that is not known
@@ -129,7 +133,7 @@ def choose_support(
         else:
             assert shown is not None
             found = _fitted(seen, shown, objects, up, rng)
-            if found is None and (found := _assumed(seen, shown, options)) is not None:
+            if found is None and (found := _assumed(seen, shown, objects, options)) is not None:
                 warnings.append(
                     "no support plane is seen: one is assumed under the lowest points. Send "
                     "support, and null if there is none."
@@ -166,24 +170,54 @@ def _fitted(
     return found if _area(places[np.abs(places[:, 2]) < MOST_MARGIN]) > LEAST_AREA else None
 
 
-def _assumed(seen: Seen, shown: Segmentation, options: DetectOptions) -> Support | None:
-    """A support under the lowest points of a cloud that was cut off above it, if up is known.
+def _assumed(
+    seen: Seen, shown: Segmentation, objects: Bools, options: DetectOptions
+) -> Support | None:
+    """A support under the lowest points of a cloud that was cut off above it.
 
     Unless a camera is the origin, the frame is of a robot or a world, whose z is up.
     """
+    if (shown.support > 0.5).mean() > CUT_OFF:
+        return None
     up, cameras = options.known_up, options.viewpoint
-    if (
-        up is None
-        and shown.up[2] > 0
-        and (cameras is None or np.reshape(cameras, (-1, 3)).any(axis=1).all())
-    ):
-        up = np.array([0.0, 0.0, 1.0])
-    if up is None or (shown.support > 0.5).mean() > CUT_OFF:
+    if up is None and (cameras is None or np.reshape(cameras, (-1, 3)).any(axis=1).all()):
+        up = np.array([0.0, 0.0, 1.0]) if shown.up[2] > 0 else None
+    elif up is None and objects.mean() > ALL_OBJECTS:
+        up = _up_of_cut(Seen(seen.points[objects], seen.viewpoint))
+    if up is None:
         return None
     x, y, z = up.tolist()
-    height = seen.points.astype(np.float64) @ up
-    offset = float(np.percentile(height, LOWEST)) - UNDER
+    offset = float(np.percentile(seen.points.astype(np.float64) @ up, LOWEST)) - UNDER
     return measured(seen, SupportPlane(normal=(x, y, z), offset=offset), 0.0)
+
+
+def _up_of_cut(seen: Seen) -> Float64 | None:
+    """Up (3,) of a cloud of N points without their support: its lower edge lies in a plane.
+
+    Of the planes that the cloud touches, on the side that the camera does not see, the one that it
+    touches in the most places. None: the camera looks up, or it is a flat cloud.
+    """
+    points = seen.points[thinned(len(seen.points))].astype(np.float64)
+    if len(points) < FEWEST or seen.viewpoint is None:
+        return None
+    toward = seen.viewpoint - points.mean(axis=0)
+    try:
+        planes = ConvexHull(points).equations
+    except QhullError:
+        return None
+    behind = planes[:, :3] @ toward < -LOOKS_DOWN * np.linalg.norm(toward)
+    behind &= planes[:, :3] @ seen.viewpoint + planes[:, 3] < 0.0
+    planes = planes[behind]
+    near = points @ planes[:, :3].T + planes[:, 3] > -TOUCHED
+    place = np.floor(points / TOUCHED) @ (1.0, 1e3, 1e6)
+    fullest = np.argsort(-near.sum(axis=0), kind="stable")[:CANDIDATES]
+    places = [len(np.unique(place[near[:, k]])) for k in fullest]
+    if not places:
+        return None
+    # Alone, the sides of a box are touched as often as what it stands on; most images are upright.
+    upright = 1.0 + UPRIGHT * planes[fullest, 1]
+    up: Float64 = -planes[fullest[np.argmax(places * upright)], :3]
+    return up
 
 
 def _close_to(plane: SupportPlane, points: Float32, objects: Float32) -> SupportPlane:
