@@ -211,7 +211,8 @@ class GraspDetector:
             logits, outcome = np.empty(0, dtype=np.float32), np.empty(0, dtype=np.int8)
             if scored is not None and scene is not None:
                 logits = self._before_outcomes(scored.logits)
-                logits = judged_together(logits, scored.sample, scene, gripper)
+                if self.sees_hands:
+                    logits = judged_together(logits, scored.sample, scene, gripper)
             scale, shift = self._outcomes
             score = expit(scale * logits + shift)
             if scene is not None and not scene.approach_allowed.any():
