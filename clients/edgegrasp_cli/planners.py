@@ -192,9 +192,11 @@ def request_options(
     """
     low, high = observation.workspace.tolist()
     positions = observation.camera_positions.tolist()
-    support: dict[str, Any] = {"normal": (0.0, 0.0, 1.0), "offset": observation.table_height}
-    if rules.max_depth_error:
-        support["max_depth_error"] = rules.max_depth_error
+    support = {
+        "normal": (0.0, 0.0, 1.0),
+        "offset": observation.table_height,
+        "max_depth_error": rules.max_depth_error,
+    }
     options: dict[str, Any] = {
         "seed": seed,
         "num_approach_points": rules.num_approach_points,

@@ -44,9 +44,10 @@ def range_image(
     for _ in range(2):
         low, high = _view(apart @ turn.T)
         turn = _camera_axes(np.array([*(low + high) / 2, 1.0]) @ turn, downward)
-    low, high = _view(apart @ turn.T)
+    in_view = apart @ turn.T
+    low, high = _view(in_view)
     finest = float(np.sqrt((high - low).prod() / (WIDTH * HEIGHT)))
-    pixel_size = max(finest, _spacing(apart @ turn.T, low, high, len(points)))
+    pixel_size = max(finest, _spacing(in_view, low, high, len(points)))
     width, height = (int(np.ceil(side / MULTIPLE)) * MULTIPLE for side in (high - low) / pixel_size)
     middle = (low + high) / 2
     image = np.full((height, width, 3), np.nan, dtype=np.float32)
@@ -55,9 +56,10 @@ def range_image(
     _render(some, viewpoint, turn, corner, pixel_size, image)
     filled = image.copy()
     _fill_holes(image, filled)
-    coarse = float(np.median(apart @ turn[2])) * pixel_size / COARSEST
+    coarse = float(np.median(in_view[:, 2])) * pixel_size / COARSEST
     if (times := min(round(pixel_size / finest), int(np.ceil(coarse)))) > 1:
-        filled, pixel_size = _enlarged(filled[..., 2], times, corner, pixel_size / times)
+        pixel_size /= times
+        filled = _enlarged(filled[..., 2], times, corner, pixel_size)
     T_cloud_camera = np.eye(4)
     T_cloud_camera[:3, :3], T_cloud_camera[:3, 3] = turn.T, viewpoint
     return RangeImage(filled, pixel_size, T_cloud_camera, corner)
@@ -99,10 +101,8 @@ def _spacing(points: Float64, low: Float64, high: Float64, count: int) -> float:
     return SPACING * float(np.sqrt(occupied / max(count, 1)))
 
 
-def _enlarged(
-    depth: Float32, times: int, corner: Float64, pixel_size: float
-) -> tuple[Float32, float]:
-    """The image of a sparse cloud with pixels as fine as the network knows, and their side.
+def _enlarged(depth: Float32, times: int, corner: Float64, pixel_size: float) -> Float32:
+    """The image of a sparse cloud with pixels as fine as the network knows.
 
     Depths are interpolated on a surface, and repeated beside its edges.
     """
@@ -111,7 +111,7 @@ def _enlarged(
     smooth = np.abs(between - nearest) < SURFACE  # false for NaN
     z = np.where(smooth, between, nearest)
     y, x = (np.indices(z.shape) + 0.5) * pixel_size + corner[::-1, None, None]
-    return np.stack([x * z, y * z, z], axis=-1).astype(np.float32), pixel_size
+    return np.stack([x * z, y * z, z], axis=-1).astype(np.float32)
 
 
 @compiled("contract")

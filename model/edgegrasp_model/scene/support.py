@@ -183,7 +183,8 @@ def _assumed(
     if up is None and (cameras is None or np.reshape(cameras, (-1, 3)).any(axis=1).all()):
         up = np.array([0.0, 0.0, 1.0]) if shown.up[2] > 0 else None
     elif up is None and objects.mean() > ALL_OBJECTS:
-        up = _up_of_cut(Seen(seen.points[objects], seen.viewpoint))
+        assert seen.viewpoint is not None
+        up = _up_of_cut(seen.points[objects], seen.viewpoint)
     if up is None:
         return None
     x, y, z = up.tolist()
@@ -191,27 +192,26 @@ def _assumed(
     return measured(seen, SupportPlane(normal=(x, y, z), offset=offset), 0.0)
 
 
-def _up_of_cut(seen: Seen) -> Float64 | None:
-    """Up (3,) of a cloud of N points without their support: its lower edge lies in a plane.
+def _up_of_cut(cloud: Float32, viewpoint: Float64) -> Float64 | None:
+    """Up (3,) of a cloud (N, 3) without its support: its lower edge lies in a plane.
 
     Of the planes that the cloud touches, on the side that the camera does not see, the one that it
     touches in the most places. None: the camera looks up, or it is a flat cloud.
     """
-    points = seen.points[thinned(len(seen.points))].astype(np.float64)
-    if len(points) < FEWEST or seen.viewpoint is None:
+    points = cloud[thinned(len(cloud))].astype(np.float64)
+    if len(points) < FEWEST:
         return None
-    toward = seen.viewpoint - points.mean(axis=0)
+    toward = viewpoint - points.mean(axis=0)
     try:
         planes = ConvexHull(points).equations
     except QhullError:
         return None
     behind = planes[:, :3] @ toward < -LOOKS_DOWN * np.linalg.norm(toward)
-    behind &= planes[:, :3] @ seen.viewpoint + planes[:, 3] < 0.0
+    behind &= planes[:, :3] @ viewpoint + planes[:, 3] < 0.0
     planes = planes[behind]
     near = points @ planes[:, :3].T + planes[:, 3] > -TOUCHED
-    place = np.floor(points / TOUCHED) @ (1.0, 1e3, 1e6)
     fullest = np.argsort(-near.sum(axis=0), kind="stable")[:CANDIDATES]
-    places = [len(np.unique(place[near[:, k]])) for k in fullest]
+    places = [_occupied(points[near[:, k]], TOUCHED) for k in fullest]
     if not places:
         return None
     # Alone, the sides of a box are touched as often as what it stands on; most images are upright.
@@ -420,8 +420,13 @@ def _covers(points: Floats, viewpoint: Float64, plane: SupportPlane, scale: floa
 
 def _area(places: Float64) -> float:
     """Square metres that points (N, 3) cover, seen along z."""
-    cells = np.floor(places[:, :2] / CELL)
-    return len(np.unique(cells @ (1.0, 1e6))) * CELL**2  # many times as fast as unique rows
+    return _occupied(places[:, :2], CELL) * CELL**2
+
+
+def _occupied(points: Float64, side: float) -> int:
+    """How many cells with sides of so many metres hold points (N, D)."""
+    # One number for each cell is many times as fast as unique rows.
+    return len(np.unique(np.floor(points / side) @ 10.0 ** (5.0 * np.arange(points.shape[1]))))
 
 
 def _middle(factors: Float64, scale: float, reach: float) -> float | None:
