@@ -7,6 +7,7 @@ One command makes the whole data set again: `edgegrasp generate-scenes FOLDER --
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_camera.arrays import Array, Bools, Float32, Float64
 from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.engine import Intrinsics
-from edgegrasp_sim.sensor import random_sensor
+from edgegrasp_sim.sensor import DepthSensor, random_sensor
 from edgegrasp_training.scene_layouts import (
     MAX_OBJECTS,
     OBJECT,
@@ -31,7 +32,7 @@ from edgegrasp_training.scene_layouts import (
 )
 from edgegrasp_training.scene_pool import Mesh, make_arms, make_pool
 
-WIDTH, HEIGHT = 320, 240  # pixels
+WIDTH, HEIGHT = 480, 352  # pixels
 DEPTH_UNIT = 0.0002  # metres of a stored depth; 16 bits reach 13 m
 VIEWS_PER_SCENE = 4
 SCENES_PER_FILE = 50
@@ -193,7 +194,7 @@ def _faults(
         noisy = depth + rng.normal(0.0, rng.uniform(0.0, 0.0015), depth.shape)
         noisy[depth >= 0.999 * camera.far] = np.nan
     else:
-        noisy = random_sensor(rng).apply(depth, camera, rng)
+        noisy = _coarser(random_sensor(rng), rng.uniform(1.0, 2.5)).apply(depth, camera, rng)
     dark = np.append(numbers[rng.random(len(numbers)) < 0.08], [SUPPORT] * (rng.random() < 0.05))
     if len(dark):
         noisy[np.isin(label, dark) & (_blobs(rng, depth.shape) < rng.uniform(0.2, 0.9))] = np.nan
@@ -209,6 +210,13 @@ def _faults(
     # Flying pixels and ghosts show nothing that is there.
     wrong = np.abs(noisy - depth) > WRONG[0] + WRONG[1] * depth
     return noisy, np.where(wrong, OTHER, label).astype(np.uint8)
+
+
+def _coarser(sensor: DepthSensor, factor: float) -> DepthSensor:
+    """A camera with larger windows, as those have that match patterns in larger images."""
+    window = 2 * round(factor * sensor.window / 2) + 1 if sensor.window > 1 else 1
+    pixels = round(factor * sensor.noise_pixels) if sensor.noise_pixels > 1 else 1
+    return replace(sensor, window=window, noise_pixels=pixels)
 
 
 def _blobs(rng: np.random.Generator, shape: tuple[int, ...], size: int = 10) -> Float64:

@@ -109,11 +109,20 @@ def _bin(scene: SceneMeshes) -> None:
     half = (rng.uniform(0.12, 0.35), rng.uniform(0.1, 0.28))
     depth = rng.uniform(0.03, 0.35)
     flush = rng.random() < 0.2
+    round_bin = not flush and rng.random() < 0.12
     scene.elevation = (0.45 if depth < 0.1 else 0.75, 1.57)
-    scene.add(_surface(rng, half, 0.004), SUPPORT)
-    _open_box(scene, half, depth, flush)
-    scene.add_box((2 * half[0] + 0.004, 2 * half[1] + 0.004, 0.01), (0, 0, -0.012))
+    scene.add(_disc(half) if round_bin else _surface(rng, half, 0.004), SUPPORT)
+    _open_box(scene, half, depth, flush, round_bin)
+    if not round_bin:
+        scene.add_box((2 * half[0] + 0.004, 2 * half[1] + 0.004, 0.01), (0, 0, -0.012))
     heights = HeightMap(half, walls=depth)
+    if rng.random() < 0.12:  # a wall between compartments
+        size, place = np.array([0.006, 2 * half[1], depth]), rng.uniform(-0.4, 0.4) * half[0]
+        size[2] *= rng.uniform(0.3, 1.0)
+        scene.add_box(size, (place, 0, size[2] / 2))
+        y, z = rng.uniform(-0.5, 0.5, (2, 3000))
+        points = np.stack([np.full(3000, place), y * size[1], (z + 0.5) * size[2]], axis=1)
+        heights.put(points)
     fill = rng.uniform(-0.15, 1.5)
     around = rng.uniform(0.3, 1.0) * max(half)
     while fill > 0 and len(scene.centres) < 70:
@@ -225,6 +234,44 @@ def _room(scene: SceneMeshes, floor: float, label: int = OTHER) -> None:
         points = points * rng.uniform(1.0, 3.0)
         place = np.array([*_aside(yaw, away), floor - points[:, 2].min()])
         scene.add((points + place, triangles))
+    for _ in range(int(rng.integers(0, 4))):
+        away = rng.uniform(0.5, 2.5)
+        scene.add(_frame(rng, (*_aside(rng.uniform(0, 2 * np.pi), away), floor + 0.03)))
+    if rng.random() < 0.2:  # a rail, a hose, or a cable that hangs into the view
+        away = rng.uniform(0.1, 0.5)
+        start = *_aside(rng.uniform(0, 2 * np.pi), away), scene.level + rng.uniform(0.1, 0.6)
+        scene.add(_frame(rng, start) if rng.random() < 0.6 else _cable(rng, start))
+
+
+def _frame(rng: np.random.Generator, start: ArrayLike) -> Mesh:
+    """Bars that meet: the foot of a chair, a stand, a camera's rig, a rack."""
+    ends, bars = [np.asarray(start, dtype=np.float64)], list[Mesh]()
+    longest, width = rng.uniform(0.15, 1.2), rng.uniform(0.008, 0.08)
+    spokes, straight = rng.random() < 0.4, rng.random() < 0.6  # from one point; at right angles
+    for _ in range(int(rng.integers(1, 8))):
+        way = np.eye(3)[rng.integers(3)] if straight and not spokes else rng.normal(size=3)
+        way[2] = abs(way[2]) * (0.1 if spokes else 1.0)
+        way *= longest * rng.uniform(0.4, 1.0) / np.linalg.norm(way)
+        first = ends[0 if spokes else int(rng.integers(len(ends)))]
+        bars.append(_bar(first, way, width * rng.uniform(0.6, 1.0), int(rng.choice([4, 8]))))
+        ends += [first + way, first + way * rng.random()]
+    points, triangles = merged(bars)
+    return (points - start) @ _turn(rng.uniform(0, 2 * np.pi)).T + start, triangles
+
+
+def _bar(start: Float64, way: Float64, width: float, sides: int) -> Mesh:
+    """A prism along `way` (3,)."""
+    to_way, _ = Rotation.align_vectors([way], [[0, 0, 1]])
+    angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
+    ring = width / 2 * np.stack([np.cos(angle), np.sin(angle), np.zeros(sides)], axis=1)
+    ring = ring @ to_way.as_matrix().T + start
+    here, there = np.arange(sides), (np.arange(sides) + 1) % sides
+    walls = [
+        np.stack([here, there, there + sides], 1),
+        np.stack([here, there + sides, here + sides], 1),
+    ]
+    caps = [np.stack([0 * here, here, there], 1), sides + np.stack([0 * here, there, here], 1)]
+    return np.concatenate([ring, ring + way]), np.concatenate(walls + caps)
 
 
 def _aside(yaw: float, away: float) -> Float64:
@@ -277,17 +324,21 @@ def _distractors(scene: SceneMeshes, heights: "HeightMap") -> None:
             put(_cable(rng, place))
 
 
-def _cable(rng: np.random.Generator, place: Float64) -> Mesh:
+def _cable(rng: np.random.Generator, place: ArrayLike) -> Mesh:
+    """A cable from a place (2,) on the support, or through a place (3,) above it."""
+    start, rise = np.asarray(place), np.zeros(50)
+    if len(start) == 3:
+        rise = start[2] + np.cumsum(rng.normal(0.0, 0.004) + rng.normal(0.0, 0.004, 50))
     heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0.0, 0.18, 50))
     step = rng.uniform(0.012, 0.03)
-    way = place + np.cumsum(step * np.stack([np.cos(heading), np.sin(heading)], 1), axis=0)
+    way = start[:2] + np.cumsum(step * np.stack([np.cos(heading), np.sin(heading)], 1), axis=0)
     radius = rng.uniform(0.002, 0.008)
     angle = 2 * np.pi * np.arange(6) / 6
     side = np.stack([-np.sin(heading), np.cos(heading)], 1)
     points = np.concatenate(
         [
             (way[:, None] + radius * np.cos(angle)[None, :, None] * side[:, None]),
-            np.broadcast_to(radius + radius * np.sin(angle)[None, :, None], (50, 6, 1)),
+            rise[:, None, None] + radius + radius * np.sin(angle)[None, :, None],
         ],
         axis=2,
     )
@@ -307,8 +358,17 @@ def _add_arm(scene: SceneMeshes, share: float = 0.25) -> None:
         scene.add((points @ turn.T + place, triangles))
 
 
-def _open_box(scene: SceneMeshes, half: tuple[float, float], depth: float, flush: bool) -> None:
-    """Four walls of an open box whose floor is at 0: vertical or sloped, perhaps ribbed."""
+def _disc(half: tuple[float, float]) -> Mesh:
+    """The level ellipse through the corners of a rectangle."""
+    points = np.concatenate([np.zeros((1, 3)), np.pad(_ROUND * half, ((0, 0), (0, 1)))])
+    around = np.arange(len(_ROUND))
+    return points, np.stack([0 * around, around + 1, (around + 1) % len(_ROUND) + 1], axis=1)
+
+
+def _open_box(
+    scene: SceneMeshes, half: tuple[float, float], depth: float, flush: bool, is_round: bool = False
+) -> None:
+    """Walls around a floor at 0: vertical or sloped, perhaps ribbed or with handles."""
     rng = scene.rng
     slope = depth * rng.uniform(0.0, 0.6) if rng.random() < 0.5 else 0.0
     wall = rng.uniform(0.003, 0.025)
@@ -321,11 +381,23 @@ def _open_box(scene: SceneMeshes, half: tuple[float, float], depth: float, flush
     outline = [(inner, low), (top, depth), (top + rim, depth), (top + wall, behind)]
     outline.append((inner + wall, low))
     strips = np.array([(0, 1, 3), (0, 3, 2)]) + 2 * np.arange(len(outline) - 1)[:, None, None]
-    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-    for k in range(4):
-        ends = corners[k], corners[(k + 1) % 4]
+    corners = _ROUND if is_round else np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    for k in range(len(corners)):
+        ends = corners[k], corners[(k + 1) % len(corners)]
         points = np.array([(*(end * size), z) for size, z in outline for end in ends])
         scene.add((points, strips.reshape(-1, 3)))
+    if is_round:
+        return
+    for _ in range(int(rng.integers(1, 7)) if rng.random() < 0.35 else 0):  # handles and bosses
+        axis, sign = int(rng.integers(2)), rng.choice([-1, 1])
+        size = rng.uniform((0.02, 0.02, 0.01), (0.15, 0.15, 0.08))
+        size[1 - axis] = rng.uniform(0.006, 0.04)
+        centre = np.zeros(3)
+        centre[2] = depth * rng.uniform(0.1, 1.0)
+        centre[axis] = rng.uniform(-0.8, 0.8) * half[axis]
+        out = slope * centre[2] / depth + (0.0 if rng.random() < 0.5 else wall)
+        centre[1 - axis] = sign * (half[1 - axis] + out)
+        scene.add_box(size, centre)
     if rng.random() < 0.3:
         pitch = rng.uniform(0.03, 0.1)
         for axis in (0, 1):
@@ -336,6 +408,11 @@ def _open_box(scene: SceneMeshes, half: tuple[float, float], depth: float, flush
                     centre = np.full(3, depth / 2)
                     centre[axis], centre[1 - axis] = sign * (half[axis] + slope / 2), place
                     scene.add_box(size, centre)
+
+
+_ROUND = np.sqrt(2) * np.stack(
+    [np.cos(np.arange(24) * np.pi / 12), np.sin(np.arange(24) * np.pi / 12)], axis=1
+)
 
 
 def _surface(rng: np.random.Generator, half: tuple[float, float], bow: float) -> Mesh:

@@ -15,11 +15,11 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.kernels import compiled
 
-HEIGHT, WIDTH = 240, 320  # pixels of the input
-MULTIPLE = 16  # its sides are multiples of
+HEIGHT, WIDTH = 352, 480  # pixels of the input
+MULTIPLE = 32  # its sides are multiples of
 CLASSES = ("other", "support", "object")
 CHANNELS = 12  # of `scene_features`
-WIDTHS = (24, 32, 64, 96, 128)
+WIDTHS = (16, 32, 48, 64, 96, 128)
 STRIDE = 2  # pixels of the input between neighbours whose difference gives the normal
 VOTE_UNIT = 0.05  # metres
 OUTPUTS = len(CLASSES) + 3 + 2 + 3
@@ -53,7 +53,7 @@ class SceneNet(nn.Module):
         self.head = nn.Conv2d(first, OUTPUTS, 1)
 
     def forward(self, features: Tensor) -> SceneOutput:
-        """Maps features (B, CHANNELS, H, W); H and W are multiples of 16."""
+        """Maps features (B, CHANNELS, H, W); H and W are multiples of 32."""
         x = self.fine(self.stem(features))
         kept = []
         for layer in self.down:

@@ -31,7 +31,7 @@ FIXED, UNKNOWN = -1, -2
 
 # When pixels show the same object.
 APART = 0.035  # metres of depth between neighbours; and between the mean votes of its parts
-SMALLEST = 20  # pixels of an object, in the network's output
+SMALLEST = 45  # pixels of an object, in the network's output
 SMALLEST_AREA = 5e-4  # square metres of it, as seen
 SMOOTH = 0.97  # cosine between normals of neighbours on one smooth surface
 STEP = 3.0  # pixels between neighbours on one smooth surface
