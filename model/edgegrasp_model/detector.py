@@ -169,7 +169,7 @@ class GraspDetector:
         """Second stage: sample candidates and score them; None if there is no scene.
 
         In rounds: around half of the approach points; around the other half, on objects without a
-        sure grasp; and around further ones on objects without a good grasp, with tilted hands too.
+        sure grasp; and twice around further ones on objects without a good grasp, as a last resort.
         """
         scene, scored = prepared.scene, None
         if scene is None or not scene.approach_allowed.any() or prepared.options.follows_only:
@@ -178,7 +178,7 @@ class GraspDetector:
         for enough in ROUNDS:
             with prepared.timed("candidates"):
                 done = self._objects_with(prepared, scored, enough)
-                sample = sampler.sample(done, leaning=enough == GOOD_SCORE)
+                sample = sampler.sample(done, last_resort=enough == GOOD_SCORE)
             if sample is not None:
                 found = self._score(prepared, sample)
                 scored = found if scored is None else scored.and_further(found)
@@ -193,7 +193,7 @@ class GraspDetector:
             prepared.gripper,
             prepared.crop_radius,
             prepared.counts,
-            self.sees_hands,
+            sees_hands=self.sees_hands,
         )
 
     def run(self, batch: Batch) -> Float32:

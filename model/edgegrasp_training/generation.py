@@ -384,7 +384,7 @@ def choose_grasps(
         if scene is not None and scene.approach_allowed.any():
             gripper = choose_gripper(request, load_gripper(), {})
             radius = max(CROP_RADIUS, gripper.max_opening / 2)
-            sample = Sampler(scene, request, gripper, radius, {}).all()
+            sample = Sampler(scene, request, gripper, radius, {}, sees_hands=True).all()
     else:
         prepared = guide.prepare(observation.cloud, request)
         selected, scene = prepared.selected, prepared.scene

@@ -89,11 +89,11 @@ class Sampler:
         gripper: Gripper,
         crop_radius: float,  # of the balls, metres
         counts: dict[str, int],  # gets the candidates left after each constraint, over all rounds
-        centre: bool = False,  # add centred hands: for networks that see hands, not edges
+        sees_hands: bool = False,  # whether the network scores hands that are no edge grasps well
     ) -> None:
         """Share the approach points among the objects."""
         self.scene, self.options, self.gripper = scene, options, gripper
-        self.crop_radius, self.counts, self.centre = crop_radius, counts, centre
+        self.crop_radius, self.counts, self.sees_hands = crop_radius, counts, sees_hands
         self._rng_approach = np.random.default_rng([options.seed, APPROACH_STREAM])
         self._rng = np.random.default_rng([options.seed, CANDIDATE_STREAM])
         self._rows = np.flatnonzero(scene.approach_allowed)
@@ -106,7 +106,7 @@ class Sampler:
         self,
         done: Int64 = NOTHING,  # (D,) numbers of objects that need no more
         *,
-        leaning: bool = False,  # try tilted hands too
+        last_resort: bool = False,  # try hands that hold less often or are scored too high
     ) -> Sample | None:
         """Candidates around further approach points; None if there is no point to add.
 
@@ -119,18 +119,25 @@ class Sampler:
         more = self._spread(counts)
         self._round += 1
         self._used = np.concatenate([self._used, more])
-        return self._around(more, leaning=leaning) if len(more) else None
+        return self._around(more, last_resort=last_resort) if len(more) else None
 
     def all(self) -> Sample:
         """Two rounds, whatever their scores."""
-        samples = self.sample(), self.sample(leaning=True)
+        samples = self.sample(), self.sample(last_resort=True)
         return reduce(Sample.and_further, [one for one in samples if one is not None])
 
-    def _around(self, approach_index: Int64, *, leaning: bool) -> Sample:
+    def _around(self, approach_index: Int64, *, last_resort: bool) -> Sample:
         scene, options, gripper, counts = self.scene, self.options, self.gripper, self.counts
         crop = crop_balls(scene.cloud.points, approach_index, self.crop_radius)
         drawn, outcome = _constrained(
-            scene, approach_index, crop, options, gripper, counts, self.centre, leaning=leaning
+            scene,
+            approach_index,
+            crop,
+            options,
+            gripper,
+            counts,
+            sees_hands=self.sees_hands,
+            last_resort=last_resort,
         )
         row, free = _checked(drawn, outcome, scene, options, gripper, counts, self._rng)
         new = free | (options.collision.mode != "avoid")
@@ -202,11 +209,15 @@ def _constrained(
     options: DetectOptions,
     gripper: Gripper,
     counts: dict[str, int],
-    centre: bool,
     *,
-    leaning: bool,
+    sees_hands: bool,
+    last_resort: bool,
 ) -> tuple[Candidates, NDArray[np.int8]]:
-    """The edge grasps of some balls; RETURNED: all constraints hold except collision."""
+    """The candidates of some balls; RETURNED: all constraints hold except collision.
+
+    A network that sees hands gets centred hands, and hands across outlines: as a last resort tilted
+    ones too. To one that sees edges a hand across an outline is a last resort.
+    """
     add_count(counts, "approach_points", len(approach_index))
     add_count(counts, "pairs", len(crop.ball_rows))
     pair = np.flatnonzero(scene.contact_allowed[crop.ball_rows])
@@ -214,17 +225,19 @@ def _constrained(
     pairs = approach_index[crop.ball_of_point[pair]], crop.ball_rows[pair]
     candidates = edge_grasps(scene.cloud, *pairs, gripper)
     candidates = replace(candidates, pair=pair[candidates.pair])
-    if centre:
+    if sees_hands:
         centred = centred_grasps(scene.cloud.points, crop, candidates, gripper)
         candidates = Candidates.concatenate([candidates, centred])
     points, margin = scene.cloud.points, options.collision.margin
     is_contact = np.zeros(len(points), dtype=bool)
     is_contact[pairs[1]] = True
-    across = [
-        outline_grasps(points, crop, approach_index, pair, each, scene.support, gripper, margin)
-        for each in outlines(points, scene.viewpoints, np.flatnonzero(is_contact), leaning=leaning)
-    ]
-    candidates = Candidates.concatenate([candidates, *across])
+    if sees_hands or last_resort:
+        contacts, leaning = np.flatnonzero(is_contact), sees_hands and last_resort
+        across = [
+            outline_grasps(points, crop, approach_index, pair, each, scene.support, gripper, margin)
+            for each in outlines(points, scene.viewpoints, contacts, leaning=leaning)
+        ]
+        candidates = Candidates.concatenate([candidates, *across])
     add_count(counts, "candidates", len(candidates))
     outcome = np.full(len(candidates), CODE[Outcome.RETURNED])
     if scene.support is not None:
