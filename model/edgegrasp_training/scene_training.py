@@ -217,7 +217,7 @@ def fit_confidence(network: SceneNet, images: SceneImages) -> list[float]:
     sign, values = np.where(np.concatenate(right), 1.0, -1.0), np.concatenate(traits)
 
     def loss(weights: Float64) -> float:
-        return float(np.logaddexp(0.0, -sign * (values @ weights)).mean())
+        return float(np.logaddexp(0.0, -sign * (values @ weights)).sum() / max(len(sign), 1))
 
     fitted: list[float] = minimize(loss, np.zeros(values.shape[1])).x.round(3).tolist()
     return fitted

@@ -121,6 +121,9 @@ def _segment_view(
     pixels, seen_up = look(shipped.network, image.points, up_in_view, image.footprint)
     of_pixel = group(pixels)
     score = instance_traits(of_pixel, pixels) @ shipped.confidence
+    likely = score > 0.0  # that it is an object, rather than background
+    new = np.append(np.where(likely, np.cumsum(likely) - 1, FIXED), [UNKNOWN, FIXED])
+    of_pixel, score = new[of_pixel], score[likely]
     number = np.full(len(points), UNKNOWN)
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
     T_camera_cloud = np.linalg.inv(image.T_cloud_camera)
