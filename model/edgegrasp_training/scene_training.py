@@ -19,7 +19,7 @@ from torch.optim import swa_utils
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_model.scene.network import VOTE_UNIT, SceneNet, SceneOutput, scene_features
-from edgegrasp_model.scene.segment import group, instance_traits, look
+from edgegrasp_model.scene.segment import group, look, mean_probability
 from edgegrasp_training.scene_images import DEPTH_UNIT, SceneImage
 from edgegrasp_training.scene_layouts import OBJECT
 
@@ -202,8 +202,8 @@ def evaluate(network: SceneNet, images: SceneImages, limit: int = 200) -> dict[s
 
 
 def fit_confidence(network: SceneNet, images: SceneImages) -> list[float]:
-    """Logistic regression from `instance_traits` to whether most of an instance is an object."""
-    traits, right = [], []
+    """Logistic regression from `mean_probability` to whether most of an instance is an object."""
+    means, right = [], []
     for row in range(len(images)):
         image, points = images[row], image_points(images[row])
         known = image.up.astype(np.float64) if row % 2 else None
@@ -212,14 +212,15 @@ def fit_confidence(network: SceneNet, images: SceneImages) -> list[float]:
         size = np.bincount(number[number >= 0])
         on_object = (number >= 0) & (image.label[::2, ::2] >= OBJECT)
         held = np.bincount(number[on_object], minlength=len(size))
-        traits.append(instance_traits(number, pixels))
+        means.append(mean_probability(number, pixels.classes))
         right.append(held >= 0.5 * np.maximum(size, 1))
-    sign, values = np.where(np.concatenate(right), 1.0, -1.0), np.concatenate(traits)
+    sign, mean = np.where(np.concatenate(right), 1.0, -1.0), np.concatenate(means)
 
     def loss(weights: Float64) -> float:
-        return float(np.logaddexp(0.0, -sign * (values @ weights)).sum() / max(len(sign), 1))
+        score = weights[0] + weights[1] * mean
+        return float(np.logaddexp(0.0, -sign * score).sum() / max(len(sign), 1))
 
-    fitted: list[float] = minimize(loss, np.zeros(values.shape[1])).x.round(3).tolist()
+    fitted: list[float] = minimize(loss, np.zeros(2)).x.round(3).tolist()
     return fitted
 
 

@@ -33,8 +33,6 @@ FIXED, UNKNOWN = -1, -2
 APART = 0.035  # metres of depth between neighbours; and between the mean votes of its parts
 SMALLEST = 45  # pixels of an object, in the network's output
 SMALLEST_AREA = 5e-4  # square metres of it, as seen
-SMOOTH = 0.97  # cosine between normals of neighbours on one smooth surface
-STEP = 3.0  # pixels between neighbours on one smooth surface
 VIEW_CELL = 0.01  # metres, in which the views of one object lie in the same place
 VIEW_SHARE = 0.25  # of the smaller one's cells that two views of one object share
 BESIDE = 0.012  # metres from an object within which missed points may belong to it
@@ -58,7 +56,6 @@ class Pixels(NamedTuple):
     """The network's output for each pixel, and the point seen there; camera frame."""
 
     points: Float32  # (H, W, 3) metres; NaN where nothing was seen
-    normals: Float32  # (H, W, 3) unit; 0 where unknown
     classes: Float32  # (3, H, W) probabilities
     votes: Float32  # (H, W, 3) metres from each point to the centre of its object
     links: Float32  # (2, H, W) probability of showing the same object as the right, lower pixel
@@ -66,7 +63,11 @@ class Pixels(NamedTuple):
 
 
 class Recogniser(NamedTuple):
-    """The `scene` network, and the weights (3,) of `instance_traits` in a logistic regression."""
+    """The `scene` network, and how it recognises objects.
+
+    The log odds that an instance is an object are `confidence` (2,): a constant and a factor of its
+    `mean_probability`.
+    """
 
     network: SceneNet
     confidence: Float64
@@ -120,7 +121,8 @@ def _segment_view(
     up_in_view = None if up is None else up @ turn
     pixels, seen_up = look(shipped.network, image.points, up_in_view, image.footprint)
     of_pixel = group(pixels)
-    score = instance_traits(of_pixel, pixels) @ shipped.confidence
+    constant, factor = shipped.confidence
+    score = constant + factor * mean_probability(of_pixel, pixels.classes)
     likely = score > 0.0  # that it is an object, rather than background
     new = np.append(np.where(likely, np.cumsum(likely) - 1, FIXED), [UNKNOWN, FIXED])
     of_pixel, score = new[of_pixel], score[likely]
@@ -148,11 +150,10 @@ def look(
         links = output.links[0].sigmoid().contiguous().numpy()
         ways = functional.normalize(output.up[0], dim=0).numpy()
     seen = np.ascontiguousarray(points[::2, ::2])
-    normals = features[5:8, ::2, ::2].transpose(1, 2, 0)
     seen_up = ways[:, ~np.isnan(seen[..., 2])].sum(axis=1).astype(np.float64)
     if not seen_up.any():  # nothing was seen: assume toward the camera
         seen_up = np.array([0.0, 0.0, -1.0])
-    return Pixels(seen, normals, classes, votes, links, 2 * footprint), unit(seen_up)
+    return Pixels(seen, classes, votes, links, 2 * footprint), unit(seen_up)
 
 
 @contextmanager
@@ -168,7 +169,7 @@ def _one_thread() -> Iterator[None]:
 
 def group(pixels: Pixels) -> Int64:
     """The object (H, W) of each pixel, from 0; FIXED: background; UNKNOWN: undecided."""
-    points, _, classes, votes, links, footprint = pixels
+    points, classes, votes, links, footprint = pixels
     seen = ~np.isnan(points[..., 2])
     held = seen & (classes.argmax(axis=0) == 2)
     number = np.where(held, UNKNOWN, FIXED)
@@ -235,30 +236,14 @@ def _join(
         component[n] = root
 
 
-def instance_traits(number: Int64, pixels: Pixels) -> Float64:
-    """Features (O, 3) that tell objects from background that the network classified as object.
+def mean_probability(number: Int64, classes: Float32) -> Float64:
+    """The mean probability (O,) of an object over each instance's pixels.
 
-    1, the mean probability of an object, and the share of the border across which the surface
-    continues smoothly into background. `number` (H, W) is as from `group`, of O objects.
+    `number` (H, W) is as from `group`, of O instances; `classes` (3, H, W) are probabilities.
     """
-    points, normals, classes, _, _, footprint = pixels
-    count = int(number.max(initial=-1)) + 1
     held = number >= 0
-    size = np.bincount(number[held], minlength=count)
-    mean = np.bincount(number[held], classes[2][held], minlength=count) / np.maximum(size, 1)
-    border, smooth = np.zeros((2, count))
-    near = STEP * footprint * np.nan_to_num(points[..., 2])
-    for a, b in (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]):
-        step = np.linalg.norm(points[a] - points[b], axis=-1) < near[a]  # false for NaN
-        along = (normals[a] * normals[b]).sum(axis=-1) > SMOOTH
-        for inside, outside in ((a, b), (b, a)):
-            edge = (number[inside] >= 0) & (number[outside] != number[inside])
-            edge &= ~np.isnan(points[outside][..., 2])
-            border += np.bincount(number[inside][edge], minlength=count)
-            runs_on = edge & step & along & (number[outside] < 0)
-            smooth += np.bincount(number[inside][runs_on], minlength=count)
-    share = smooth / np.maximum(border, 1)
-    return np.stack([np.ones(count), mean, share], axis=1)
+    total = np.bincount(number[held], classes[2][held])
+    return total / np.maximum(np.bincount(number[held]), 1)
 
 
 def joined(points: Float32, number: Int64, count: int) -> Int64:
