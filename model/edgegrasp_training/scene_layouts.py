@@ -245,7 +245,8 @@ def _room(scene: SceneMeshes, floor: float, label: int = OTHER) -> None:
 
 def _frame(rng: np.random.Generator, start: ArrayLike) -> Mesh:
     """Bars that meet: the foot of a chair, a stand, a camera's rig, a rack."""
-    ends, bars = [np.asarray(start, dtype=np.float64)], list[Mesh]()
+    origin = np.asarray(start, dtype=np.float64)
+    ends, bars = [origin], list[Mesh]()
     longest, width = rng.uniform(0.15, 1.2), rng.uniform(0.008, 0.08)
     spokes, straight = rng.random() < 0.4, rng.random() < 0.6  # from one point; at right angles
     for _ in range(int(rng.integers(1, 8))):
@@ -256,7 +257,7 @@ def _frame(rng: np.random.Generator, start: ArrayLike) -> Mesh:
         bars.append(_bar(first, way, width * rng.uniform(0.6, 1.0), int(rng.choice([4, 8]))))
         ends += [first + way, first + way * rng.random()]
     points, triangles = merged(bars)
-    return (points - start) @ _turn(rng.uniform(0, 2 * np.pi)).T + start, triangles
+    return (points - origin) @ _turn(rng.uniform(0, 2 * np.pi)).T + origin, triangles
 
 
 def _bar(start: Float64, way: Float64, width: float, sides: int) -> Mesh:
