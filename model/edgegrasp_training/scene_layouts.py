@@ -262,17 +262,11 @@ def _frame(rng: np.random.Generator, start: ArrayLike) -> Mesh:
 
 def _bar(start: Float64, way: Float64, width: float, sides: int) -> Mesh:
     """A prism along `way` (3,)."""
-    to_way, _ = Rotation.align_vectors([way], [[0, 0, 1]])
-    angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
-    ring = width / 2 * np.stack([np.cos(angle), np.sin(angle), np.zeros(sides)], axis=1)
-    ring = ring @ to_way.as_matrix().T + start
-    here, there = np.arange(sides), (np.arange(sides) + 1) % sides
-    walls = [
-        np.stack([here, there, there + sides], 1),
-        np.stack([here, there + sides, here + sides], 1),
-    ]
-    caps = [np.stack([0 * here, here, there], 1), sides + np.stack([0 * here, there, here], 1)]
-    return np.concatenate([ring, ring + way]), np.concatenate(walls + caps)
+    import trimesh
+
+    ends = np.stack([start, start + way])
+    surface = trimesh.creation.cylinder(width / 2, sections=sides, segment=ends)
+    return np.asarray(surface.vertices), np.asarray(surface.faces)
 
 
 def _aside(yaw: float, away: float) -> Float64:

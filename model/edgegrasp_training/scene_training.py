@@ -26,7 +26,7 @@ from edgegrasp_training.scene_layouts import OBJECT
 UP_SHARE = 0.5  # share of the images for which the network gets `up`
 UP_ERROR = 0.02  # radians, standard deviation of the `up` that it is given
 BATCH = 16
-SIZES, SIZE_SHARES = ((352, 480), (288, 384), (192, 256)), (0.5, 0.3, 0.2)  # pixels, of batches
+SIZES, SIZE_SHARES = ((352, 480), (256, 384), (192, 288)), (0.5, 0.3, 0.2)  # pixels, of batches
 CLOSER_SHARE = 0.5  # of the smaller images, a part of a stored image rather than all of it
 CROPPED_SHARE = 0.12  # share of the images cropped to the objects' surroundings
 HELD_OUT = 2  # files, the first ones, that the network never learns from

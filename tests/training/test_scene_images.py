@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("open3d", reason="rays are cast by Open3D")
+pytest.importorskip("trimesh", reason="some background is made by trimesh")
 
 from edgegrasp_model.scene.network import SceneNet
 from edgegrasp_training import scene_images, scene_pool, scene_training
