@@ -1,5 +1,6 @@
 """Planners for clutter removal: a detector, on a server or in this process, or any by name."""
 
+import hashlib
 import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -68,6 +69,10 @@ def open_planner(
             used = model_used(client, model)
         facts: dict[str, Any] = {"name": choice.planner, "options": dict(options)}
         facts |= {"model": used.name, "digest": used.digest, "voxel_size": used.voxel_size}
+        if not choice.server:
+            from edgegrasp_model.scene.segment import WEIGHTS
+
+            facts["scene_digest"] = hashlib.sha256(WEIGHTS.read_bytes()).hexdigest()
         yield ChosenPlanner(partial(ClientPlanner, open_client, rules, asked), facts)
 
 

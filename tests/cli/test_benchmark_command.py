@@ -181,7 +181,7 @@ def test_a_model_may_be_a_file_of_weights(tmp_path: Path) -> None:
     ablation.write_bytes((WEIGHTS_FOLDER / "edgegrasp-plus.safetensors").read_bytes())
     file = PlannerFlags(planner="in-process", model=str(ablation))
     with open_planner(file, PAPER, {}) as made:
-        assert len(made.facts["digest"]) == 64
+        assert len(made.facts["digest"]) == len(made.facts["scene_digest"]) == 64
     assert planned(model=str(ablation)).score == planned().score
     missing = PlannerFlags(planner="in-process", model=str(tmp_path / "none.safetensors"))
     with pytest.raises(ValueError, match="no such file"), open_planner(missing, PAPER, {}):
