@@ -6,6 +6,7 @@ import pytest
 from edgegrasp_model.options import DetectOptions, SupportPlane
 from edgegrasp_results import Grasp
 
+from .rendered import box, camera, render, table
 from .scenes import detector
 
 TOP = 0.3  # metres
@@ -61,3 +62,12 @@ def test_a_rim_is_grasped_across_its_wall() -> None:
     assert np.mean(closing > FIFTEEN_DEGREES) > 0.9
     distance = np.linalg.norm(hands[:, :2, 3], axis=1)
     np.testing.assert_allclose(distance, 0.072, atol=0.003)
+
+
+def test_a_network_of_edges_gets_edge_grasps_where_they_are_good(catalogue) -> None:
+    box_on_table = render([table(), box((0, 0, 0.05), (0.02, 0.03, 0.05))], camera(0.7, -1.5, 0.7))
+    found = catalogue.get("edgegrasp-small").detect(box_on_table, DetectOptions(top_k=100))
+    assert found.grasps
+    for grasp in found.grasps:  # the approach point lies on the hand's axis
+        from_hand = np.linalg.inv(grasp.T_cloud_hand) @ np.append(grasp.approach_point, 1.0)
+        assert np.abs(from_hand[:2]).max() < 1e-4
