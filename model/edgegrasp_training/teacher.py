@@ -14,8 +14,8 @@ from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_training.examples import SoftLabels, hand_batch
 from edgegrasp_training.views import LabelledView, load_view
 
-OWN_BALLS = 16  # balls of a view around approach points of its tried grasps
-FURTHER_BALLS = 8  # around other points
+BALLS = 24  # of a view,
+OWN_BALLS = 16  # of them at most around approach points of its tried grasps
 GRASPS_PER_BALL = 64  # scored at most; about a third of a ball's candidates
 
 
@@ -39,7 +39,7 @@ class Teacher:
         own = np.unique(view.approach_index[view.tried()])
         others = np.setdiff1d(np.flatnonzero(view.numbered_objects() >= 0), own)
         own = rng.permutation(own)[:OWN_BALLS]
-        balls = np.sort(np.concatenate([own, rng.permutation(others)[:FURTHER_BALLS]]))
+        balls = np.sort(np.concatenate([own, rng.permutation(others)[: BALLS - len(own)]]))
         candidates = self._candidates(view, balls, rng) if len(balls) else None
         if candidates is None or len(candidates) == 0:
             rows, numbers = np.empty(0, np.uint16), np.empty(0, np.float16)

@@ -125,22 +125,25 @@ class Trainer:
         self._save_state()
 
     def evaluate(self, balls_per_view: int | None = None) -> Evaluation:
-        """Score the validation views, or at most `balls_per_view` balls of each."""
+        """Score the validation views, or at most `balls_per_view` balls of each.
+
+        Targets are the outcomes of grasps that were tried; with a teacher its scores too.
+        """
         logits, labels = [], []
         with torch.inference_mode():
             for number, path in enumerate(self.validation_paths):
                 grasps = self._tried(path, True)
-                balls = grasps.balls()
+                balls, soft_labels = self._labelled_balls(path, grasps)
                 if len(balls) == 0:
                     continue
                 if balls_per_view is not None and len(balls) > balls_per_view:
                     rng = np.random.default_rng([self.options.seed, number])
                     balls = np.sort(rng.choice(balls, balls_per_view, replace=False))
-                packed = self._pack(grasps, balls)
+                packed = self._pack(grasps, balls, soft_labels=soft_labels)
                 logits.append(self.average(packed.batch.to(self.device)).float().cpu())
-                labels.append((packed.label > 0.5).float())
-        logit, label_array = torch.cat(logits).numpy(), torch.cat(labels).numpy()
-        return evaluate_scores(logit, label_array)
+                label = packed.label
+                labels.append((label > 0.5).float() if soft_labels is None else label)
+        return evaluate_scores(torch.cat(logits).numpy(), torch.cat(labels).numpy())
 
     def finish(self, provenance: dict[str, Any], command: str) -> Evaluation:
         """Calibrate the best network on all validation views; write it and its card."""
@@ -219,10 +222,7 @@ class Trainer:
             grasps = self._tried(self.train_paths[index], bool(camera_known) or not camera_matters)
             if not support_known:
                 grasps = grasps.without_support()
-            balls, soft_labels = grasps.balls(), None
-            if self.teacher is not None:
-                soft_labels = self._soft_labels(self.train_paths[index])
-                balls = np.union1d(balls, soft_labels.approach_index).astype(np.int64)
+            balls, soft_labels = self._labelled_balls(self.train_paths[index], grasps)
             if len(balls) == 0:
                 continue
             chosen = rng.choice(balls, min(self.options.balls_per_view, len(balls)), replace=False)
@@ -240,6 +240,13 @@ class Trainer:
         batches, labels, weights = zip(*parts, strict=True)
         join: Any = type(batches[0]).concatenate
         return Packed(join(batches), torch.cat(labels), torch.cat(weights))
+
+    def _labelled_balls(self, path: Path, grasps: TriedGrasps) -> tuple[Int64, SoftLabels | None]:
+        """Approach points (A,) of a view whose grasps were tried, or scored by the teacher."""
+        if self.teacher is None:
+            return grasps.balls(), None
+        taught = self._soft_labels(path)
+        return np.union1d(grasps.balls(), taught.approach_index).astype(np.int64), taught
 
     def _pack(
         self,

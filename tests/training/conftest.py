@@ -79,23 +79,21 @@ def networks() -> dict[str, NetworkConfig]:
 
 @pytest.fixture(scope="session")
 def make_trainer(views: list[Path]) -> MakeTrainer:
-    """Makes the trainer of a small network on made-up views."""
+    """Makes the trainer of a small network, on made-up views unless others are given."""
 
     def make(
         folder: Path,
         network: str = "hands",
         *,
         name: str = "tiny",
-        train: list[Path] | None = None,
+        views: list[Path] = views,
         teacher: Teacher | None = None,
         start: Path | None = None,
         **options: object,
     ) -> Trainer:
         metadata = CheckpointMetadata(name, NETWORKS[network], voxel_size=0.0045, gripper="panda")
-        own, validation = split_by_scene(views, 0.25, seed=0)
+        train, validation = split_by_scene(views, 0.25, seed=0)
         chosen = TrainingOptions(**FAST | options)
-        return Trainer(
-            metadata, train or own, validation, folder, chosen, teacher=teacher, start=start
-        )
+        return Trainer(metadata, train, validation, folder, chosen, teacher=teacher, start=start)
 
     return make

@@ -1,5 +1,6 @@
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -149,6 +150,22 @@ def test_loss_falls_with_a_teacher_who_is_named_in_card_and_checkpoint(
     card = (tmp_path / "tiny.md").read_text()
     assert "| teacher | guide |" in card
     assert digest in card
+
+
+def test_a_teacher_alone_labels_views_in_which_no_grasp_was_tried(
+    make_trainer, made_up_view, teacher: Teacher, tmp_path: Path
+) -> None:
+    for number in range(8):
+        view = made_up_view(number)
+        nothing = np.empty(0, dtype=np.int64)
+        untried = replace(
+            view, approach_index=nothing, contact_index=nothing, success=nothing.astype(np.int8)
+        )
+        untried.save(tmp_path / f"packed_{number}_0.npz")
+    run = make_trainer(tmp_path / "run", "balls", teacher=teacher, views=find_views([tmp_path]))
+    before = run.evaluate()
+    run.run(ignore)
+    assert run.evaluate().loss < 0.95 * before.loss
 
 
 def test_only_hands_teach_and_only_balls_are_taught(make_trainer, networks, teacher, tmp_path):
