@@ -5,23 +5,20 @@ import json
 import struct
 import zlib
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks.dummy import DummyCatalogue
 from hypothesis import strategies as st
 from PIL import Image
 from tests.cloud_files import npy
+from tests.service.worker.conftest import ask as ask_worker
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.request_cloud import GIVEN, PER_POINT, File, decode_cloud
 from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.answer import answer
-from edgegrasp_service.worker.process import Job
 
 from .conftest import (
     DEPTH_IMAGE,
@@ -145,7 +142,7 @@ FORM = b"".join(
 
 # Whole requests
 
-ANSWER = partial(answer, catalogue=DummyCatalogue(), settings=Settings(max_points=MAX_POINTS))
+SETTINGS = Settings(max_points=MAX_POINTS)
 DOCUMENTS = {
     "points": POINTS.tolist(),
     "point_cloud2": POINT_CLOUD2 | {"data": base64_of(POINT_CLOUD2["data"])},
@@ -157,19 +154,13 @@ DOCUMENTS = {
 BESIDE = {"edges": [[0, 1], [2, 3]], "hand_poses": [np.eye(4).tolist()], "options": OPTIONS}
 
 
-def ask(transport: Any, body: bytes, scores: bool, media_type: str = "", query: str = "") -> None:
-    """Ask; anything but an answer or an error of the caller's fails."""
-    method: Any = "ScoreGrasps" if scores else "DetectGrasps"
-    job = Job(method, transport, body, 60.0, media_type, query)
-
-    def work() -> None:
-        answer = ANSWER(job)
-        if answer.error is not None:
-            assert 400 <= answer.error.status < 500, answer.facts.traceback
-            answer.error.detail.encode()  # what cannot be encoded cannot be answered
-            assert len(answer.error.detail) < 2000
-
-    decodes_or_refuses(work, len(body) + len(query), MAX_POINTS)
+def ask(transport: str, body: bytes, scores: bool, media_type: str = "", query: str = "") -> None:
+    """Ask, within memory; anything but an answer or an error of the caller's fails."""
+    decodes_or_refuses(
+        lambda: ask_worker(transport, body, media_type, query, scores, SETTINGS),
+        len(body) + len(query),
+        MAX_POINTS,
+    )
 
 
 @given(mutated([message.SerializeToString() for message in MESSAGES]), st.booleans())
@@ -235,8 +226,7 @@ def test_what_is_mutated_is_good() -> None:
         ("application/json", json.dumps({name: DOCUMENTS[name]}).encode()) for name in DOCUMENTS
     ]
     for media_type, content in good:
-        answer = ANSWER(Job("DetectGrasps", "http", content, 60.0, media_type))
-        assert answer.error is None
+        assert ask_worker("http", content, media_type, settings=SETTINGS).error is None
     for file_format in FILES:
         for content in FILES[file_format]:
             decode_cloud({"cloud": File(file_format, content)}, DetectOptions(), MAX_POINTS)
