@@ -13,6 +13,10 @@ from pathlib import Path
 from typing import Any
 
 os.environ["OMP_NUM_THREADS"] = "1"  # two test processes and their servers share two cores
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):  # or each program started compiles all of PyTorch
+    sys.pycache_prefix = str(Path(__file__).parents[1] / "build" / "pycache")
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
+    sys.dont_write_bytecode = False
 
 import numpy as np
 import pytest
