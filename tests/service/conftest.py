@@ -23,7 +23,10 @@ from edgegrasp_service.server import Server
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.pool import ONE_THREAD
 
-PATIENCE = 20  # seconds; longer than anything takes
+PATIENCE = 30  # seconds; longer than anything takes
+USER = "user-token-0123456789"
+ADMIN = "admin-token-0123456789"
+WRONG = "wrong-token-0123456789"
 
 
 @dataclass
@@ -48,8 +51,8 @@ def bearer(token: str | None) -> dict[str, str]:
 class Grpc:
     name = "grpc"
 
-    def __init__(self, server: Server) -> None:
-        options = (("grpc.max_send_message_length", -1),)
+    def __init__(self, server: Server, *options: tuple[str, int]) -> None:
+        options = (("grpc.max_send_message_length", -1), *options)
         self.channel = aio.insecure_channel(server.grpc_address, options)
         self.stub = grasp_pb2_grpc.GraspServiceStub(self.channel)
 
@@ -194,6 +197,19 @@ class Running:
         self.clients.append(Grpc(self.server) if transport == "grpc" else Rest(self.server))
         return self.clients[-1]
 
+    def http(self) -> httpx.AsyncClient:
+        """A client that knows no messages, until the test ends."""
+        return self.connect("rest").http
+
+    def channel(self, *options: tuple[str, int]) -> aio.Channel:
+        """A connection of gRPC, until the test ends."""
+        self.clients.append(Grpc(self.server, *options))
+        return self.clients[-1].channel
+
+    def stub(self) -> Any:
+        """The calls of the service, until the test ends."""
+        return self.connect("grpc").stub
+
     def address(self, transport: str) -> str:
         return self.server.grpc_address if transport == "grpc" else self.server.http_url
 
@@ -291,14 +307,9 @@ def serve(begin: Serve) -> Serve:
     return start
 
 
-@pytest.fixture
-def is_error() -> Callable[[Reply, str], bool]:
+def is_error(answer: Reply, kind: str) -> bool:
     """Whether an answer is the error of a kind, on whichever transport."""
-
-    def check(answer: Reply, kind: str) -> bool:
-        code, status = next(STATUS[error] for error in STATUS if kind_of(error) == kind)
-        # A gRPC client whose deadline passed does not wait to hear of it.
-        kinds = (kind, "") if kind == "deadline-exceeded" else (kind,)
-        return answer.code in (code, str(status)) and answer.kind in kinds
-
-    return check
+    code, status = next(STATUS[error] for error in STATUS if kind_of(error) == kind)
+    # A gRPC client whose deadline passed does not wait to hear of it.
+    kinds = (kind, "") if kind == "deadline-exceeded" else (kind,)
+    return answer.code in (code, str(status)) and answer.kind in kinds

@@ -12,7 +12,7 @@ from grpc import aio
 
 import edgegrasp_model.errors
 import edgegrasp_service.errors
-from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import STATUS, kind_of
 
@@ -29,13 +29,10 @@ START_UP = {
 async def ask(running, cloud) -> tuple[httpx.Response, aio.AioRpcError]:
     """What both transports tell of a fault; it is told to the next two requests."""
     fault = (running.stages.folder / "fault-prepare").read_text()
-    async with httpx.AsyncClient(base_url=running.server.http_url, timeout=20) as http:
-        response = await http.post("/v1/grasps", json={"points": cloud.tolist()})
+    response = await running.http().post("/v1/grasps", json={"points": cloud.tolist()})
     running.stages.fail("prepare", fault)
-    async with aio.insecure_channel(running.server.grpc_address) as channel:
-        stub = grasp_pb2_grpc.GraspServiceStub(channel)
-        with pytest.raises(aio.AioRpcError) as caught:
-            await stub.DetectGrasps(grasp_pb2.DetectGraspsRequest(points=cloud.tobytes()))
+    with pytest.raises(aio.AioRpcError) as caught:
+        await running.stub().DetectGrasps(grasp_pb2.DetectGraspsRequest(points=cloud.tobytes()))
     return response, caught.value
 
 
@@ -61,8 +58,7 @@ async def test_every_error_of_the_table(serve, cloud) -> None:
         await running.until(lambda number=number: len(running.calls) == 2 * number)
         assert running.ended[-2:] == [kind_of(kind)] * 2
     running.stages.folder.joinpath("fault-prepare").unlink(missing_ok=True)
-    client = running.connect("grpc")
-    assert (await client.detect(cloud)).fine
+    assert (await running.connect("grpc").detect(cloud)).fine
 
 
 def check_google_details(data: bytes, ours: grasp_pb2.ErrorDetail) -> None:

@@ -22,14 +22,11 @@ def test_pages_work_without_internet(dummy_server) -> None:
 
 async def test_the_front_page_is_the_playground_or_that_of_the_api(serve) -> None:
     for playground, path, status in ((True, "/playground/", 200), (False, "/docs", 404)):
-        url = (await serve(playground=playground)).server.http_url
-        async with httpx.AsyncClient(base_url=url, follow_redirects=True) as http:
-            front = await http.get("/")
-            assert front.url.path == path
-            assert (
-                "default-src 'none'" in front.headers["content-security-policy"] or not playground
-            )
-            assert (await http.get("/playground/")).status_code == status
+        http = (await serve(playground=playground)).http()
+        front = await http.get("/", follow_redirects=True)
+        assert front.url.path == path
+        assert "default-src 'none'" in front.headers["content-security-policy"] or not playground
+        assert (await http.get("/playground/")).status_code == status
 
 
 def test_head_is_get_without_the_body(dummy_server) -> None:
@@ -119,17 +116,15 @@ async def test_headers_that_do_not_come_are_not_waited_for(serve) -> None:
 )
 async def test_names_of_the_server(serve, host: str, given: dict[str, Any], status: int) -> None:
     """A web page can have its own name point to this server."""
-    running = await serve(**given)
-    async with httpx.AsyncClient(base_url=running.server.http_url) as http:
-        for path in ("/v1/models", "/docs", "/metrics"):
-            assert (await http.get(path, headers={"host": host})).status_code == status
-        assert (await http.get("/health/live", headers={"host": host})).status_code == 200
+    http = (await serve(**given)).http()
+    for path in ("/v1/models", "/docs", "/metrics"):
+        assert (await http.get(path, headers={"host": host})).status_code == status
+    assert (await http.get("/health/live", headers={"host": host})).status_code == 200
 
 
 async def test_every_answer_says_what_a_browser_may_do_with_it(serve) -> None:
-    running = await serve()
-    async with httpx.AsyncClient(base_url=running.server.http_url) as http:
-        for path in ("/docs", "/playground/", "/v1/models", "/none", "/openapi.json"):
-            headers = (await http.get(path)).headers
-            assert "frame-ancestors 'none'" in headers["content-security-policy"]
-            assert headers["x-content-type-options"] == "nosniff"
+    http = (await serve()).http()
+    for path in ("/docs", "/playground/", "/v1/models", "/none", "/openapi.json"):
+        headers = (await http.get(path)).headers
+        assert "frame-ancestors 'none'" in headers["content-security-policy"]
+        assert headers["x-content-type-options"] == "nosniff"

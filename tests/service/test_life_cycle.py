@@ -23,7 +23,8 @@ from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import AddressInUse
 from edgegrasp_service.probe import is_ready
 
-PATIENCE = 20
+from .conftest import PATIENCE, is_error
+
 Status = health_pb2.HealthCheckResponse
 
 
@@ -47,26 +48,22 @@ async def grpc_state(channel: aio.Channel, cloud: np.ndarray) -> tuple[int, Stat
 
 async def test_not_ready_until_loaded(begin, cloud) -> None:
     running, ready = await begin(lambda stages: stages.shut("load"))
-    server = running.server
-    async with (
-        httpx.AsyncClient(base_url=server.http_url) as http,
-        aio.insecure_channel(server.grpc_address) as channel,
-    ):
-        stub = health_pb2_grpc.HealthStub(channel)
-        names = ("", "edgegrasp.v1.GraspService")
-        watches = [stub.Watch(health_pb2.HealthCheckRequest(service=name)) for name in names]
-        assert [(await watch.read()).status for watch in watches] == [Status.NOT_SERVING] * 2
-        assert await http_state(http, cloud) == (200, 503, 503)
-        assert await grpc_state(channel, cloud) == (Status.NOT_SERVING, StatusCode.UNAVAILABLE)
-        assert (await http.get("/v1/models")).json()["title"] == "Not ready"
-        assert "edgegrasp_model_info{" not in running.metrics()
-        running.stages.open("load")
-        await ready.wait()
-        assert [(await watch.read()).status for watch in watches] == [Status.SERVING] * 2
-        assert await http_state(http, cloud) == (200, 200, 200)
-        assert await grpc_state(channel, cloud) == (Status.SERVING, StatusCode.OK)
-        running.stop.set()
-        assert [(await watch.read()).status for watch in watches] == [Status.NOT_SERVING] * 2
+    http, channel = running.http(), running.channel()
+    stub = health_pb2_grpc.HealthStub(channel)
+    names = ("", "edgegrasp.v1.GraspService")
+    watches = [stub.Watch(health_pb2.HealthCheckRequest(service=name)) for name in names]
+    assert [(await watch.read()).status for watch in watches] == [Status.NOT_SERVING] * 2
+    assert await http_state(http, cloud) == (200, 503, 503)
+    assert await grpc_state(channel, cloud) == (Status.NOT_SERVING, StatusCode.UNAVAILABLE)
+    assert (await http.get("/v1/models")).json()["title"] == "Not ready"
+    assert "edgegrasp_model_info{" not in running.metrics()
+    running.stages.open("load")
+    await ready.wait()
+    assert [(await watch.read()).status for watch in watches] == [Status.SERVING] * 2
+    assert await http_state(http, cloud) == (200, 200, 200)
+    assert await grpc_state(channel, cloud) == (Status.SERVING, StatusCode.OK)
+    running.stop.set()
+    assert [(await watch.read()).status for watch in watches] == [Status.NOT_SERVING] * 2
 
 
 async def test_weights_that_cannot_be_loaded_end_the_server(begin) -> None:
@@ -92,36 +89,32 @@ async def test_a_taken_port_is_named(begin, name: str) -> None:
 
 async def test_while_draining_both_transports_say_so(serve, transport, cloud) -> None:
     running = await serve()
-    client, server = running.connect(transport), running.server
-    async with (
-        httpx.AsyncClient(base_url=server.http_url, timeout=PATIENCE) as http,
-        aio.insecure_channel(server.grpc_address) as channel,
-    ):
-        stub = grasp_pb2_grpc.GraspServiceStub(channel)
-        watch = health_pb2_grpc.HealthStub(channel).Watch(health_pb2.HealthCheckRequest())
-        assert (await watch.read()).status == Status.SERVING
-        assert (await http.get("/health/live")).status_code == 200
-        running.stages.shut("finish")
-        accepted = [asyncio.create_task(client.detect(cloud, seed=seed)) for seed in (1, 2)]
-        await running.until(lambda: running.stages.begun["finish"] == 1)
-        await running.until(lambda: running.waiting == 1)
-        running.stop.set()
-        assert (await watch.read()).status == Status.NOT_SERVING
-        late = await http.post("/v1/grasps", json={"points": cloud.tolist()})
-        assert late.status_code == 503
-        assert late.headers["connection"] == "close"
-        with pytest.raises(aio.AioRpcError) as caught:
-            await stub.DetectGrasps(grasp_pb2.DetectGraspsRequest(points=cloud.tobytes()))
-        assert caught.value.code() == StatusCode.UNAVAILABLE
-        assert not any(task.done() for task in accepted)
-        running.stages.open("finish")
-        assert [(await task).fine for task in accepted] == [True, True]
+    client, by_grpc, http = running.connect(transport), running.connect("grpc"), running.http()
+    health = health_pb2_grpc.HealthStub(by_grpc.channel)
+    watch = health.Watch(health_pb2.HealthCheckRequest())
+    assert (await watch.read()).status == Status.SERVING
+    assert (await http.get("/health/live")).status_code == 200
+    running.stages.shut("finish")
+    accepted = [asyncio.create_task(client.detect(cloud, seed=seed)) for seed in (1, 2)]
+    await running.until(lambda: running.stages.begun["finish"] == 1)
+    await running.until(lambda: running.waiting == 1)
+    running.stop.set()
+    assert (await watch.read()).status == Status.NOT_SERVING
+    late = await http.post("/v1/grasps", json={"points": cloud.tolist()})
+    assert late.status_code == 503
+    assert late.headers["connection"] == "close"
+    assert (await by_grpc.detect(cloud)).code == "UNAVAILABLE"
+    assert not any(task.done() for task in accepted)
+    running.stages.open("finish")
+    assert [(await task).fine for task in accepted] == [True, True]
+    await http.aclose()
+    await by_grpc.close()
     await running.serving
     with pytest.raises(httpx.ConnectError):
-        httpx.get(f"{server.http_url}/health/live")
+        httpx.get(f"{running.server.http_url}/health/live")
 
 
-async def test_when_grace_is_over_callers_are_told(serve, transport, is_error, cloud) -> None:
+async def test_when_grace_is_over_callers_are_told(serve, transport, cloud) -> None:
     running = await serve(grace_seconds=0.2)
     running.stages.shut("finish")
     asked = asyncio.create_task(running.connect(transport).detect(cloud))
@@ -134,20 +127,17 @@ async def test_when_grace_is_over_callers_are_told(serve, transport, is_error, c
 async def test_idle_connections_do_not_hold_a_stop_up(serve, cloud) -> None:
     """A watcher of health, an idle stream and a kept connection, with an hour's grace."""
     running = await serve(grace_seconds=3600.0)
-    async with (
-        httpx.AsyncClient(base_url=running.server.http_url) as http,
-        aio.insecure_channel(running.server.grpc_address) as channel,
-    ):
-        assert (await http.get("/health/live")).status_code == 200
-        watch = health_pb2_grpc.HealthStub(channel).Watch(health_pb2.HealthCheckRequest())
-        await watch.read()
-        stream = grasp_pb2_grpc.GraspServiceStub(channel).DetectGraspsStream()
-        request = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes())
-        await stream.write(grasp_pb2.DetectGraspsStreamRequest(request=request))
-        assert len((await stream.read()).detection.grasps) == 10
-        running.stop.set()
-        await asyncio.wait_for(running.serving, 60)
-        assert await stream.code() == StatusCode.UNAVAILABLE
+    assert (await running.http().get("/health/live")).status_code == 200
+    health = health_pb2_grpc.HealthStub(running.channel())
+    watch = health.Watch(health_pb2.HealthCheckRequest())
+    await watch.read()
+    stream = running.stub().DetectGraspsStream()
+    request = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes())
+    await stream.write(grasp_pb2.DetectGraspsStreamRequest(request=request))
+    assert len((await stream.read()).detection.grasps) == 10
+    running.stop.set()
+    await asyncio.wait_for(running.serving, 60)
+    assert await stream.code() == StatusCode.UNAVAILABLE
 
 
 def call(address: str, cloud: np.ndarray, came: list[str], streams: bool) -> None:

@@ -14,7 +14,6 @@ import grpc
 import httpx
 import numpy as np
 import pytest
-from grpc import aio
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
@@ -23,9 +22,7 @@ from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import AsyncGraspClient, GraspClient, StreamRequest
 from edgegrasp_service.observability import JsonFormatter, LogQueue
 
-TOKEN = "user-token-0123456789"
-ADMIN = "admin-token-0123456789"
-WRONG = "wrong-token-0123456789"
+from .conftest import ADMIN, USER, WRONG
 
 
 def told(server: Any, transport: str, headers: dict[str, str]) -> str:
@@ -50,28 +47,25 @@ def test_request_ids_come_back(dummy_server, transport: str) -> None:
 
 
 async def test_errors_and_streams_carry_the_request_id(serve) -> None:
-    server = (await serve(max_body_bytes=1024)).server
-    async with httpx.AsyncClient(base_url=server.http_url) as http:
-        for path, status in (("/none", 404), ("/v1/grasps", 413)):
-            headers = {"x-request-id": "mine"}
-            answer = await http.post(path, content=bytes(9000), headers=headers)
-            assert (answer.status_code, answer.headers["x-request-id"]) == (status, "mine")
-    async with aio.insecure_channel(server.grpc_address) as channel:
-        stub, metadata = grasp_pb2_grpc.GraspServiceStub(channel), (("x-request-id", "mine"),)
-        call = stub.DetectGrasps(grasp_pb2.DetectGraspsRequest(points=b"1"), metadata=metadata)
-        assert await call.code() == grpc.StatusCode.INVALID_ARGUMENT
-        assert dict(await call.trailing_metadata())["x-request-id"] == "mine"
-        stream = stub.DetectGraspsStream(metadata=metadata)  # before its first answer
-        assert dict(await stream.initial_metadata())["x-request-id"] == "mine"
-        stream.cancel()
+    running = await serve(max_body_bytes=1024)
+    headers = {"x-request-id": "mine"}
+    for path, status in (("/none", 404), ("/v1/grasps", 413)):
+        answer = await running.http().post(path, content=bytes(9000), headers=headers)
+        assert (answer.status_code, answer.headers["x-request-id"]) == (status, "mine")
+    stub, metadata = running.stub(), tuple(headers.items())
+    call = stub.DetectGrasps(grasp_pb2.DetectGraspsRequest(points=b"1"), metadata=metadata)
+    assert await call.code() == grpc.StatusCode.INVALID_ARGUMENT
+    assert dict(await call.trailing_metadata())["x-request-id"] == "mine"
+    stream = stub.DetectGraspsStream(metadata=metadata)  # before its first answer
+    assert dict(await stream.initial_metadata())["x-request-id"] == "mine"
+    stream.cancel()
 
 
-async def test_json_lines_name_requests_and_no_secrets(serve, cloud, tmp_path, caplog) -> None:
+async def test_json_lines_name_requests_and_no_secrets(serve, cloud, caplog) -> None:
     caplog.set_level(logging.DEBUG, logger="edgegrasp_service")
-    (tmp_path / "tokens").write_text(f"arm-1:{TOKEN}")
-    running = await serve(token_file=tmp_path / "tokens", admin_tokens=[ADMIN])
+    running = await serve(tokens=[f"arm-1:{USER}"], admin_tokens=[ADMIN])
     for transport in ("rest", "grpc"):
-        async with AsyncGraspClient(running.address(transport), token=TOKEN) as client:
+        async with AsyncGraspClient(running.address(transport), token=USER) as client:
             await client.ready()
             await client.detect(cloud)
         for token in (ADMIN, WRONG):
@@ -80,7 +74,7 @@ async def test_json_lines_name_requests_and_no_secrets(serve, cloud, tmp_path, c
     await running.until(lambda: len(running.calls) == 2)
     ours = [record for record in caplog.records if record.name.startswith("edgegrasp")]
     lines = [json.loads(JsonFormatter().format(record)) for record in ours]
-    assert not any(word in str(lines) + caplog.text for word in (TOKEN, ADMIN, WRONG))
+    assert not any(word in str(lines) + caplog.text for word in (USER, ADMIN, WRONG))
     probes = [line["level"] for line in lines if line.get("method") in ("Ready", "HealthCheck")]
     assert probes == ["debug", "debug"]
     detected = [line for line in lines if line.get("method") == "DetectGrasps"]
@@ -168,9 +162,8 @@ def samples(page: str) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
     }
 
 
-async def read(server: Any, **headers: str) -> dict[Any, float]:
-    async with httpx.AsyncClient(base_url=server.http_url) as http:
-        answer = await http.get("/metrics", headers=headers)
+async def read(running: Any) -> dict[Any, float]:
+    answer = await running.http().get("/metrics")
     assert answer.status_code == 200
     assert answer.headers["content-type"].startswith("text/plain")
     return samples(answer.text)
@@ -185,15 +178,15 @@ def requests_total(found: dict[Any, float]) -> dict[tuple[str, str, str], float]
 
 
 async def test_requests_are_counted_on_both_transports(serve, cloud: np.ndarray) -> None:
-    server = (await serve()).server
-    for address in (server.grpc_address, server.http_url):
-        async with AsyncGraspClient(address) as client:
+    running = await serve()
+    for transport in ("grpc", "rest"):
+        async with AsyncGraspClient(running.address(transport)) as client:
             await client.detect(cloud)
             await client.score(cloud, edges=np.array([[0, 1]]))
             await client.models()
             with pytest.raises(Exception, match="points"):
                 await client.detect(cloud[:0])
-    found = await read(server)
+    found = await read(running)
     total = requests_total(found)
     for transport, fine, bad in (("grpc", "OK", "INVALID_ARGUMENT"), ("http", "200", "400")):
         for method in ("DetectGrasps", "ScoreGrasps", "ListModels"):
@@ -217,36 +210,29 @@ async def test_requests_are_counted_on_both_transports(serve, cloud: np.ndarray)
 
 
 async def test_streams_are_counted_by_result(serve, cloud: np.ndarray) -> None:
-    server = (await serve()).server
-    async with AsyncGraspClient(server.grpc_address) as client:
+    running = await serve()
+    async with AsyncGraspClient(running.address("grpc")) as client:
         requests = [StreamRequest(points) for points in (cloud, cloud[:0], cloud)]
         answers = [answer async for answer in client.detect_stream(requests)]
     assert len(answers) == 3
-    found = await read(server)
+    found = await read(running)
     assert found["edgegrasp_stream_results_total", (("code", "OK"),)] == 2.0
     assert found["edgegrasp_stream_results_total", (("code", "INVALID_ARGUMENT"),)] == 1.0
     assert requests_total(found)["grpc", "DetectGraspsStream", "OK"] == 1.0
 
 
 async def test_hostile_callers_add_no_labels(serve, cloud: np.ndarray) -> None:
-    server = (await serve()).server
-    before = set(await read(server))
-    async with httpx.AsyncClient(base_url=server.http_url) as http:
-        for number in range(5):
-            await http.get(f"/v1/{number}/none")
-            await http.get("/v1/grasps")
-            await http.post(
-                "/v1/grasps",
-                json={"points": cloud.tolist(), "options": {"model": f"evil-{number}\n{{}}"}},
-            )
-    async with aio.insecure_channel(server.grpc_address) as channel:
-        stub = grasp_pb2_grpc.GraspServiceStub(channel)
-        for number in range(5):
-            request = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes())
-            request.options.model = f"evil-{number}"
-            unknown = channel.unary_unary(f"/evil.Service{number}/Method", bytes, bytes)
-            await asyncio.gather(unknown(b""), stub.DetectGrasps(request), return_exceptions=True)
-    after = await read(server)
+    running = await serve()
+    before, http, client = set(await read(running)), running.http(), running.connect("grpc")
+    for number in range(5):
+        evil = {"model": f"evil-{number}\n{{}}"}
+        await http.get(f"/v1/{number}/none")
+        await http.get("/v1/grasps")
+        await http.post("/v1/grasps", json={"points": cloud.tolist(), "options": evil})
+        assert not (await client.detect(cloud, **evil)).fine
+        unknown = client.channel.unary_unary(f"/evil.Service{number}/Method", bytes, bytes)
+        assert await unknown(b"").code() is grpc.StatusCode.UNIMPLEMENTED
+    after = await read(running)
     added = {
         tuple(dict(labels)[name] for name in ("transport", "method", "code"))
         for name, labels in set(after) - before
@@ -264,7 +250,7 @@ async def test_hostile_callers_add_no_labels(serve, cloud: np.ndarray) -> None:
 
 
 async def test_the_dashboard_names_metrics_that_exist(serve, cloud: np.ndarray) -> None:
-    server = (await serve(admin_tokens=["admin-token-0123456789"])).server
+    server = (await serve(admin_tokens=[ADMIN])).server
     async with AsyncGraspClient(server.http_url) as client:
         await client.detect(cloud)
     server.metrics.watch("log_lines_dropped", "as `edgegrasp serve` adds it", lambda: 0)

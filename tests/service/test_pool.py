@@ -16,6 +16,8 @@ import pytest
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_service.worker.process import Answer, Job
 
+from .conftest import is_error
+
 
 def grown(running) -> int:
     return len(running.server.pool.pids)
@@ -23,7 +25,7 @@ def grown(running) -> int:
 
 @pytest.mark.parametrize("fault", ["kill", "eat"])
 async def test_a_worker_that_dies_fails_its_own_request_only(
-    serve, transport, is_error, cloud, fault: str
+    serve, transport, cloud, fault: str
 ) -> None:
     running = await serve(max_worker_bytes=2**28)
     client, before = running.connect(transport), running.server.pool.pids
@@ -34,7 +36,7 @@ async def test_a_worker_that_dies_fails_its_own_request_only(
     assert "edgegrasp_workers_replaced_total 1.0" in running.metrics()
 
 
-async def test_a_request_that_workers_die_of_is_not_tried_again(serve, transport, is_error, cloud):
+async def test_a_request_that_workers_die_of_is_not_tried_again(serve, transport, cloud):
     """A crash is enough; a worker that was killed may have been killed for something else."""
     running = await serve()
     client = running.connect(transport)
@@ -148,7 +150,7 @@ def alive(pid: int) -> bool:
 
 
 async def test_a_request_that_expires_or_is_left_while_it_waits_is_never_computed(
-    serve, transport, is_error, cloud
+    serve, transport, cloud
 ) -> None:
     running = await serve()
     client = running.connect(transport)
@@ -167,7 +169,7 @@ async def test_a_request_that_expires_or_is_left_while_it_waits_is_never_compute
 
 
 async def test_a_worker_that_goes_on_after_the_deadline_is_replaced(
-    serve, transport, is_error, cloud
+    serve, transport, cloud
 ) -> None:
     running = await serve()
     client, before = running.connect(transport), running.server.pool.pids
@@ -178,7 +180,7 @@ async def test_a_worker_that_goes_on_after_the_deadline_is_replaced(
     assert "edgegrasp_workers_replaced_total 1.0" in running.metrics()
 
 
-async def test_the_worker_itself_stops_after_the_deadline(serve, transport, is_error, cloud):
+async def test_the_worker_itself_stops_after_the_deadline(serve, transport, cloud):
     running = await serve()
     client, before = running.connect(transport), running.server.pool.pids
     running.stages.shut("prepare")
@@ -203,7 +205,7 @@ async def test_a_request_whose_client_left_frees_its_worker(serve, transport, cl
     assert (await running.connect("grpc").detect(cloud)).fine
 
 
-async def test_the_servers_own_limit_holds_without_a_deadline(serve, transport, is_error, cloud):
+async def test_the_servers_own_limit_holds_without_a_deadline(serve, transport, cloud):
     running = await serve(max_request_seconds=0.2)
     running.stages.shut("evaluate")
     assert is_error(await running.connect(transport).detect(cloud), "deadline-exceeded")

@@ -48,10 +48,10 @@ async def test_recorded_requests_are_replayed(serve, transport, cloud, tmp_path,
 async def test_the_oldest_are_deleted(serve, cloud, tmp_path: Path) -> None:
     running = await serve(record_folder=tmp_path / "recorded", record_bytes=2**20)
     body = npy(np.tile(cloud, (60, 1)))  # 360 kB
-    headers = {"content-type": "application/x-npy"}
-    async with httpx.AsyncClient(base_url=running.server.http_url, headers=headers) as http:
-        for number in range(5):
-            await http.post("/v1/grasps", content=body, headers={"x-request-id": f"r{number}"})
+    http, headers = running.http(), {"content-type": "application/x-npy"}
+    for number in range(5):
+        headers["x-request-id"] = f"r{number}"
+        await http.post("/v1/grasps", content=body, headers=headers)
     running.stop.set()
     await running.serving
     kept = sorted((tmp_path / "recorded").glob("*.job"))

@@ -16,8 +16,8 @@ import pytest
 from edgegrasp_client import AsyncGraspClient, GraspClient
 from edgegrasp_model.detector import WEIGHTS_FOLDER
 
-USER = "user-token-0123456789"
-ADMIN = "admin-token-0123456789"
+from .conftest import ADMIN, USER
+
 NEW = "new-token-0123456789"
 
 
@@ -67,12 +67,11 @@ async def test_only_an_admin_token_reloads(serve, transport: str) -> None:
 
 async def test_no_spelling_of_the_address_comes_around_the_token(serve) -> None:
     running = await serve(tokens=[USER], admin_tokens=[ADMIN])
-    headers = {"authorization": f"Bearer {USER}"}
-    async with httpx.AsyncClient(base_url=running.server.http_url, headers=headers) as http:
-        for tail in ("", "%0A", "/", "%2F", "?x=1", ";", "%00", "//"):
-            for start in ("/v1/models:reload", "/v1/models%3Areload", "/v1/./models:reload"):
-                answer = await http.post(start + tail, follow_redirects=True)
-                assert answer.status_code in (403, 404, 405), answer.text
+    http, headers = running.http(), {"authorization": f"Bearer {USER}"}
+    for tail in ("", "%0A", "/", "%2F", "?x=1", ";", "%00", "//"):
+        for start in ("/v1/models:reload", "/v1/models%3Areload", "/v1/./models:reload"):
+            answer = await http.post(start + tail, headers=headers, follow_redirects=True)
+            assert answer.status_code in (403, 404, 405), answer.text
     assert running.stages.begun["load"] == 1
 
 

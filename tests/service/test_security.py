@@ -5,14 +5,13 @@ import ssl
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
-from grpc import StatusCode, aio
+from grpc import StatusCode
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
-from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client import AccessDeniedError, AsyncGraspClient, ServerUnavailableError, Tls
 from edgegrasp_service.errors import InvalidSettings, ReloadFailed
 from edgegrasp_service.probe import is_ready, read_settings
@@ -20,10 +19,7 @@ from edgegrasp_service.security import ServerTls, load_tokens
 from edgegrasp_service.server import warn
 from edgegrasp_service.settings import Settings
 
-USER = "user-token-0123456789"
-ADMIN = "admin-token-0123456789"
-WRONG = "wrong-token-0123456789"
-HOST = "127.0.0.1"
+from .conftest import ADMIN, USER, WRONG
 
 
 @pytest.fixture
@@ -117,48 +113,44 @@ PROTECTED = [
 
 
 async def test_only_probes_are_open(serve) -> None:
-    server = (await serve(tokens=[USER], admin_tokens=[ADMIN], max_body_bytes=1024)).server
-    async with httpx.AsyncClient(base_url=server.http_url) as http:
-        for path in ("/health/live", "/health/ready", "/docs", "/openapi.json"):
-            assert (await http.get(path)).status_code == 200
-        for path in PROTECTED:
-            answer = await http.get(server.http_url + path)
-            assert answer.status_code == 401, path
-            assert answer.headers["www-authenticate"] == 'Bearer realm="edgegrasp"'
-            assert answer.json()["type"] == "urn:edgegrasp:error:unauthenticated"
-        evil = {"origin": "http://evil.example", "access-control-request-method": "POST"}
-        for answer in (
-            await http.options("/v1/grasps", headers=evil),
-            await http.get("/v1/models", headers=evil),
-        ):
-            assert not [name for name in answer.headers if name.startswith("access-control")]
-        for header in ("", "Bearer", f"Basic {USER}", USER, b"Bearer \xc3\xbf\xff"):
-            answer = await http.get("/v1/models", headers={"authorization": header})
-            assert answer.status_code == 401, header
-        for header in (f"bearer  {USER}", f"Bearer {ADMIN}"):
-            answer = await http.get("/v1/models", headers={"authorization": header})
-            assert answer.status_code == 200, header
-    async with aio.insecure_channel(server.grpc_address) as channel:
-        health = health_pb2_grpc.HealthStub(channel)
-        status = (await health.Check(health_pb2.HealthCheckRequest())).status
-        assert status == health_pb2.HealthCheckResponse.SERVING
-        reflection = reflection_pb2_grpc.ServerReflectionStub(channel)
-        request = reflection_pb2.ServerReflectionRequest(list_services="")
-        unknown = channel.unary_unary("/edgegrasp.v1.GraspService/None", bytes, bytes)
-        too_large = grasp_pb2.DetectGraspsRequest(points=bytes(12_000))  # which is not read
-        for call in (
-            reflection.ServerReflectionInfo(iter([request])),
-            unknown(b""),
-            grasp_pb2_grpc.GraspServiceStub(channel).DetectGrasps(too_large),
-        ):
-            assert await call.code() == StatusCode.UNAUTHENTICATED
+    running = await serve(tokens=[USER], admin_tokens=[ADMIN], max_body_bytes=1024)
+    http, channel = running.http(), running.channel()
+    for path in ("/health/live", "/health/ready", "/docs", "/openapi.json"):
+        assert (await http.get(path)).status_code == 200
+    for path in PROTECTED:
+        answer = await http.get(running.server.http_url + path)
+        assert answer.status_code == 401, path
+        assert answer.headers["www-authenticate"] == 'Bearer realm="edgegrasp"'
+        assert answer.json()["type"] == "urn:edgegrasp:error:unauthenticated"
+    evil = {"origin": "http://evil.example", "access-control-request-method": "POST"}
+    for answer in (
+        await http.options("/v1/grasps", headers=evil),
+        await http.get("/v1/models", headers=evil),
+    ):
+        assert not [name for name in answer.headers if name.startswith("access-control")]
+    for status, header in (
+        *((401, bad) for bad in ("", "Bearer", f"Basic {USER}", USER, b"Bearer \xc3\xbf\xff")),
+        *((200, good) for good in (f"bearer  {USER}", f"Bearer {ADMIN}")),
+    ):
+        answer = await http.get("/v1/models", headers={"authorization": header})
+        assert answer.status_code == status, header
+    health = await health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest())
+    assert health.status == health_pb2.HealthCheckResponse.SERVING
+    request = reflection_pb2.ServerReflectionRequest(list_services="")
+    too_large = grasp_pb2.DetectGraspsRequest(points=bytes(12_000))  # which is not read
+    for call in (
+        reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo(iter([request])),
+        channel.unary_unary("/edgegrasp.v1.GraspService/None", bytes, bytes)(b""),
+        running.stub().DetectGrasps(too_large),
+    ):
+        assert await call.code() == StatusCode.UNAUTHENTICATED
 
 
 async def test_no_tls_older_than_1_2_and_a_health_check(serve, server_tls, pem) -> None:
     given = server_tls | {"tls_client_ca": pem["ca"]}
     server = (await serve(**given, tokens=[USER])).server
     port = int(server.http_url.rpartition(":")[2])
-    assert await asyncio.to_thread(is_ready, HOST, port, pem["server"], pem["ca"])
+    assert await asyncio.to_thread(is_ready, "127.0.0.1", port, pem["server"], pem["ca"])
     loaded = ServerTls(Settings(**given))
     assert loaded.http.current.minimum_version == ssl.TLSVersion.TLSv1_2
 

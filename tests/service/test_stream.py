@@ -1,13 +1,10 @@
 """One stream, many clouds: answers in order, errors among them, and no more read than bounded."""
 
 import asyncio
-from collections.abc import AsyncIterator
 from typing import Any
 
 import grpc
 import numpy as np
-import pytest
-from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 
@@ -19,22 +16,9 @@ def request(name: str, points: np.ndarray, **options: Any) -> grasp_pb2.DetectGr
     return grasp_pb2.DetectGraspsStreamRequest(request_id=name, request=detect)
 
 
-@pytest.fixture
-async def streams() -> AsyncIterator[Any]:
-    channels = []
-
-    def open_stream(running: Any) -> Any:
-        channels.append(aio.insecure_channel(running.server.grpc_address))
-        return grasp_pb2_grpc.GraspServiceStub(channels[-1]).DetectGraspsStream()
-
-    yield open_stream
-    for channel in channels:
-        await channel.close(None)
-
-
-async def test_an_error_is_an_answer_and_the_stream_goes_on(serve, streams, cloud) -> None:
+async def test_an_error_is_an_answer_and_the_stream_goes_on(serve, cloud) -> None:
     running = await serve()
-    stream = streams(running)
+    stream = running.stub().DetectGraspsStream()
     bad = request("negative", cloud)
     bad.timeout = -1.0
     empty = grasp_pb2.DetectGraspsStreamRequest(request_id="empty")
@@ -54,9 +38,9 @@ async def test_an_error_is_an_answer_and_the_stream_goes_on(serve, streams, clou
         assert error.message.startswith(error.detail.field)
 
 
-async def test_a_request_of_a_stream_has_a_deadline_of_its_own(serve, streams, cloud) -> None:
+async def test_a_request_of_a_stream_has_a_deadline_of_its_own(serve, cloud) -> None:
     running = await serve()
-    stream = streams(running)
+    stream = running.stub().DetectGraspsStream()
     running.stages.shut("evaluate")
     await stream.write(request("patient", cloud))
     await running.until(lambda: running.stages.begun["evaluate"] == 1)
@@ -71,9 +55,9 @@ async def test_a_request_of_a_stream_has_a_deadline_of_its_own(serve, streams, c
     assert running.stages.begun["prepare"] == 1
 
 
-async def test_no_more_is_read_than_may_be(serve, streams, cloud) -> None:
+async def test_no_more_is_read_than_may_be(serve, cloud) -> None:
     running = await serve(max_stream_requests=3)
-    stream = streams(running)
+    stream = running.stub().DetectGraspsStream()
     running.stages.shut("evaluate")
     for number in range(8):
         await stream.write(request(str(number), cloud))
@@ -88,32 +72,27 @@ async def test_no_more_is_read_than_may_be(serve, streams, cloud) -> None:
 async def test_what_the_client_does_not_take_is_not_computed(serve, cloud) -> None:
     """A stream that waits for its client reads nothing; gRPC's flow control does the rest."""
     running = await serve(max_stream_requests=2)
-    options = [("grpc.http2.lookahead_bytes", 16384)]
     many = {"num_approach_points": 256, "debug": True}
     crowd = np.tile(cloud, (8, 1))  # 4,000 points in each answer
-    async with aio.insecure_channel(running.server.grpc_address, options) as channel:
-        stream = grpc_stub(channel).DetectGraspsStream()
-        sending = asyncio.create_task(send(stream, [request("", crowd, **many)] * 60))
-        await running.until(lambda: len(running.calls) >= 3)
-        await asyncio.sleep(0.5)
-        assert len(running.calls) < 40
-        assert len([answer async for answer in stream]) == 60
-        await sending
+    channel = running.channel(("grpc.http2.lookahead_bytes", 16384))
+    stream = grasp_pb2_grpc.GraspServiceStub(channel).DetectGraspsStream()
+
+    async def send() -> None:
+        for _ in range(60):
+            await stream.write(request("", crowd, **many))
+        await stream.done_writing()
+
+    sending = asyncio.create_task(send())
+    await running.until(lambda: len(running.calls) >= 3)
+    await asyncio.sleep(0.5)
+    assert len(running.calls) < 40
+    assert len([answer async for answer in stream]) == 60
+    await sending
 
 
-def grpc_stub(channel: aio.Channel) -> Any:
-    return grasp_pb2_grpc.GraspServiceStub(channel)
-
-
-async def send(stream: Any, requests: list[grasp_pb2.DetectGraspsStreamRequest]) -> None:
-    for each in requests:
-        await stream.write(each)
-    await stream.done_writing()
-
-
-async def test_a_full_server_is_told_of_in_the_stream(serve, streams, cloud) -> None:
+async def test_a_full_server_is_told_of_in_the_stream(serve, cloud) -> None:
     running = await serve(max_queue_length=0)
-    stream = streams(running)
+    stream = running.stub().DetectGraspsStream()
     running.stages.shut("evaluate")
     for name in ("taken", "refused"):
         await stream.write(request(name, cloud))
@@ -125,20 +104,20 @@ async def test_a_full_server_is_told_of_in_the_stream(serve, streams, cloud) -> 
     assert refused.error.detail.retry_after >= 1.0
 
 
-async def test_streams_are_bounded(serve, streams, cloud) -> None:
+async def test_streams_are_bounded(serve, cloud) -> None:
     running = await serve(max_streams=1)
-    first = streams(running)
+    first = running.stub().DetectGraspsStream()
     await first.write(request("first", cloud))
     assert (await first.read()).request_id == "first"
-    second = streams(running)
+    second = running.stub().DetectGraspsStream()
     assert await second.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
     await first.done_writing()
     assert await first.code() is grpc.StatusCode.OK
 
 
-async def test_a_stream_whose_client_left_ends(serve, streams, cloud) -> None:
+async def test_a_stream_whose_client_left_ends(serve, cloud) -> None:
     running = await serve()
-    stream = streams(running)
+    stream = running.stub().DetectGraspsStream()
     running.stages.shut("evaluate")
     for name in ("first", "second"):
         await stream.write(request(name, cloud))
@@ -151,9 +130,9 @@ async def test_a_stream_whose_client_left_ends(serve, streams, cloud) -> None:
     assert running.stages.begun["prepare"] == 1
 
 
-async def test_a_stopping_server_answers_what_it_read_and_ends_the_stream(serve, streams, cloud):
+async def test_a_stopping_server_answers_what_it_read_and_ends_the_stream(serve, cloud):
     running = await serve()
-    stream, idle = streams(running), streams(running)
+    stream, idle = running.stub().DetectGraspsStream(), running.stub().DetectGraspsStream()
     running.stages.shut("evaluate")
     await stream.write(request("read", cloud))
     await running.until(lambda: running.stages.begun["evaluate"] == 1)
