@@ -67,16 +67,10 @@ class FailingServer(grasp_pb2_grpc.GraspServiceServicer):
 
     def respond(self, request: httpx.Request) -> httpx.Response:
         if (problem := self._problem()) is None:
-            body = {"grasps": [], "counts": {}, "seconds": {}, "model": "fake", "warnings": []}
-            found = {
-                "debug": None,
-                "support": None,
-                "tracking": None,
-                "up": [0, 0, 1],
-                "objects": [],
-            }
-            found["gripper"] = {"name": "fake", "palm_z": 0.0, "tip_z": 0.1}
-            return httpx.Response(200, json=body | found)
+            found = dict.fromkeys(("debug", "support", "tracking")) | {"up": [0, 0, 1]}
+            found |= {"grasps": [], "warnings": [], "objects": [], "counts": {}, "seconds": {}}
+            found |= {"model": "fake", "gripper": {"name": "fake", "palm_z": 0.0, "tip_z": 0.1}}
+            return httpx.Response(200, json=found)
         if not problem.kind:
             return httpx.Response(problem.status, text="<html>")
         document = {"detail": "what happened", "field": "f", "value": "v", "fix": "x"}

@@ -120,13 +120,8 @@ def test_an_unknown_gripper_or_opening_is_refused_by_field(fields, field, fix) -
 
 @by_name
 def test_grasps_fit_the_gripper_that_was_asked_for(gripper: Gripper) -> None:
-    options = DetectOptions(
-        viewpoint=VIEW,
-        gripper=gripper.name,
-        support=None,
-        num_approach_points=12,
-        suppression=None,
-    )
+    whole = {"viewpoint": VIEW, "support": None, "suppression": None}
+    options = DetectOptions(gripper=gripper.name, num_approach_points=12, **whole)
     found = detector().detect(box_on_table(), options)
     assert found.grasps
     for grasp in found.grasps:
@@ -151,15 +146,9 @@ def test_weights_trained_with_many_hands_warn_about_no_gripper() -> None:
 
 
 def test_a_wider_gripper_reaches_contacts_beyond_the_ball_of_the_weights() -> None:
+    whole = {"viewpoint": VIEW, "support": None, "suppression": None, "collision": "ignore"}
     for name, least, most in (("panda", 0.0, 0.045), ("robotiq-2f-140", 0.045, 0.07)):
-        options = DetectOptions(
-            viewpoint=VIEW,
-            gripper=name,
-            support=None,
-            collision="ignore",
-            suppression=None,
-            top_k=2000,
-        )
+        options = DetectOptions(gripper=name, top_k=2000, **whole)
         grasps = detector().detect(box_on_table(), options).grasps
         longest = max(np.linalg.norm(g.approach_point - g.contact_point) for g in grasps)
         assert least < longest < most

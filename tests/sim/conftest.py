@@ -1,4 +1,4 @@
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
@@ -30,8 +30,7 @@ def world(engine: str) -> Iterator[World]:
         yield world
 
 
-@pytest.fixture(scope="session")
-def paper_with() -> Callable[[int], Protocol]:
-    """Makes the paper's protocol with so many objects in a scene."""
+def paper_with(number: int) -> Protocol:
+    """The paper's protocol with so many objects in a scene."""
     paper = load_protocol("edgegrasp")
-    return lambda number: replace(paper, scene=replace(paper.scene, num_objects=(number,)))
+    return replace(paper, scene=replace(paper.scene, num_objects=(number,)))

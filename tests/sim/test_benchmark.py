@@ -16,13 +16,14 @@ from edgegrasp_sim.benchmark import BenchmarkConfig, RoundRunner, manifest, run_
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
-from edgegrasp_sim.protocol import FOLDER, Protocol, load_protocol, protocol_from, protocol_names
+from edgegrasp_sim.protocol import FOLDER, load_protocol, protocol_from, protocol_names
 from edgegrasp_sim.results import ResultFolder, attempts_digest, summarise
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trial import PlannedGrasp, Planner, Round, RoundDriver, RoundEnd, StartCollides
 
-PAPER = load_protocol("edgegrasp")
-TWO_OBJECTS = replace(PAPER, scene=replace(PAPER.scene, num_objects=(2,)))
+from .conftest import paper_with
+
+TWO_OBJECTS = paper_with(2)
 
 # Called, it gives the planner; spawned workers can import it.
 make_planner = partial(partial, plan)
@@ -169,25 +170,18 @@ def test_a_wrong_file_is_refused(tmp_path: Path, old: str, new: str, message: st
         load_protocol(str(file))
 
 
-MakeProtocol = Callable[[int], Protocol]
 PACKED, PILE, *_ = SceneKind
 IN_THE_AIR = np.diag([1.0, -1.0, -1.0, 1.0])
 IN_THE_AIR[:3, 3] = (0.15, 0.15, 0.5)
 
 
 @pytest.fixture
-def run(simulation: ClutterSimulation, paper_with: MakeProtocol) -> Callable[..., Round]:
+def run(simulation: ClutterSimulation) -> Callable[..., Round]:
     """Runs a round with so many objects."""
 
-    def run(
-        planner: Planner,
-        scene: SceneKind,
-        number: int,
-        seed: int = 0,
-        index: int = 0,
-    ) -> Round:
-        driver = RoundDriver(simulation, scene, paper_with(number), seed=seed, index=index)
-        return driver.run(planner)
+    def run(planner: Planner, scene: SceneKind, number: int, **given: int) -> Round:
+        of = {"seed": 0, "index": 0} | given
+        return RoundDriver(simulation, scene, paper_with(number), **of).run(planner)
 
     return run
 
@@ -199,7 +193,7 @@ def cubes(engine: str) -> Iterator[ClutterSimulation]:
         yield simulation
 
 
-def test_top_down_grasps_clear_a_scene_of_cubes(cubes, paper_with) -> None:
+def test_top_down_grasps_clear_a_scene_of_cubes(cubes) -> None:
     done = RoundDriver(cubes, PACKED, paper_with(3), seed=0, index=0).run(plan)
     assert done.end is RoundEnd.CLEARED
     assert done.successes == len(done.objects) == 3
@@ -229,7 +223,7 @@ def test_no_grasp_is_no_attempt_and_the_third_ends_a_round(run: Callable[..., Ro
     assert len(set(clouds)) == 3  # a new view every time
 
 
-def test_a_view_that_shows_nothing_is_one_without_a_grasp(cubes, paper_with, monkeypatch) -> None:
+def test_a_view_that_shows_nothing_is_one_without_a_grasp(cubes, monkeypatch) -> None:
     views: list[Observation] = []
     observe_from = cubes.observe_from
 
@@ -252,7 +246,7 @@ def test_an_arm_that_cannot_start_in_a_view_takes_another_one(run: Callable[...,
     assert (failures["start in collision"], failures["no candidate"]) == (3, 0)
 
 
-def test_scenes_and_views_do_not_depend_on_the_planner(engine, run, paper_with) -> None:
+def test_scenes_and_views_do_not_depend_on_the_planner(engine, run) -> None:
     first_clouds = []
 
     def keep_first(seen: Observation, seed: int) -> PlannedGrasp:

@@ -13,7 +13,6 @@ from edgegrasp_training.teacher import Teacher
 from edgegrasp_training.training import Trainer
 from edgegrasp_training.views import LabelledView, find_views, split_by_scene
 
-MakeView = Callable[[int], LabelledView]
 MakeTrainer = Callable[..., Trainer]
 FAST = {
     "steps": 40,
@@ -22,7 +21,7 @@ FAST = {
     "learning_rate": 3e-3,
     "evaluate_every": 10,
 }
-NETWORKS = {
+NETWORKS = {  # small ones of every architecture
     "balls": NetworkConfig("edgegrasp", (8, 8, 8), (8, 8, 8), (8, 8), (16, 8), crop_radius=0.04),
     "vn": NetworkConfig("vn-edgegrasp", (6, 6, 6), (6, 9, 9), (9, 9), (16, 8, 4), crop_radius=0.04),
     "hands": NetworkConfig(
@@ -31,7 +30,7 @@ NETWORKS = {
 }
 
 
-def _made_up_view(seed: int) -> LabelledView:
+def made_up_view(seed: int) -> LabelledView:
     """A box on the table; grasps from above are said to hold, others not."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-0.5, 0.5, (300, 3)) * (0.05, 0.05, 0.06)
@@ -58,23 +57,11 @@ def _made_up_view(seed: int) -> LabelledView:
 
 
 @pytest.fixture(scope="session")
-def made_up_view() -> MakeView:
-    """Makes the view of a seed."""
-    return _made_up_view
-
-
-@pytest.fixture(scope="session")
 def views(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("views")
     for number in range(8):
-        _made_up_view(number).save(folder / f"packed_{number}_0.npz")
+        made_up_view(number).save(folder / f"packed_{number}_0.npz")
     return find_views([folder])
-
-
-@pytest.fixture(scope="session")
-def networks() -> dict[str, NetworkConfig]:
-    """Small networks of every architecture."""
-    return NETWORKS
 
 
 @pytest.fixture(scope="session")

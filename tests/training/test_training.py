@@ -19,6 +19,8 @@ from edgegrasp_training.teacher import GRASPS_PER_BALL, Teacher
 from edgegrasp_training.training import Trainer
 from edgegrasp_training.views import find_views, split_by_scene
 
+from .conftest import NETWORKS, made_up_view
+
 SAMPLE = Path(__file__).parents[2] / "examples" / "labelled_views"
 
 
@@ -124,7 +126,7 @@ def teacher(weights: Path) -> Teacher:
     return Teacher(weights, 0.04)
 
 
-def test_a_teacher_scores_candidates_above_the_table(made_up_view, views, teacher) -> None:
+def test_a_teacher_scores_candidates_above_the_table(views, teacher) -> None:
     view = made_up_view(0)
     labels = teacher.soft_labels(views[0])
     balls, count = np.unique(labels.approach_index, return_counts=True)
@@ -168,9 +170,9 @@ def test_a_teacher_alone_labels_views_in_which_no_grasp_was_tried(
     assert run.evaluate().loss < 0.95 * before.loss
 
 
-def test_only_hands_teach_and_only_balls_are_taught(make_trainer, networks, teacher, tmp_path):
-    metadata = CheckpointMetadata("tiny", networks["balls"], voxel_size=0.0045, gripper="panda")
-    save_checkpoint(tmp_path / "tiny.safetensors", build_network(networks["balls"]), metadata)
+def test_only_hands_teach_and_only_balls_are_taught(make_trainer, teacher, tmp_path):
+    metadata = CheckpointMetadata("tiny", NETWORKS["balls"], voxel_size=0.0045, gripper="panda")
+    save_checkpoint(tmp_path / "tiny.safetensors", build_network(NETWORKS["balls"]), metadata)
     with pytest.raises(ValueError, match="teacher: got a network of architecture 'edgegrasp'"):
         Teacher(tmp_path / "tiny.safetensors", 0.04)
     with pytest.raises(ValueError, match="tiny learns from labels alone"):
@@ -178,8 +180,8 @@ def test_only_hands_teach_and_only_balls_are_taught(make_trainer, networks, teac
 
 
 @pytest.mark.parametrize("name", ["balls", "vn", "hands"])
-def test_the_new_weights_answer_the_fitted_probability(name, networks, made_up_view, tmp_path):
-    config, old = networks[name], tmp_path / "old.safetensors"
+def test_the_new_weights_answer_the_fitted_probability(name, tmp_path):
+    config, old = NETWORKS[name], tmp_path / "old.safetensors"
     metadata = CheckpointMetadata("old", config, 0.0045, "panda", temperature=1.5)
     network = build_network(config, torch.Generator().manual_seed(0))
     save_checkpoint(old, network, metadata)

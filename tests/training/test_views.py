@@ -11,7 +11,7 @@ from scipy.special import expit
 from edgegrasp_model.gripper import gripper_fields, load_gripper
 from edgegrasp_model.hand_description import Surroundings
 from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
-from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
+from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_sim.objects import CLUTTER, ObjectSet
@@ -28,10 +28,12 @@ from edgegrasp_training.views import (
     split_by_scene,
 )
 
+from .conftest import NETWORKS, made_up_view
+
 SAMPLE = Path(__file__).parents[2] / "examples" / "labelled_views"
 
 
-def test_a_view_comes_back_with_the_hand_that_tried_its_grasps(made_up_view, tmp_path) -> None:
+def test_a_view_comes_back_with_the_hand_that_tried_its_grasps(tmp_path) -> None:
     file, view = tmp_path / "pile_1-000001_0.npz", made_up_view(0)
     view.save(file)
     read = load_view(file)
@@ -88,11 +90,8 @@ def test_no_test_object_is_in_the_data_of_the_shipped_weights(shared_dir, kind) 
     assert not {digest for _, digest in listed} & {model.digest for model in kept_apart}
 
 
-Networks = dict[str, NetworkConfig]
-
-
-def test_packed_balls_hold_each_tried_grasp_and_its_contact(made_up_view, networks) -> None:
-    balls = networks["balls"]
+def test_packed_balls_hold_each_tried_grasp_and_its_contact() -> None:
+    balls = NETWORKS["balls"]
     grasps = tried_grasps(made_up_view(1), balls)
     batch, label, weight = pack_balls(grasps, grasps.balls(), balls)
     assert len(label) == len(grasps.label) == len(batch.contact)
@@ -108,8 +107,8 @@ def test_packed_balls_hold_each_tried_grasp_and_its_contact(made_up_view, networ
     assert 0 < len(some.label) < len(label)
 
 
-def test_packed_hands_are_what_the_detector_would_pack_and_vary(made_up_view, networks) -> None:
-    view, hands = made_up_view(1), networks["hands"]
+def test_packed_hands_are_what_the_detector_would_pack_and_vary() -> None:
+    view, hands = made_up_view(1), NETWORKS["hands"]
     grasps = tried_grasps(view, hands)
     batch, label, _ = pack_hands(grasps, grasps.balls()[:2], hands)
     rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, grasps.balls()[:2]))
@@ -128,8 +127,8 @@ def test_packed_hands_are_what_the_detector_would_pack_and_vary(made_up_view, ne
     assert (varied.points[~there] == 0).all()
 
 
-def test_a_grasp_that_stays_when_shaken_is_worth_a_little_more(made_up_view, networks) -> None:
-    view, balls = made_up_view(1), networks["balls"]
+def test_a_grasp_that_stays_when_shaken_is_worth_a_little_more() -> None:
+    view, balls = made_up_view(1), NETWORKS["balls"]
     firm = np.where(view.success == 1, np.arange(len(view.success)) % 2, view.success)
     shaken = tried_grasps(replace(view, firm=firm.astype(np.int8)), balls).label
     unknown = tried_grasps(view, balls).label
@@ -153,15 +152,15 @@ def test_the_temperature_undoes_overconfidence() -> None:
     assert sum(each.number for each in ranges.values()) == 20_000
 
 
-def test_views_are_scored_by_hand_networks_alone(made_up_view, networks, tmp_path: Path) -> None:
+def test_views_are_scored_by_hand_networks_alone(tmp_path: Path) -> None:
     made_up_view(1).save(tmp_path / "pile_0-000000_0.npz")
     made_up_view(2).save(tmp_path / "table_0-000001_0.npz")
     paths = sorted(tmp_path.glob("*.npz"))
     files = {}
     for name in ("hands", "balls"):
         files[name] = tmp_path / f"{name}.safetensors"
-        metadata = CheckpointMetadata(name, networks[name], 0.0045, "panda")
-        save_checkpoint(files[name], build_network(networks[name]), metadata)
+        metadata = CheckpointMetadata(name, NETWORKS[name], 0.0045, "panda")
+        save_checkpoint(files[name], build_network(NETWORKS[name]), metadata)
     scored = score_views(paths, [files["hands"], files["hands"]])
     assert set(scored.kind.tolist()) == {"pile", "table"}
     assert scored.logit.shape == (2, len(scored.held))
