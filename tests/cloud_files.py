@@ -103,3 +103,10 @@ def point_cloud2(points: np.ndarray, padding: int = 0, big: bool = False) -> dic
     data = b"".join(row.astype(record).tobytes() + bytes(padding) for row in rows)
     layout = {"is_bigendian": big, "row_step": width * record.itemsize + padding, "data": data}
     return size | {"fields": fields} | layout
+
+
+def block_obj(x: float, y: float, z: float) -> str:
+    """An OBJ file of a block from the origin to a corner."""
+    quads = ("1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4")
+    corners = [f"v {a} {b} {c}\n" for a in (0, x) for b in (0, y) for c in (0, z)]
+    return "".join([*corners, *(f"f {quad}\n" for quad in quads)])

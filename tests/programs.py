@@ -1,9 +1,10 @@
-"""Programs that tests run to their end."""
+"""Programs that tests run."""
 
 import socket
 import subprocess
 import sys
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 EDGEGRASP = (sys.executable, "-c", "from edgegrasp_cli.main import main; main()")
@@ -15,6 +16,17 @@ def run(*words: object, code: int = 0, **more: Any) -> subprocess.CompletedProce
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, **more)
     assert done.returncode == code, done.stdout[-5000:] + done.stderr
     return done
+
+
+@contextmanager
+def started(*words: object, **more: Any) -> Iterator[subprocess.Popen[str]]:
+    """A program that runs until the block ends."""
+    command = [str(word) for word in words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, **more) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
 
 
 def free_ports(count: int) -> list[int]:

@@ -4,14 +4,13 @@ import importlib.metadata
 import json
 import os
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
-from tests.programs import EDGEGRASP
+from tests.programs import EDGEGRASP, started
 from tests.programs import run as run_program
 from typer.testing import CliRunner
 
@@ -19,17 +18,8 @@ from edgegrasp.v1 import grasp_pb2
 from edgegrasp_cli import main
 from edgegrasp_service.worker.process import Answer, Facts, Job
 
-HEAVY = {
-    "torch",
-    "open3d",
-    "grpc",
-    "pybullet",
-    "mujoco",
-    "fastapi",
-    "uvicorn",
-    "matplotlib",
-    "httpx",
-}
+HEAVY = {"torch", "open3d", "grpc", "pybullet", "mujoco", "fastapi", "uvicorn", "httpx"}
+HEAVY |= {"matplotlib"}
 
 
 def loaded_by(*commands: list[str]) -> tuple[str, set[str]]:
@@ -103,20 +93,20 @@ def test_a_missing_engine_is_named(command: str, refused, monkeypatch, tmp_path:
     assert "is installed: pip install 'edgegrasp[sim]'" in said or "pip install mujoco" in said
 
 
-def test_training_the_scene_network_names_its_extras() -> None:
-    words = ["edgegrasp", "train-scene", "FOLDER", "--run", "FOLDER"]
+@pytest.mark.parametrize(
+    ("missing", "words", "extra"),
+    [
+        ("open3d", ["train-scene", "FOLDER", "--run", "FOLDER"], "open3d,train"),
+        ("typer", [], "cli"),  # the command line itself
+    ],
+)
+def test_a_package_missing_from_the_start_names_the_extra(missing, words, extra) -> None:
     program = (
-        f"import sys; sys.modules['open3d'] = None; sys.argv = {words}; "
+        f"import sys; sys.modules[{missing!r}] = None; sys.argv = {['edgegrasp', *words]}; "
         "from edgegrasp_cli.main import main; main()"
     )
     said = run_program(sys.executable, "-c", program, code=1).stderr
-    assert "pip install 'edgegrasp[open3d,train]'" in said
-
-
-def test_the_command_line_is_an_extra() -> None:
-    program = "import sys; sys.modules['typer'] = None; import edgegrasp_cli.main"
-    said = run_program(sys.executable, "-c", program, code=1).stderr
-    assert "pip install 'edgegrasp[cli]'" in said
+    assert f"pip install 'edgegrasp[{extra}]'" in said
 
 
 @pytest.mark.parametrize(
@@ -153,18 +143,15 @@ def test_a_recorded_request_is_answered_again(transport, run, refused, tmp_path,
 def test_a_scene_is_viewed_until_ctrl_c(tmp_path: Path) -> None:
     np.save(tmp_path / "depth.npy", np.full((4, 6), 500, np.uint16))
     flags = ("--depth", tmp_path / "depth.npy", "--intrinsics", "30,30,3,2", "--no-browser")
-    command = [*EDGEGRASP, "view", *map(str, flags)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as viewer:
+    with started(*EDGEGRASP, "view", *flags) as viewer:
         assert viewer.stdout is not None
         address = viewer.stdout.readline().split()[0]
-        try:
-            sample = httpx.get(f"{address}samples/samples.json").json()[0]
-            assert sample["intrinsics"] == "30,30,3,2"
-            file = httpx.get(f"{address}samples/{sample['files'][0]}").content
-            assert file == (tmp_path / "depth.npy").read_bytes()
-            assert httpx.get(address).status_code == 200
-        finally:
-            viewer.send_signal(signal.SIGINT)
+        sample = httpx.get(f"{address}samples/samples.json").json()[0]
+        assert sample["intrinsics"] == "30,30,3,2"
+        file = httpx.get(f"{address}samples/{sample['files'][0]}").content
+        assert file == (tmp_path / "depth.npy").read_bytes()
+        assert httpx.get(address).status_code == 200
+        viewer.send_signal(signal.SIGINT)
         assert viewer.wait(timeout=30) == 0
     with pytest.raises(httpx.ConnectError):
         httpx.get(address)

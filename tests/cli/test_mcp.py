@@ -4,10 +4,9 @@ import importlib.metadata
 import json
 import os
 import socket
-import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -16,10 +15,10 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
-from tests.programs import EDGEGRASP, free_ports, run
+from tests.programs import EDGEGRASP, free_ports, run, started
 
 from edgegrasp_cli.mcp import grasp_tools
-from edgegrasp_client import Detection, Grasp, GraspClient
+from edgegrasp_client import Detection, GraspClient
 from edgegrasp_results import ArmPlan, ArmTrajectory
 
 mcp = pytest.importorskip("mcp", reason="the extra `mcp` is not installed")
@@ -108,8 +107,8 @@ async def test_a_camera_pose_puts_answers_into_the_base_frame(dummy_server, fold
     T_base_camera = np.eye(4)
     T_base_camera[:3, :3] = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
     T_base_camera[:3, 3] = 0.4, 0.1, 0.9
-    asked = {"depth_file": "depth.png", "intrinsics": CAMERA, "T_base_camera": T_base_camera}
-    asked["T_base_camera"] = T_base_camera.tolist()
+    asked = {"depth_file": "depth.png", "intrinsics": CAMERA}
+    asked |= {"T_base_camera": T_base_camera.tolist()}
     depth = np.asarray(image.open(folder / "depth.png"))
     view = {"depth": depth, "intrinsics": CAMERA, "T_cloud_camera": T_base_camera}
     with GraspClient(dummy_server.grpc_address) as client:
@@ -179,11 +178,8 @@ class Planning:
         arm = ArmPlan(True, joints, 2 * joints, motion)
         far = ArmPlan(False, None, None, None)
         plans = [arm if self._reaches else far, far]
-        return replace(found, grasps=[*map(with_arm, found.grasps, plans)], counts={"reachable": 0})
-
-
-def with_arm(grasp: Grasp, arm: ArmPlan) -> Grasp:
-    return replace(grasp, arm=arm)
+        grasps = [replace(one, arm=plan) for one, plan in zip(found.grasps, plans, strict=True)]
+        return replace(found, grasps=grasps, counts={"reachable": 0})
 
 
 @pytest.mark.parametrize("reaches", [True, False])
@@ -214,24 +210,13 @@ async def test_an_agent_gets_the_joints_of_a_robot(dummy_server, folder, reaches
     assert ("counts" in found) != reaches  # which say why no grasp is within reach
 
 
-@pytest.fixture
-def http_address(dummy_server, folder: Path) -> Iterator[str]:
+async def test_the_tools_over_http(dummy_server, folder: Path) -> None:
+    flags = ["--server", dummy_server.grpc_address, "--folder", folder]
     (port,) = free_ports(1)
-    flags = ["--server", dummy_server.grpc_address, "--folder", str(folder)]
-    command = [sys.executable, *PROGRAM, *flags, "--http", f"127.0.0.1:{port}"]
-    with subprocess.Popen(command) as process:
-        try:
-            while process.poll() is None:
-                with socket.socket() as probe:
-                    if probe.connect_ex(("127.0.0.1", port)) == 0:
-                        break
+    with started(sys.executable, *PROGRAM, *flags, "--http", f"127.0.0.1:{port}") as process:
+        with socket.socket() as probe:
+            while process.poll() is None and probe.connect_ex(("127.0.0.1", port)):
                 time.sleep(0.1)
-            yield f"http://127.0.0.1:{port}/mcp"
-        finally:
-            process.terminate()
-
-
-async def test_the_tools_over_http(http_address: str) -> None:
-    async with mcp.Client(http_address) as client:
-        found = await client.call_tool(CLOUD, {"point_cloud_file": "cloud.npy"})
-        assert len(answer(found)["grasps"]) == 5
+        async with mcp.Client(f"http://127.0.0.1:{port}/mcp") as client:
+            found = await client.call_tool(CLOUD, {"point_cloud_file": "cloud.npy"})
+            assert len(answer(found)["grasps"]) == 5

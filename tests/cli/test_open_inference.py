@@ -3,7 +3,6 @@
 import importlib.util
 import json
 import socket
-import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -13,7 +12,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from tests.programs import EDGEGRASP, free_ports, run
+from tests.programs import EDGEGRASP, free_ports, run, started
 
 pytest.importorskip("uvicorn", reason="the extra `open-inference` is not installed")
 
@@ -145,14 +144,11 @@ def test_the_command_serves_both_transports(dummy_server) -> None:
     ports = [str(port) for port in free_ports(2)]
     flags = ["--server", dummy_server.grpc_address]
     flags += ["--http-port", ports[0], "--grpc-port", ports[1]]
-    with subprocess.Popen([*EDGEGRASP, "open-inference", *flags]) as process:
-        try:
-            with httpx.Client(transport=httpx.HTTPTransport(retries=10)) as http:
-                ready = http.get(f"http://127.0.0.1:{ports[0]}/v2/health/ready", timeout=60)
-            assert ready.json() == {"ready": True}
-            socket.create_connection(("127.0.0.1", int(ports[1]))).close()
-        finally:
-            process.terminate()
+    with started(*EDGEGRASP, "open-inference", *flags):
+        with httpx.Client(transport=httpx.HTTPTransport(retries=10)) as http:
+            ready = http.get(f"http://127.0.0.1:{ports[0]}/v2/health/ready", timeout=60)
+        assert ready.json() == {"ready": True}
+        socket.create_connection(("127.0.0.1", int(ports[1]))).close()
 
 
 def test_a_server_that_is_away() -> None:

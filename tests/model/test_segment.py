@@ -248,9 +248,7 @@ def test_objects_that_touch_are_grasped_however_long_the_heap_is() -> None:
         box((x, rng.uniform(-0.03, 0.03), half), (0.035, rng.uniform(0.02, 0.035), half), 0.0)
         for x, half in zip(np.arange(-0.28, 0.29, 0.07), rng.uniform(0.02, 0.05, 9), strict=True)
     ]
-    T_world_camera = camera(0.6, -1.5, 0.8)
-    found = detect(render([table(), *heap], T_world_camera))
-    assert found.grasps
+    assert detect(render([table(), *heap], camera(0.6, -1.5, 0.8))).grasps
 
 
 def test_an_object_that_leans_on_a_wall_ends_there_and_no_hand_closes_on_the_wall() -> None:

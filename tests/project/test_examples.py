@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from tests.cloud_files import block_obj
 from tests.programs import EDGEGRASP, run
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -114,13 +115,10 @@ def test_your_planner(tmp_path: Path) -> None:
 
 
 def test_training_on_your_objects(tmp_path: Path) -> None:
-    corners = "".join(f"v {x} {y} {z}\n" for x in (0, 5) for y in (0, 4) for z in (0, 9))
-    quads = ("1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4")
-    block = corners + "".join(f"f {quad}\n" for quad in quads)
     for split in ("train", "test"):
         folder = tmp_path / "objects" / "packed" / split
         folder.mkdir(parents=True)
-        (folder / "block.obj").write_text(block)
+        (folder / "block.obj").write_text(block_obj(5, 4, 9))
     programs = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     words = (tmp_path / "objects", tmp_path / "out", 2, 1)
     environment = os.environ | {"PATH": programs}

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from tests.programs import run
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "system_packages.sh"
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "scripts" / "system_packages.sh"
 VENV_CHECK = "import ensurepip, venv"
 
 
@@ -19,11 +20,8 @@ def stand_in(folder: Path, name: str, body: str) -> None:
 
 def machine(folder: Path, *, lacks: str, user: int = 0, apt: bool = True) -> dict[str, str]:
     """A folder of stand-ins as PATH; the interpreter fails where a bash pattern matches."""
-    stand_in(
-        folder,
-        "python3",
-        f'case "$*" in {lacks}) exit 1;; *print*) echo python3.11-venv;; esac',
-    )
+    fails = f'case "$*" in {lacks}) exit 1;; *print*) echo python3.11-venv;; esac'
+    stand_in(folder, "python3", fails)
     stand_in(folder, "id", f"echo {user}")
     stand_in(folder, "uname", "echo Linux")
     if apt:
@@ -59,9 +57,6 @@ def test_root_installs_missing_packages_and_others_get_the_command(
         assert done.stdout + done.stderr == ""
 
 
-ROOT = Path(__file__).parents[2]
-
-
 @pytest.mark.parametrize(
     ("machine", "flags", "loops"),
     [
@@ -79,8 +74,7 @@ def test_the_server_starts_with_the_loops_of_its_processor(machine, flags, loops
         "edgegrasp": 'echo "${NUMBA_CPU_NAME-of its own}: $*"',
     }
     for name, line in programs.items():
-        (tmp_path / name).write_text(f"#!/bin/sh\n{line}\n")
-        (tmp_path / name).chmod(0o755)
+        stand_in(tmp_path, name, line)
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CPU_NAME"}
     here = {**environment, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
     started = run("/bin/sh", ROOT / "docker" / "start.sh", "--workers", "2", env=here)

@@ -13,7 +13,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from tests.programs import run
+from tests.programs import run, started
 
 from edgegrasp_client import GraspClient
 
@@ -58,18 +58,14 @@ def test_the_wheel_alone_serves(built: tuple[Path, Path], tmp_path: Path) -> Non
         shutil.copy(loop, to)
     command = [str(new / "bin/edgegrasp"), "serve", "--http-port=0", "--grpc-port=0", "--workers=1"]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
-    ) as server:
-        try:
-            assert server.stdout is not None
-            _, _, _, url, _, address = server.stdout.readline().split()
-            document = httpx.get(f"{url}/openapi.json").json()
-            with GraspClient(address) as client:
-                box = np.random.default_rng(0).uniform(-0.03, 0.03, (2000, 3))
-                assert client.detect(box, viewpoint=(0.0, 0.0, 0.5)).model == "edgegrasp-plus"
-        finally:
-            server.terminate()
+    with started(*command, cwd=tmp_path, env=environment) as server:
+        assert server.stdout is not None
+        _, _, _, url, _, address = server.stdout.readline().split()
+        document = httpx.get(f"{url}/openapi.json").json()
+        with GraspClient(address) as client:
+            box = np.random.default_rng(0).uniform(-0.03, 0.03, (2000, 3))
+            assert client.detect(box, viewpoint=(0.0, 0.0, 0.5)).model == "edgegrasp-plus"
+        server.terminate()
         assert server.wait(20) == 0
     assert "/v1/grasps" in document["paths"]
     where = "import edgegrasp_service as s; print(s.__file__)"

@@ -8,6 +8,8 @@ import pytest
 pytest.importorskip("open3d", reason="rays are cast by Open3D")
 pytest.importorskip("trimesh", reason="some background is made by trimesh")
 
+from tests.cloud_files import block_obj
+
 from edgegrasp_model.scene.network import SceneNet
 from edgegrasp_training import scene_images, scene_pool, scene_training
 from edgegrasp_training.scene_images import DEPTH_UNIT, draw_pose, generate, make_image
@@ -20,10 +22,6 @@ from edgegrasp_training.scene_training import (
     scene_loss,
     train,
 )
-
-BLOCK = "".join(f"v {x} {y} {z}\n" for x in (0, 0.05) for y in (0, 0.04) for z in (0, 0.06))
-for quad in ("1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"):
-    BLOCK += f"f {quad}\n"
 
 
 @pytest.fixture(scope="module")
@@ -62,18 +60,18 @@ def test_the_same_scene_is_made_again_from_its_seed(pool: list[PoolMesh]) -> Non
 
 
 def test_a_file_is_made_and_learned_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_images, "SCENES_PER_FILE", 4)
+    monkeypatch.setattr(scene_images, "SCENES_PER_FILE", 2)
     monkeypatch.setattr(scene_pool, "NUM_POOL", 12)
     monkeypatch.setattr(scene_pool, "NUM_ARMS", 0)
     monkeypatch.setattr(scene_training, "HELD_OUT", 1)
-    monkeypatch.setattr(scene_training, "BATCH", 4)
+    monkeypatch.setattr(scene_training, "BATCH", 2)
     mesh = tmp_path / "block.obj"
-    mesh.write_text(BLOCK)
+    mesh.write_text(block_obj(0.05, 0.04, 0.06))
     generate(tmp_path / "data", [mesh], files=2, seed=1, part=0, parts=1)
     files = sorted((tmp_path / "data").glob("scenes-????.npz"))
     assert len(files) == 2
     batch = make_batch([SceneImages(files)[0]], np.random.default_rng(0), up_known=True)
-    train(tmp_path / "data", tmp_path / "run", seconds=2.0)
+    train(tmp_path / "data", tmp_path / "run", seconds=0.2)
     assert (tmp_path / "run" / "scene.safetensors").is_file()
     assert "iou_object" in (tmp_path / "run" / "log.txt").read_text()
     output = SceneNet().eval()(batch.features)
