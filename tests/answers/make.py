@@ -42,11 +42,7 @@ def answer(case: Case, catalogue: ModelCatalogue) -> Any:
 
 def record(answer: Any) -> Record:
     """What is kept of an answer, of the model's or of the client's: plain values and arrays."""
-    plain = {
-        "counts": dict(answer.counts),
-        "model": answer.model,
-        "warnings": len(answer.warnings),
-    }
+    plain = {"counts": dict(answer.counts), "model": answer.model, "warnings": len(answer.warnings)}
     grasps = getattr(answer, "grasps", None)
     if grasps is None:
         plain["reasons"] = [each.reason and str(each.reason) for each in answer.evaluations]

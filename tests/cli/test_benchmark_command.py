@@ -47,10 +47,7 @@ def test_the_shipped_weights_are_not_below_the_gate(benchmark: Callable, run, tm
     gate.write_text(json.dumps(committed))
     benchmark(tmp_path, "in-process", *few, "--gate", gate, rounds=4)
     planner = json.loads((tmp_path / "manifest.json").read_text())["run"]["planner"]
-    assert planner["options"] == {
-        "num_approach_points": 16,
-        "num_candidates": 400,
-    }
+    assert planner["options"] == {"num_approach_points": 16, "num_candidates": 400}
 
 
 def test_another_hand_is_planned_for_and_simulated(benchmark, run, refused, tmp_path) -> None:

@@ -36,10 +36,7 @@ def gateway(dummy_server) -> Iterator[dict[str, str]]:
         thread = threading.Thread(target=server.run, args=([bound],))
         thread.start()
         with grpc_server(models, "127.0.0.1:0", LIMIT) as port:
-            yield {
-                "http": f"127.0.0.1:{bound.getsockname()[1]}",
-                "grpc": f"127.0.0.1:{port}",
-            }
+            yield {"http": f"127.0.0.1:{bound.getsockname()[1]}", "grpc": f"127.0.0.1:{port}"}
         server.should_exit = True
         thread.join()
         bound.close()

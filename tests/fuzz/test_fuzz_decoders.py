@@ -185,9 +185,7 @@ def test_changed_json_decode_or_are_refused(document: Any, scores: bool) -> None
 
 
 @given(
-    mutated([FORM]),
-    st.sampled_from(["b", '"b"', "b; x=y", "x", '"', "b'\ud800"]),
-    st.booleans(),
+    mutated([FORM]), st.sampled_from(["b", '"b"', "b; x=y", "x", '"', "b'\ud800"]), st.booleans()
 )
 def test_mutated_forms_decode_or_are_refused(content: bytes, boundary: str, scores: bool) -> None:
     ask("http", content, scores, f"multipart/form-data; boundary={boundary}")

@@ -213,6 +213,13 @@ class Running:
     def address(self, transport: str) -> str:
         return self.server.grpc_address if transport == "grpc" else self.server.http_url
 
+    async def hold(self, request: Awaitable[Any], stage: str = "evaluate") -> "asyncio.Task[Any]":
+        """Ask for something that stays in a stage until this is opened."""
+        self.stages.shut(stage)
+        task = asyncio.ensure_future(request)
+        await self.until(lambda: self.stages.begun[stage] == 1)
+        return task
+
     async def speak(self, data: bytes) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         """A connection to the HTTP port on which this has been sent."""
         host, port = self.server.http_url.removeprefix("http://").split(":")

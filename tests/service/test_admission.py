@@ -154,9 +154,7 @@ async def test_a_deadline_that_may_be_met_is_let_in(took, requests, seconds) -> 
 async def test_a_full_server_refuses_at_once(serve, transport, cloud) -> None:
     running = await serve(max_queue_length=1)
     client = running.connect(transport)
-    running.stages.shut("evaluate")
-    accepted = [asyncio.create_task(client.detect(cloud))]
-    await running.until(lambda: running.stages.begun["evaluate"] == 1)
+    accepted = [await running.hold(client.detect(cloud))]
     accepted.append(asyncio.create_task(client.detect(cloud, seed=1)))
     await running.until(lambda: running.waiting == 1)
     refused = await client.detect(cloud)
@@ -171,10 +169,8 @@ async def test_a_full_server_refuses_at_once(serve, transport, cloud) -> None:
 
 async def test_nobody_is_read_before_there_is_a_place(serve, cloud) -> None:
     running = await serve(max_queue_length=0)
-    running.stages.shut("prepare")
     client = running.connect("grpc")
-    accepted = asyncio.create_task(client.detect(cloud))
-    await running.until(lambda: running.stages.begun["prepare"] == 1)
+    accepted = await running.hold(client.detect(cloud), "prepare")
     # As a stream, this client may send its message whenever it likes: never.
     call = client.channel.stream_unary("/edgegrasp.v1.GraspService/DetectGrasps")()
     assert await call.code() is grpc.StatusCode.RESOURCE_EXHAUSTED

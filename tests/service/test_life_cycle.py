@@ -94,9 +94,8 @@ async def test_while_draining_both_transports_say_so(serve, transport, cloud) ->
     watch = health.Watch(health_pb2.HealthCheckRequest())
     assert (await watch.read()).status == Status.SERVING
     assert (await http.get("/health/live")).status_code == 200
-    running.stages.shut("finish")
-    accepted = [asyncio.create_task(client.detect(cloud, seed=seed)) for seed in (1, 2)]
-    await running.until(lambda: running.stages.begun["finish"] == 1)
+    accepted = [await running.hold(client.detect(cloud), "finish")]
+    accepted.append(asyncio.create_task(client.detect(cloud)))
     await running.until(lambda: running.waiting == 1)
     running.stop.set()
     assert (await watch.read()).status == Status.NOT_SERVING
@@ -116,9 +115,7 @@ async def test_while_draining_both_transports_say_so(serve, transport, cloud) ->
 
 async def test_when_grace_is_over_callers_are_told(serve, transport, cloud) -> None:
     running = await serve(grace_seconds=0.2)
-    running.stages.shut("finish")
-    asked = asyncio.create_task(running.connect(transport).detect(cloud))
-    await running.until(lambda: running.stages.begun["finish"] == 1)
+    asked = await running.hold(running.connect(transport).detect(cloud), "finish")
     running.stop.set()
     assert is_error(await asked, "not-ready")
     await asyncio.wait_for(running.serving, PATIENCE)

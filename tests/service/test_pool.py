@@ -154,9 +154,7 @@ async def test_a_request_that_expires_or_is_left_while_it_waits_is_never_compute
 ) -> None:
     running = await serve()
     client = running.connect(transport)
-    running.stages.shut("evaluate")
-    first = asyncio.create_task(client.detect(cloud))
-    await running.until(lambda: running.stages.begun["evaluate"] == 1)
+    first = await running.hold(client.detect(cloud))
     left = asyncio.create_task(client.detect(cloud))
     await running.until(lambda: running.waiting == 1)
     left.cancel()
@@ -194,10 +192,7 @@ async def test_the_worker_itself_stops_after_the_deadline(serve, transport, clou
 
 async def test_a_request_whose_client_left_frees_its_worker(serve, transport, cloud) -> None:
     running = await serve()
-    client = running.connect(transport)
-    running.stages.shut("evaluate")
-    asked = asyncio.create_task(client.detect(cloud))
-    await running.until(lambda: running.stages.begun["evaluate"] == 1)
+    asked = await running.hold(running.connect(transport).detect(cloud))
     asked.cancel()
     await running.until(lambda: running.ended == ["cancelled"])
     await running.until_idle()  # though the gate is shut

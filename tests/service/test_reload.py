@@ -116,9 +116,7 @@ async def test_one_reload_at_a_time(serve) -> None:
 async def test_what_was_begun_with_the_old_weights_ends_with_them(serve, cloud) -> None:
     running = await serve(admin_tokens=[ADMIN])
     client = running.connect("grpc")
-    running.stages.shut("finish")
-    asked = asyncio.create_task(client.detect(cloud))
-    await running.until(lambda: running.stages.begun["finish"] == 1)
+    asked = await running.hold(client.detect(cloud), "finish")
     assert (await running.connect("rest").reload(ADMIN)).digest == "2"
     running.stages.open("finish")
     assert (await asked).fine

@@ -41,9 +41,7 @@ async def test_an_error_is_an_answer_and_the_stream_goes_on(serve, cloud) -> Non
 async def test_a_request_of_a_stream_has_a_deadline_of_its_own(serve, cloud) -> None:
     running = await serve()
     stream = running.stub().DetectGraspsStream()
-    running.stages.shut("evaluate")
-    await stream.write(request("patient", cloud))
-    await running.until(lambda: running.stages.begun["evaluate"] == 1)
+    await running.hold(stream.write(request("patient", cloud)))
     hasty = request("hasty", cloud)
     hasty.timeout = 0.05
     await stream.write(hasty)
@@ -133,9 +131,7 @@ async def test_a_stream_whose_client_left_ends(serve, cloud) -> None:
 async def test_a_stopping_server_answers_what_it_read_and_ends_the_stream(serve, cloud):
     running = await serve()
     stream, idle = running.stub().DetectGraspsStream(), running.stub().DetectGraspsStream()
-    running.stages.shut("evaluate")
-    await stream.write(request("read", cloud))
-    await running.until(lambda: running.stages.begun["evaluate"] == 1)
+    await running.hold(stream.write(request("read", cloud)))
     running.stop.set()
     await running.until(running.server.service.stopping.is_set)
     running.stages.open("evaluate")
