@@ -3,6 +3,7 @@
 import base64
 import warnings
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any
 
 import hypothesis
@@ -107,7 +108,7 @@ def changed(good: dict[str, Any]) -> st.SearchStrategy[dict[str, Any]]:
 
     @st.composite
     def change(draw: st.DrawFn) -> dict[str, Any]:
-        found = copied(good)
+        found = deepcopy(good)
         for _ in range(draw(st.integers(1, 3))):
             at: Any = found
             while True:
@@ -126,12 +127,6 @@ def changed(good: dict[str, Any]) -> st.SearchStrategy[dict[str, Any]]:
         return found
 
     return change()
-
-
-def copied(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: copied(part) for name, part in value.items()}
-    return [copied(part) for part in value] if isinstance(value, list) else value
 
 
 def base64_of(value: Any) -> str:

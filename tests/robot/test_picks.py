@@ -14,8 +14,20 @@ from tests.checks import refusal
 from tests.robot.arms import BOXES, HALF, TURNED, picks_of, surface
 
 from edgegrasp_model.options import parse_options
+from edgegrasp_robot import load_robot
+from edgegrasp_robot.surroundings import _near_robot
 
 CLOSE, CLOSE_ANGLE = 1e-3, np.deg2rad(0.2)  # metres, radians
+
+
+@pytest.fixture(scope="module", params=["fr3", "ur5"])
+def robot(request):
+    return load_robot(request.param)
+
+
+@pytest.fixture(scope="module")
+def fr3():
+    return load_robot("fr3")
 
 
 def assert_pose(found, wanted):
@@ -46,8 +58,6 @@ def plans_of(detection):
 
 def touches(robot, joints, points, distance=0.0):
     """Whether the robot, as the planner sees it, holds any of the points (N, 3), base frame."""
-    from edgegrasp_robot.surroundings import _near_robot
-
     return bool(_near_robot(robot, joints, points, distance).any())
 
 

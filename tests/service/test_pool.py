@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import httpx
 import numpy as np
+import psutil
 import pytest
 
 from edgegrasp.v1 import grasp_pb2
@@ -138,15 +139,7 @@ async def test_workers_end_with_the_server(serve) -> None:
     assert len(set(pids)) == 2
     running.stop.set()
     await running.serving
-    await running.until(lambda: not any(alive(pid) for pid in pids))
-
-
-def alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
+    await running.until(lambda: not any(map(psutil.pid_exists, pids)))
 
 
 async def test_a_request_that_expires_or_is_left_while_it_waits_is_never_computed(

@@ -124,7 +124,6 @@ def test_a_box_appears_where_it_is(world: World, aside: float, azimuth: float) -
     assert top[:, :2].max(axis=0) == pytest.approx(CENTRE[:2] + HALF[:2], abs=1.5e-3)
 
 
-DEPTH_CAMERA = Intrinsics()
 FAULTLESS = replace(
     STRUCTURED_LIGHT, baseline=0.0, window=1, fattening=0.0, noise_floor=0.0, noise_growth=0.0,
     warp=0.0, disparity_step=0.0, grazing=180.0, missing=0.0,
@@ -142,12 +141,12 @@ def box_before_wall() -> np.ndarray:
 
 
 def seen(sensor, depth: np.ndarray, seed: int = 0) -> np.ndarray:
-    return sensor.apply(depth, DEPTH_CAMERA, np.random.default_rng(seed))
+    return sensor.apply(depth, CAMERA, np.random.default_rng(seed))
 
 
 def test_a_camera_without_faults_sees_what_is_there_and_nothing_beyond_its_range() -> None:
     depth = box_before_wall()
-    depth[:, 300:] = DEPTH_CAMERA.far
+    depth[:, 300:] = CAMERA.far
     image = seen(FAULTLESS, depth)
     assert np.isnan(image[:, 300:]).all()
     np.testing.assert_allclose(image[:, :300], depth[:, :300], atol=1e-6)
@@ -165,7 +164,7 @@ def test_what_the_projector_does_not_light_is_missing_on_its_other_side(side: fl
     missing = np.isnan(seen(replace(FAULTLESS, baseline=side * 0.075), box_before_wall()))
     beside = [slice(100, 120), slice(200, 220)]  # to the left of the box, and to the right
     shadow, lit = beside if side > 0 else reversed(beside)
-    width = 0.075 * DEPTH_CAMERA.focal_length * (1 / 0.8 - 1)  # pixels
+    width = 0.075 * CAMERA.focal_length * (1 / 0.8 - 1)  # pixels
     assert missing[90:150, shadow].sum(axis=1) == pytest.approx(np.full(60, width), abs=2)
     assert not missing[90:150, lit].any()
     assert not missing[:70].any()
