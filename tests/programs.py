@@ -20,9 +20,9 @@ def run(*words: object, code: int = 0, **more: Any) -> subprocess.CompletedProce
 
 @contextmanager
 def started(*words: object, **more: Any) -> Iterator[subprocess.Popen[str]]:
-    """A program that runs until the block ends."""
-    command = [str(word) for word in words]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, **more) as process:
+    """A program that runs until the block ends, its output in a pipe unless that is set."""
+    command, more = [str(word) for word in words], {"stdout": subprocess.PIPE, **more}
+    with subprocess.Popen(command, text=True, **more) as process:
         try:
             yield process
         finally:

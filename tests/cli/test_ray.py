@@ -2,7 +2,6 @@
 
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -17,7 +16,7 @@ import psutil
 import pytest
 from benchmarks.load import OPTIONS
 from benchmarks.load import cloud as table
-from tests.programs import EDGEGRASP, free_ports
+from tests.programs import EDGEGRASP, free_ports, started
 
 from edgegrasp_client import GraspClient, GraspClientError, InvalidRequestError, UnknownModelError
 from edgegrasp_model.options import DetectOptions
@@ -30,6 +29,8 @@ from edgegrasp_training.views import find_views
 ROOT = Path(__file__).parents[2]
 DATA = ["generate-data", "--scenes=6", "--views-per-scene=1", "--grasps-per-view=8", "--seed=5"]
 PATIENCE = 240  # seconds, of a busy machine
+# Shells start jobs in the background with this signal ignored.
+INTERRUPTIBLE = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), "stdout": None}
 
 
 @pytest.fixture(scope="module")
@@ -62,21 +63,6 @@ def cluster() -> Iterator[Any]:
 
 
 @contextmanager
-def started(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
-    """Python with these arguments, until the block ends."""
-    process = subprocess.Popen(
-        [sys.executable, *map(str, arguments)],
-        # Shells start jobs in the background with this signal ignored.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
-
-
-@contextmanager
 def served(cluster: Any, folder: Path) -> Iterator[dict[str, str]]:
     """`serve run`; addresses of both transports."""
     yaml = pytest.importorskip("yaml")
@@ -88,7 +74,7 @@ def served(cluster: Any, folder: Path) -> Iterator[dict[str, str]]:
     file = folder / "serve.yaml"
     file.write_text(yaml.safe_dump(config))
     words = "-m", "ray.serve.scripts", "run", f"--address={cluster.address}", file
-    with started(*words) as serving:
+    with started(sys.executable, *words, **INTERRUPTIBLE) as serving:
         yield {"rest": f"http://127.0.0.1:{http}", "grpc": f"127.0.0.1:{grpc}"}
         serving.send_signal(signal.SIGINT)  # which frees the processors
         assert serving.wait(PATIENCE) is not None
@@ -162,7 +148,8 @@ def test_data_are_those_of_one_process_though_a_node_is_lost(cluster, tmp_path) 
     alone, there = tmp_path / "alone", tmp_path / "there"
     few = {"scenes": 6, "views_per_scene": 1, "grasps_per_view": 8, "seed": 5}
     list(generate(alone, None, GenerationOptions(**few)))
-    with started(*EDGEGRASP[1:], *DATA, there, f"--ray={cluster.address}") as making:
+    words = *EDGEGRASP, *DATA, there, f"--ray={cluster.address}"
+    with started(*words, **INTERRUPTIBLE) as making:
         until(lambda: len(at_work("_run")) == 2 and list(there.glob("*.npz")))
         (second,) = cluster.worker_nodes
         cluster.remove_node(second, allow_graceful=False)

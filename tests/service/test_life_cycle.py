@@ -10,14 +10,15 @@ import tempfile
 import threading
 import time
 import zlib
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-from grpc import StatusCode, aio
+from grpc import StatusCode
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client import AsyncGraspClient, GraspClient, GraspClientError, StreamRequest
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import AddressInUse
@@ -28,40 +29,30 @@ from .conftest import PATIENCE, is_error
 Status = health_pb2.HealthCheckResponse
 
 
-async def http_state(http: httpx.AsyncClient, cloud: np.ndarray) -> tuple[int, ...]:
-    answers = [
-        await http.get("/health/live"),
-        await http.get("/health/ready"),
-        await http.post("/v1/grasps", json={"points": cloud.tolist()}),
-    ]
-    return tuple(answer.status_code for answer in answers)
-
-
-async def grpc_state(channel: aio.Channel, cloud: np.ndarray) -> tuple[int, StatusCode]:
-    health = health_pb2_grpc.HealthStub(channel)
+async def states(running: Any, cloud: np.ndarray) -> tuple[Any, ...]:
+    """What probes and a request are told: by HTTP, then by gRPC."""
+    http, client = running.http(), running.connect("grpc")
+    found = [await http.get(path) for path in ("/health/live", "/health/ready")]
+    found.append(await http.post("/v1/grasps", json={"points": cloud.tolist()}))
+    health = health_pb2_grpc.HealthStub(client.channel)
     status = (await health.Check(health_pb2.HealthCheckRequest())).status
-    call = grasp_pb2_grpc.GraspServiceStub(channel).DetectGrasps(
-        grasp_pb2.DetectGraspsRequest(points=cloud.tobytes())
-    )
-    return status, await call.code()
+    return *(answer.status_code for answer in found), status, (await client.detect(cloud)).code
 
 
 async def test_not_ready_until_loaded(begin, cloud) -> None:
     running, ready = await begin(lambda stages: stages.shut("load"))
-    http, channel = running.http(), running.channel()
-    stub = health_pb2_grpc.HealthStub(channel)
+    stub = health_pb2_grpc.HealthStub(running.channel())
     names = ("", "edgegrasp.v1.GraspService")
     watches = [stub.Watch(health_pb2.HealthCheckRequest(service=name)) for name in names]
     assert [(await watch.read()).status for watch in watches] == [Status.NOT_SERVING] * 2
-    assert await http_state(http, cloud) == (200, 503, 503)
-    assert await grpc_state(channel, cloud) == (Status.NOT_SERVING, StatusCode.UNAVAILABLE)
-    assert (await http.get("/v1/models")).json()["title"] == "Not ready"
+    not_ready = (200, 503, 503, Status.NOT_SERVING, "UNAVAILABLE")
+    assert await states(running, cloud) == not_ready
+    assert (await running.http().get("/v1/models")).json()["title"] == "Not ready"
     assert "edgegrasp_model_info{" not in running.metrics()
     running.stages.open("load")
     await ready.wait()
     assert [(await watch.read()).status for watch in watches] == [Status.SERVING] * 2
-    assert await http_state(http, cloud) == (200, 200, 200)
-    assert await grpc_state(channel, cloud) == (Status.SERVING, StatusCode.OK)
+    assert await states(running, cloud) == (200, 200, 200, Status.SERVING, "OK")
     running.stop.set()
     assert [(await watch.read()).status for watch in watches] == [Status.NOT_SERVING] * 2
 
