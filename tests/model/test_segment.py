@@ -334,6 +334,7 @@ def test_a_mask_of_the_caller_wins() -> None:
     assert panel.number == 1
     region = {"include": [{"kind": "mask", "mask": mask}]}
     held = detect(cloud, approach_region=region, contact_region=region, min_score=0.0)
+    assert held.grasps
     on_panel = cloud.reshape(-1, 3)[mask]
     for grasp in held.grasps:
         for point in (grasp.approach_point, grasp.contact_point):

@@ -19,6 +19,7 @@ from pathlib import Path
 import grpc
 import httpx
 import numpy as np
+import psutil
 import pytest
 from benchmarks.soak import CHECK, STREAM, connect, http2_frame, http2_headers, http2_opening
 from grpc import aio
@@ -81,24 +82,19 @@ async def check_health(address: str) -> None:
 def is_ended(connection: socket.socket) -> bool:
     """Whether the other side has closed it."""
     connection.setblocking(False)
-    try:
-        while connection.recv(2**16):
-            pass
-    except BlockingIOError:
-        return False
-    except ConnectionResetError:
-        pass
+    with contextlib.suppress(ConnectionResetError):
+        try:
+            while connection.recv(2**16):
+                pass
+        except BlockingIOError:
+            return False
     return True
-
-
-def resident_bytes() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
 async def test_messages_that_never_end(serve, cloud) -> None:
     """60 gRPC messages of 31 MB, of which the end never comes, on one connection."""
     running = await serve(max_held_bytes=64 * MIB)
-    before = resident_bytes()
+    before = psutil.Process().memory_info().rss
     with contextlib.closing(Http2(running.server.grpc_address)) as connection:
         for stream in range(60):
             connection.begin("/edgegrasp.v1.GraspService/DetectGrasps", 2 * stream + 1)
@@ -110,7 +106,7 @@ async def test_messages_that_never_end(serve, cloud) -> None:
         http = running.http()
         for _ in range(30):
             assert (await http.get("/health/live")).status_code == 200
-        assert resident_bytes() - before < 500 * MIB
+        assert psutil.Process().memory_info().rss - before < 500 * MIB
         connection.stop.set()
         await asyncio.to_thread(sending.join, PATIENCE)
     await running.until_idle()
@@ -213,7 +209,7 @@ def test_a_form_of_nothing_but_boundaries(dummy_server, cloud) -> None:
 
     with in_background(attack, 2):
         check_alive(dummy_server, cloud)
-    assert codes <= {400, 429, 504}
+    assert set() < codes <= {400, 429, 504}
 
 
 async def test_bodies_that_trickle_give_their_places_back(serve, cloud, transport: str) -> None:
