@@ -43,15 +43,13 @@ class Tokens:
         self._known = {token.digest: token for token in known}
         self.required = any(not token.is_admin for token in self._known.values())  # by requests
 
-    def check(self, authorization: str | None, *, admin: bool = False) -> Token | None:
-        """The valid token of a request, by its header `authorization`; None if none is needed.
+    def check(self, authorization: str | None, admin: bool = False) -> Token:
+        """The valid token of a request that needs one, by its header `authorization`.
 
         Raises:
             Unauthenticated: The token is missing or unknown.
             PermissionDenied: The token does not permit the call, which needs an admin's.
         """
-        if not admin and not self.required:
-            return None
         if admin and not any(token.is_admin for token in self._known.values()):
             raise PermissionDenied(HEADER, "an administrator's call, disabled here", ADMIN_FIX)
         if authorization is None:

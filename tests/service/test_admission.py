@@ -8,7 +8,7 @@ import pytest
 
 from edgegrasp_client import GraspClient
 from edgegrasp_service.errors import DeadlineExceeded, Overloaded
-from edgegrasp_service.front.admission import Admission, Ticket
+from edgegrasp_service.front.service import Admission, Ticket
 from edgegrasp_service.observability import Call
 
 from .conftest import PATIENCE, is_error

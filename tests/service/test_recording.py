@@ -16,8 +16,8 @@ from tests.cloud_files import npy
 
 from edgegrasp_cli.replay import answer_again
 from edgegrasp_service.errors import DiskFull, InvalidSettings
-from edgegrasp_service.front.admission import Admission
 from edgegrasp_service.front.http import DOCUMENT
+from edgegrasp_service.front.service import Admission
 from edgegrasp_service.recording import Recorder, append_line, check_outcomes
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import answer

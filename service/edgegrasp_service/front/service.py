@@ -1,28 +1,36 @@
-"""The core of both transports: check, admit, run, record and report a request."""
+"""The core of both transports: check, admit, run, record and report a request.
+
+`Admission` limits how many requests and bytes the server holds, shared fairly between clients.
+"""
 
 import asyncio
 import contextlib
 import hashlib
 import logging
+import math
+import statistics
 import time
+from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import (
     STOPPING,
     Cancelled,
+    DeadlineExceeded,
     HarmfulRequest,
     NotReady,
+    Overloaded,
     PayloadTooLarge,
     PermissionDenied,
     ReloadFailed,
+    ServiceError,
     WorkerLost,
     report,
 )
-from edgegrasp_service.front.admission import Admission, Ticket
 from edgegrasp_service.observability import CALL, Call
 from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, load_tokens
 from edgegrasp_service.settings import Settings
@@ -34,6 +42,8 @@ logger = logging.getLogger(__name__)
 MOST_DEATHS = 3  # dead workers after which a request is refused; a crash counts as 3
 HARMFUL_SECONDS = 600.0  # seconds for which it is refused
 MOST_HARMFUL = 1000  # requests remembered
+LATEST = 15  # latest service times, whose median is the pace; one slow request does not change it
+MARGIN = 1.5  # the wait is estimated from a median, and half of the requests take longer
 
 Observer = Callable[[Call], None]
 Recorder = Callable[[Job, Answer], None]
@@ -58,7 +68,8 @@ class GraspService:
         self.admission = Admission(pool.size, settings.max_queue_length, settings.max_held_bytes)
         self._observers = observers
         self.record: Recorder | None = None  # called with each job and its answer
-        self._harmful = HarmfulRequests()
+        # Requests that killed workers, by digest: until when they are remembered, dead workers.
+        self._deaths: dict[bytes, tuple[float, int]] = {}
         self._tls = tls
         self._reloaded = reloaded
         self._reloading = asyncio.Lock()
@@ -101,12 +112,13 @@ class GraspService:
 
     def authorize(self, call: Call, authorization: str | None) -> None:
         """Check the token of a call; raises Unauthenticated or PermissionDenied."""
-        known = self.tokens.check(authorization, admin=call.method == "ReloadModels")
-        if known is not None:
+        admin = call.method == "ReloadModels"
+        if admin or self.tokens.required:
+            known = self.tokens.check(authorization, admin)
             call.token, call.is_admin = known.name, known.is_admin
 
     @asynccontextmanager
-    async def admit(self, call: Call, size: int) -> AsyncIterator[Ticket]:
+    async def admit(self, call: Call, size: int) -> AsyncIterator["Ticket"]:
         """Hold a slot and `size` bytes until the answer is sent or the deadline passes.
 
         Raises:
@@ -123,7 +135,7 @@ class GraspService:
             yield ticket
             call.end_stage("write")
 
-    async def answer(self, call: Call, ticket: Ticket, job: Job) -> Answer:
+    async def answer(self, call: Call, ticket: "Ticket", job: Job) -> Answer:
         """Let a worker answer an admitted request whose body has arrived.
 
         Raises:
@@ -137,22 +149,25 @@ class GraspService:
         self.admission.resize(ticket, call.bytes_in)
         ticket.whole = True
         job = replace(job, request_id=call.request_id)
-        await self._harmful.check(job)
+        if self._deaths:
+            until, deaths = self._deaths.get(await asyncio.to_thread(_digest, job), (0.0, 0))
+            if deaths >= MOST_DEATHS and time.monotonic() < until:
+                raise HarmfulRequest("request", CRASHED, CRASH_FIX)
         worker = await self.pool.take()
         call.end_stage("wait")
         ticket.at_work, began = True, time.monotonic()
         try:
             answer = await worker.run(job, call.deadline)
         except (HarmfulRequest, WorkerLost) as error:
-            await self._harmful.note(job, 1 if isinstance(error, WorkerLost) else MOST_DEATHS)
+            await self._note_deaths(job, 1 if isinstance(error, WorkerLost) else MOST_DEATHS)
             raise
         finally:
             self.admission.took.append(time.monotonic() - began)
             ticket.at_work = False
-        if answer.error is None:
-            await self._harmful.forget(job)
-        elif answer.error.kind == WORKER_LOST:
-            await self._harmful.note(job, 1)
+        if answer.error is not None and answer.error.kind == WORKER_LOST:
+            await self._note_deaths(job, 1)
+        elif answer.error is None and self._deaths:  # its worker had died for another reason
+            self._deaths.pop(await asyncio.to_thread(_digest, job), None)
         call.facts, call.problem = answer.facts, answer.error
         call.stages |= answer.facts.seconds
         call.bytes_out = len(answer.body)
@@ -160,6 +175,14 @@ class GraspService:
         if self.record is not None:
             self.record(job, answer)
         return answer
+
+    async def _note_deaths(self, job: Job, deaths: int) -> None:
+        """Count workers killed by a request; a crash counts more than a kill."""
+        digest, now = await asyncio.to_thread(_digest, job), time.monotonic()
+        until, before = self._deaths.pop(digest, (0.0, 0))
+        self._deaths[digest] = now + HARMFUL_SECONDS, deaths + (before if now < until else 0)
+        if len(self._deaths) > MOST_HARMFUL:
+            del self._deaths[next(iter(self._deaths))]
 
     async def drain(self, grace: float) -> None:
         """Refuse new requests and wait for accepted ones; abandon them after `grace` seconds."""
@@ -177,14 +200,16 @@ class GraspService:
 
     def reload_soon(self) -> None:
         """Start a reload in the running event loop; the log has its outcome."""
-        task = asyncio.get_running_loop().create_task(self.reload())
-        self._tasks.add(task)
-        task.add_done_callback(self._reloaded_soon)
 
-    def _reloaded_soon(self, task: asyncio.Task[Any]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()):
-            logger.warning("SIGHUP: %s", error)
+        async def reload() -> None:
+            try:
+                await self.reload()
+            except EdgeGraspError as error:
+                logger.warning("SIGHUP: %s", error)
+
+        task = asyncio.get_running_loop().create_task(reload())
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     async def reload(self, call: Call | None = None) -> list[dict[str, Any]]:
         """Reload weights, tokens and certificates; the old ones stay in use meanwhile.
@@ -229,33 +254,6 @@ class GraspService:
             raise PayloadTooLarge("body", f"{size} bytes", fix)
 
 
-class HarmfulRequests:
-    """Requests that killed workers, by digest: their expiry and the number of dead workers."""
-
-    def __init__(self) -> None:
-        self._deaths: dict[bytes, tuple[float, int]] = {}
-
-    async def check(self, job: Job) -> None:
-        """Raise HarmfulRequest for a request that must not run again."""
-        if self._deaths:
-            until, deaths = self._deaths.get(await asyncio.to_thread(_digest, job), (0.0, 0))
-            if deaths >= MOST_DEATHS and time.monotonic() < until:
-                raise HarmfulRequest("request", CRASHED, CRASH_FIX)
-
-    async def note(self, job: Job, deaths: int) -> None:
-        """Count workers killed by a request; a crash counts more than a kill."""
-        digest, now = await asyncio.to_thread(_digest, job), time.monotonic()
-        until, before = self._deaths.pop(digest, (0.0, 0))
-        self._deaths[digest] = now + HARMFUL_SECONDS, deaths + (before if now < until else 0)
-        if len(self._deaths) > MOST_HARMFUL:
-            del self._deaths[next(iter(self._deaths))]
-
-    async def forget(self, job: Job) -> None:
-        """Clear a request that was answered, so its worker had died for another reason."""
-        if self._deaths:
-            self._deaths.pop(await asyncio.to_thread(_digest, job), None)
-
-
 def _digest(job: Job) -> bytes:
     """Digest of a request as a worker sees it; run it in a thread, as bodies may be large."""
     kind = f"{job.method}\n{job.transport}\n{job.content_type}\n{job.query}\n"
@@ -263,3 +261,166 @@ def _digest(job: Job) -> bytes:
     for part in job.parts:
         digest.update(part)
     return digest.digest()
+
+
+# Admission
+
+
+@dataclass(eq=False)
+class Ticket:
+    """The slot of one request in the server."""
+
+    client: str
+    timeout: asyncio.Timeout  # that ends it
+    whole: bool = False  # whether its body has arrived
+    at_work: bool = False  # whether a worker has started it
+    bytes: int = 0
+    left: bool = False
+    reason: ServiceError | None = None  # why it was refused
+
+    def refuse(self, reason: ServiceError) -> None:
+        """End the request with an error, at any stage."""
+        self.reason = reason
+        if not self.timeout.expired():
+            self.timeout.reschedule(asyncio.get_running_loop().time())
+
+
+class Admission:
+    """Limits the requests and bytes in the server; used in the event loop only.
+
+    A single client may use all slots and half of the bytes. When the server is full, the client
+    that holds the most loses a request to a client that would still hold fewer.
+
+    Args:
+        workers: Requests worked on at a time.
+        max_waiting: Requests in the server beside those.
+        max_bytes: Of bodies held; a client holds at most half of them.
+    """
+
+    def __init__(self, workers: int, max_waiting: int, max_bytes: int) -> None:
+        self.held_bytes = 0
+        self._workers = workers
+        self._max_tickets = workers + max_waiting
+        self._max_bytes = max_bytes
+        self._tickets: list[Ticket] = []  # in the order they came
+        self._client_bytes: Counter[str] = Counter()
+        self._freed = asyncio.Event()  # set when bytes are freed
+        self.took: deque[float] = deque(maxlen=LATEST)  # seconds of the latest jobs of workers
+        self._empty = asyncio.Event()
+        self._empty.set()
+
+    @property
+    def tickets(self) -> int:
+        """Requests in the server."""
+        return len(self._tickets)
+
+    @asynccontextmanager
+    async def admit(self, client: str, deadline: float, size: int) -> AsyncIterator[Ticket]:
+        """Hold a place in the server for a client: its token's name, or else its address.
+
+        The body of the context is cancelled at the deadline, on the event loop's clock. Waits until
+        there is room for `size`, the most bytes of the body.
+
+        Raises:
+            Overloaded: There is no place, or its turn would come after its deadline.
+            DeadlineExceeded: The deadline passed inside.
+        """
+        remaining = deadline - asyncio.get_running_loop().time()
+        if remaining <= 0.0:
+            raise DeadlineExceeded()
+        wait = self._wait
+        if self._tickets and wait * MARGIN > remaining:
+            raise self._full(
+                f"{len(self._tickets)} requests come first, which take about {wait:.3g} s, and "
+                f"the deadline is {remaining:.3g} s away"
+            )
+        if len(self._tickets) >= self._max_tickets:
+            counts = Counter(ticket.client for ticket in self._tickets)
+            holder, count = counts.most_common(1)[0]
+            if count <= counts[client] + 1 or not self._give_up(holder):
+                raise self._full(f"it holds {len(self._tickets)} requests")
+        ticket = Ticket(client, asyncio.timeout_at(deadline))
+        self._tickets.append(ticket)
+        self._empty.clear()
+        try:
+            async with ticket.timeout:
+                await self._reserve(ticket, size)
+                yield ticket
+        except TimeoutError:
+            if not ticket.timeout.expired():
+                raise
+            raise ticket.reason or DeadlineExceeded() from None
+        finally:
+            self._leave(ticket)
+
+    def _give_up(self, holder: str) -> bool:
+        """Refuse the latest request of a client that is not being worked on; false without one."""
+        for ticket in reversed(self._tickets):
+            if ticket.client == holder and not ticket.at_work:
+                held = sum(one.client == holder for one in self._tickets)
+                why = f"this client holds {held} of {self._max_tickets} places, and others wait"
+                ticket.refuse(self._full(why))
+                self._leave(ticket)
+                return True
+        return False
+
+    def resize(self, ticket: Ticket, size: int) -> None:
+        """Set the number of bytes that a request holds."""
+        if not ticket.left:
+            self.held_bytes += size - ticket.bytes
+            self._client_bytes[ticket.client] += size - ticket.bytes
+            ticket.bytes = size
+            self._freed.set()
+
+    def hold(self, size: int) -> bool:
+        """Reserve bytes outside of requests, or free them (negative); returns whether they fit."""
+        if size > 0 and self.held_bytes + size > self._max_bytes:
+            return False
+        self.held_bytes += size
+        self._freed.set()
+        return True
+
+    def refuse_all(self, reason: ServiceError) -> None:
+        """End every request with an error."""
+        for ticket in self._tickets:
+            ticket.refuse(reason)
+
+    async def empty(self) -> None:
+        """Return once no request is in the server."""
+        await self._empty.wait()
+
+    @property
+    def _wait(self) -> float:
+        """Estimated seconds until a worker begins a new request."""
+        pace = statistics.median(self.took) if self.took else 0.0
+        ahead = sum(ticket.whole for ticket in self._tickets)  # others' bodies may be late
+        return max(0, ahead + 1 - self._workers) * pace / self._workers
+
+    def _full(self, why: str) -> Overloaded:
+        seconds = max(1, math.ceil(self._wait))  # as the header Retry-After has them
+        return Overloaded(f"The server is busy: {why}. Try again in {seconds} s.", seconds)
+
+    async def _reserve(self, ticket: Ticket, size: int) -> None:
+        """Wait until the limits of all clients and of this client leave room for so many bytes."""
+        while (self.held_bytes and self.held_bytes + size > self._max_bytes) or (
+            self._client_bytes[ticket.client]
+            and self._client_bytes[ticket.client] + size > self._max_bytes // 2
+        ):
+            holder, most = max(self._client_bytes.items(), key=lambda row: row[1], default=("", 0))
+            several = sum(held.client == holder and held.bytes > 0 for held in self._tickets) > 1
+            greedy = several and most > self._client_bytes[ticket.client] + size
+            if not (greedy and self._give_up(holder)):
+                self._freed.clear()
+                await self._freed.wait()
+        self.resize(ticket, size)
+
+    def _leave(self, ticket: Ticket) -> None:
+        if ticket.left:
+            return
+        self.resize(ticket, 0)
+        ticket.left = True
+        self._tickets.remove(ticket)
+        if not self._client_bytes[ticket.client]:
+            del self._client_bytes[ticket.client]
+        if not self._tickets:
+            self._empty.set()
