@@ -67,7 +67,7 @@ MAX_GROWTH = 0.05  # of memory, from the third quarter of the attacks to the las
 ATTACKER = "127.0.0.2"  # fairness is between addresses
 HELD_SECONDS = 8.0  # for which the second attacker holds what it opened
 PAGES, CHECKS, STREAMS = 540, 200, 16  # that it opens
-OF_ONE = 90  # calls of one connection, fewer than the server allows
+CALLS_PER_CONNECTION = 90  # fewer than the server allows
 CHECK, STREAM = "/grpc.health.v1.Health/Check", "/edgegrasp.v1.GraspService/DetectGraspsStream"
 ROOM = ("--max-queue-length", "512", "--max-streams", "64")  # for all of the clients
 
@@ -95,7 +95,7 @@ def main() -> None:
 
 def run(server: Addresses, clients: int, seconds: float, seed: int) -> dict[str, Any]:
     """Run clients beside the attacks and the probe, each a process; returns the figures."""
-    context, works = multiprocessing.get_context("spawn"), (probe, poison, lock_out)
+    context, works = multiprocessing.get_context("spawn"), (probe, poison, hold_connections)
     with context.Manager() as manager, ProcessPoolExecutor(len(works), context) as pool:
         stop = manager.Event()
         list(pool.map(time.sleep, [START_SECONDS] * len(works)))  # until all have started
@@ -147,7 +147,7 @@ class Soak:
 
     def __init__(self, server: Addresses, seed: int) -> None:
         self._server, self._seed = server, seed
-        self._came: Counter[str] = Counter()
+        self._outcomes: Counter[str] = Counter()
         self._wrong: list[dict[str, Any]] = []
         self._memory: list[float] = []
         self._given = 0
@@ -164,9 +164,9 @@ class Soak:
         """The results of the run."""
         return {
             "requests": self._given,
-            "lost": self._given - self._came.total(),
+            "lost": self._given - self._outcomes.total(),
             "wrong": self._wrong[:20],
-            "outcomes": dict(sorted(self._came.items())),
+            "outcomes": dict(sorted(self._outcomes.items())),
             "memory_mb": self._memory,
         }
 
@@ -216,7 +216,7 @@ class Soak:
         await answers.aclose()
 
     def _note(self, way: str, plan: Plan, came: str) -> None:
-        self._came[f"{way} {plan.kind}: {came}"] += 1
+        self._outcomes[f"{way} {plan.kind}: {came}"] += 1
         if came not in EXPECTED[plan.kind]:
             self._wrong.append({**asdict(plan), "transport": way, "outcome": came})
 
@@ -268,7 +268,7 @@ def poisons(number: int) -> dict[str, bytes]:
     }
 
 
-def lock_out(url: str, address: str, stop: Any) -> dict[str, int]:
+def hold_connections(url: str, address: str, stop: Any) -> dict[str, int]:
     """Open pages without reading them and gRPC calls without sending; hold and reopen them."""
     came: Counter[str] = Counter()
     page = b"GET /docs/assets/swagger-ui-bundle.js HTTP/1.1\r\nHost: x\r\n\r\n"
@@ -279,10 +279,10 @@ def lock_out(url: str, address: str, stop: Any) -> dict[str, int]:
                     came["pages"] += bool(stack.enter_context(connect(url)).send(page))
             for number, path in enumerate([CHECK] * CHECKS + [STREAM] * STREAMS):
                 with contextlib.suppress(OSError):
-                    if number % OF_ONE == 0:
+                    if number % CALLS_PER_CONNECTION == 0:
                         connection = stack.enter_context(connect(address))
                         connection.sendall(http2_opening())
-                    connection.sendall(http2_headers(path, 2 * (number % OF_ONE) + 1))
+                    connection.sendall(http2_headers(path, 2 * (number % CALLS_PER_CONNECTION) + 1))
                     came["silent calls"] += 1
             stop.wait(HELD_SECONDS)
     return dict(came)

@@ -15,7 +15,7 @@ from edgegrasp_service.settings import Settings
 
 HEADER = "authorization"
 
-FIX = "Send `authorization: Bearer TOKEN` with a token of this server."
+TOKEN_FIX = "Send `authorization: Bearer TOKEN` with a token of this server."
 ADMIN_FIX = "Send an admin token; where the server has none, send its process SIGHUP instead."
 
 # RFC 6750's characters; fewer than 16 can be guessed.
@@ -53,13 +53,13 @@ class Tokens:
         if admin and not any(token.is_admin for token in self._known.values()):
             raise PermissionDenied(HEADER, "an administrator's call, disabled here", ADMIN_FIX)
         if authorization is None:
-            raise Unauthenticated(HEADER, "nothing", FIX)
+            raise Unauthenticated(HEADER, "nothing", TOKEN_FIX)
         scheme, _, text = authorization.strip().partition(" ")
         if scheme.lower() != "bearer":
-            raise Unauthenticated(HEADER, "another scheme than Bearer", FIX)
+            raise Unauthenticated(HEADER, "another scheme than Bearer", TOKEN_FIX)
         found = self._known.get(_digest(text.strip()))
         if found is None:
-            raise Unauthenticated(HEADER, "a token that this server does not know", FIX)
+            raise Unauthenticated(HEADER, "a token that this server does not know", TOKEN_FIX)
         if admin and not found.is_admin:
             raise PermissionDenied(HEADER, "a token that is good for detection only", ADMIN_FIX)
         return found

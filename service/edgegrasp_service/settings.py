@@ -14,7 +14,7 @@ MIB = 2**20
 UNIX = "unix:"  # prefix of a host that is a folder of sockets
 PREFIX = "EDGEGRASP_"
 CONFIG_VARIABLE = PREFIX + "CONFIG"
-NO_SETTINGS = (CONFIG_VARIABLE, PREFIX + "CLIENT_")  # the latter belong to the client's commands
+NOT_SETTINGS = (CONFIG_VARIABLE, PREFIX + "CLIENT_")  # the latter belong to the client's commands
 LISTS = ("weights", "grippers", "robots", "allowed_hosts")
 
 Port = Annotated[int, Field(ge=0, le=65535)]
@@ -153,31 +153,28 @@ def load_settings(config: Path | None = None, **given: object) -> Settings:
 
 
 def _read_file(path: Path) -> dict[str, Any]:
-    """The settings in a file; its paths are relative to its own folder."""
+    """The settings in a file; paths in it are relative to its folder."""
     if not path.is_file():
         raise InvalidSettings(f"config: got {str(path)!r}. There is no such file.")
     try:
         fields = tomllib.loads(path.read_text("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
         raise InvalidSettings(f"config: {path}: {error}.") from None
-    return {name: _located(name, value, path.absolute().parent) for name, value in fields.items()}
-
-
-def _located(name: str, value: Any, folder: Path) -> Any:
-    if name not in Settings.model_fields or "Path" not in str(
-        Settings.model_fields[name].annotation
-    ):
-        return value
-    if isinstance(value, list):
-        return [folder / part if isinstance(part, str) else part for part in value]
-    return folder / value if isinstance(value, str) else value
+    folder = path.absolute().parent
+    for name, field in Settings.model_fields.items():
+        value = fields.get(name)
+        if "Path" in str(field.annotation) and isinstance(value, str):
+            fields[name] = folder / value
+        elif "Path" in str(field.annotation) and isinstance(value, list):
+            fields[name] = [folder / part if isinstance(part, str) else part for part in value]
+    return fields
 
 
 def _read_environment() -> dict[str, Any]:
     """The settings in EDGEGRASP_* variables, including unknown names; lists are JSON."""
     fields: dict[str, Any] = {}
     for variable, text in os.environ.items():
-        if not text or not variable.startswith(PREFIX) or variable.startswith(NO_SETTINGS):
+        if not text or not variable.startswith(PREFIX) or variable.startswith(NOT_SETTINGS):
             continue
         name = variable.removeprefix(PREFIX).lower()
         try:

@@ -121,12 +121,12 @@ async def test_a_body_larger_than_all_the_bytes_comes_in_alone() -> None:
 
 async def test_a_deadline_that_cannot_be_met_is_refused() -> None:
     inside = Inside(Admission(workers=2, max_waiting=10, max_bytes=100))
-    inside.admission.took.append(4.0)
+    inside.admission.service_seconds.append(4.0)
     for _ in range(3):
         await inside.enter("a")
     assert not (await inside.enter("b", seconds=5.0)).done()  # nobody knows when bodies arrive
     for ticket in inside.tickets[:3]:
-        ticket.whole = True
+        ticket.body_arrived = True
     with pytest.raises(Overloaded, match="4 requests come first, which take about 4 s") as caught:
         await (await inside.enter("a", seconds=5.0))
     assert caught.value.retry_after == 4
@@ -145,7 +145,7 @@ async def test_a_deadline_that_cannot_be_met_is_refused() -> None:
 )
 async def test_a_deadline_that_may_be_met_is_let_in(took, requests, seconds) -> None:
     inside = Inside(Admission(workers=1, max_waiting=10, max_bytes=100))
-    inside.admission.took.extend(took)
+    inside.admission.service_seconds.extend(took)
     for _ in range(requests):
         assert not (await inside.enter("a", seconds=seconds)).done()
     await inside.leave()

@@ -70,7 +70,7 @@ class Place:
     """A slot of `Places`."""
 
     owner: str
-    lose: Callable[[], None]  # called on eviction
+    on_eviction: Callable[[], None]
     idle: bool = True  # can be evicted
     used: float = field(default_factory=time.monotonic)
 
@@ -90,8 +90,8 @@ class Places:
     def __len__(self) -> int:
         return len(self._taken)
 
-    def take(self, owner: str, lose: Callable[[], None]) -> Place:
-        """Take a place until `leave`; `lose` is called on eviction. Raises Overloaded."""
+    def take(self, owner: str, on_eviction: Callable[[], None]) -> Place:
+        """Take a place until `release`, or until it is evicted. Raises Overloaded."""
         if len(self._taken) >= self._most:
             since = time.monotonic() - self._grace
             counts = Counter(one.owner for one in self._taken)
@@ -104,10 +104,10 @@ class Places:
             if not idle:
                 raise Overloaded(f"All {self._most} places are in use. Try again in 1 s.")
             greedy = Counter(place.owner for place in idle).most_common(1)[0][0]
-            lost = next(place for place in idle if place.owner == greedy)
-            self.leave(lost)
-            lost.lose()
-        place = Place(owner, lose)
+            evicted = next(place for place in idle if place.owner == greedy)
+            self.release(evicted)
+            evicted.on_eviction()
+        place = Place(owner, on_eviction)
         self._taken[place] = None
         return place
 
@@ -121,7 +121,7 @@ class Places:
         if place in self._taken:
             self._taken[place] = self._taken.pop(place)
 
-    def leave(self, place: Place) -> None:
+    def release(self, place: Place) -> None:
         """Return a place."""
         self._taken.pop(place, None)
 
@@ -134,14 +134,14 @@ class Places:
         """
         loop = asyncio.get_running_loop()
         try:
-            async with asyncio.timeout(None) as ends:
-                place = self.take(owner, lambda: ends.reschedule(loop.time()))
+            async with asyncio.timeout(None) as eviction:
+                place = self.take(owner, lambda: eviction.reschedule(loop.time()))
                 try:
                     yield place
                 finally:
-                    self.leave(place)
+                    self.release(place)
         except TimeoutError:
-            if not ends.expired():
+            if not eviction.expired():
                 raise
             raise Overloaded("Another client got this place. Try again in 1 s.") from None
 
@@ -181,7 +181,7 @@ async def send(settings: Settings, sending: Awaitable[None], size: int) -> None:
 
 
 class HttpProtocol(HttpToolsProtocol):
-    """Closes connections whose headers or readers are too slow; lets refused clients read why."""
+    """Closes connections whose headers or readers are too slow; refused clients can read why."""
 
     def __init__(self, settings: Settings, places: Places, **arguments: Any) -> None:
         super().__init__(**arguments)
@@ -199,7 +199,7 @@ class HttpProtocol(HttpToolsProtocol):
         """Take a place, and wait for the first headers."""
         super().connection_made(transport)
         transport.max_size = PIECE  # read in one turn of the event loop
-        self.transport = _GentleTransport(transport, self._receiving)  # type: ignore[assignment]
+        self.transport = _LingeringTransport(transport, self._receiving)  # type: ignore[assignment]
         self._await_headers()
         try:
             owner = network_of(self.client[0] if self.client else "")
@@ -273,7 +273,7 @@ class HttpProtocol(HttpToolsProtocol):
         if self._header_timer is not None:
             self._header_timer.cancel()
         self.resume_writing()
-        self._places.leave(self._place)
+        self._places.release(self._place)
         super().connection_lost(exc)
 
     def send_400_response(self, msg: str) -> None:
@@ -316,7 +316,7 @@ class HttpProtocol(HttpToolsProtocol):
             self._refuse(RequestTimeout("headers", value, "Send them at once."))
 
 
-class _GentleTransport:
+class _LingeringTransport:
     """A transport whose `close` leaves the client a few seconds to read its answer.
 
     A socket that is closed while bytes arrive is reset, and the answer may be lost.

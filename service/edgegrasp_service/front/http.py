@@ -50,13 +50,13 @@ logger = logging.getLogger(__name__)
 ASSETS = "/docs/assets"
 PLAYGROUND = "/playground/"
 PLAYGROUND_FILES = Path(__file__).parents[1] / "playground"
-OWN_ONLY = (  # what a page may load, and who may show it
+CONTENT_POLICY = (  # what a page may load, and who may show it
     "default-src 'none'; script-src 'self'{0}; style-src 'self'{0}; img-src 'self' data: blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 # The page that documents the interface has an inline script; it loads nothing from elsewhere.
-POLICIES = {"/docs": OWN_ONLY.format(" 'unsafe-inline'")}
-POLICY = OWN_ONLY.format("")
+POLICIES = {"/docs": CONTENT_POLICY.format(" 'unsafe-inline'")}
+POLICY = CONTENT_POLICY.format("")
 CHALLENGE = 'Bearer realm="edgegrasp"'
 TIMEOUT = "X-Request-Timeout"
 NUMBER = re.compile(r"\d{1,9}(\.\d*)?|\.\d+|\d{1,9}(\.\d*)?[eE][+-]?\d{1,2}", re.ASCII)
@@ -80,7 +80,7 @@ METHODS = {
     "/openapi.json": "Docs",
 }
 # Without a token: probes need none, and the pages hold no secrets.
-OPEN = ("Live", "Ready", "Docs")
+PUBLIC = ("Live", "Ready", "Docs")
 
 # The contract, written by hand as grasp.proto is.
 DOCUMENT = json.loads(Path(grasp_pb2.__file__).with_name("openapi.json").read_text())
@@ -103,17 +103,19 @@ class HttpMiddleware:
         page = path.startswith((f"{ASSETS}/", PLAYGROUND))
         method = METHODS.get(path, "Docs" if page else "other")
         peer = scope["client"][0] if scope["client"] else ""
-        whole = headers.get("content-length", "0") == "0" and "transfer-encoding" not in headers
+        body_complete = (
+            headers.get("content-length", "0") == "0" and "transfer-encoding" not in headers
+        )
         call = Call("http", method, headers.get(REQUEST_ID_HEADER, ""), peer)
         with self._service.observe(call):
 
-            async def receive_noting() -> Message:
-                nonlocal whole
+            async def receive_and_note() -> Message:
+                nonlocal body_complete
                 message = await receive()
-                whole = whole or not message.get("more_body", False)
+                body_complete = body_complete or not message.get("more_body", False)
                 return message
 
-            async def send_named(message: Message) -> None:
+            async def send_with_headers(message: Message) -> None:
                 if message["type"] == "http.response.start":
                     call.code = str(message["status"])
                     extra = [
@@ -122,28 +124,28 @@ class HttpMiddleware:
                         (b"x-content-type-options", b"nosniff"),
                     ]
                     # An answered request whose body is still arriving is not waited for.
-                    if not whole or self._service.stopping.is_set():
+                    if not body_complete or self._service.stopping.is_set():
                         extra.append((b"connection", b"close"))
                     message = {**message, "headers": [*message.get("headers", []), *extra]}
                 await send(message)
 
-            # With an app, routing raises what is not there.
+            # With an app in the scope, the router raises HTTPException for an unknown path.
             scope = {**scope, "app": self, "call": call}
             if scope["method"] == "HEAD":  # the protocol leaves the body out
                 scope["method"] = "GET"
             try:
                 self._check(scope, call, headers)
                 async with self._page(call.client) if method == "Docs" else nullcontext():
-                    await self._app(scope, receive_noting, send_named)
+                    await self._app(scope, receive_and_note, send_with_headers)
             except Exception as error:
                 if not isinstance(error, EdgeGraspError | HTTPException):
                     logger.exception("%s failed", method)
                 if call.code:  # half an answer is sent: the client must see that it is incomplete
                     call.problem, call.code = report(error), ""
                     scope["state"]["abort"]()
-                    await _gone(receive)
+                    await _disconnected(receive)
                 else:
-                    await _error_response(call, scope, error)(scope, receive, send_named)
+                    await _error_response(call, scope, error)(scope, receive, send_with_headers)
 
     @asynccontextmanager
     async def _page(self, client: str) -> AsyncIterator[None]:
@@ -161,27 +163,28 @@ class HttpMiddleware:
         if count > MAX_HEADERS or size > most:
             fix = f"Send at most {MAX_HEADERS}, of {most} bytes."
             raise HeadersTooLarge("headers", f"{count} entries of {size} bytes", fix)
-        if call.method not in ("Live", "Ready"):
-            self._check_host(headers.get("host", ""))
-        if call.method not in OPEN:
+        if call.method not in ("Live", "Ready") and not self._serves(headers.get("host", "")):
+            fix = "Use an address of the server, or name it in the setting allowed_hosts."
+            raise InvalidRequest("Host", brief(headers.get("host", "")), fix)
+        if call.method not in PUBLIC:
             self._service.authorize(call, headers.get("authorization"))
         if (encoding := headers.get("content-encoding", "identity").lower()) != "identity":
             fix = "Send the body as it is; .npz and .pcd files may be compressed inside."
             raise UnsupportedMediaType("Content-Encoding", repr(encoding[:40]), fix)
 
-    def _check_host(self, host: str) -> None:
-        """Refuse host names that a malicious web page may have pointed here (DNS rebinding)."""
+    def _serves(self, host: str) -> bool:
+        """Whether a Host header names this server, not a name that a web page pointed at it."""
         name = re.sub(r":\d*$", "", host).strip("[]").lower()
         allowed = self._service.settings.allowed_hosts
-        if not allowed and (self._service.tokens.required or "." not in name):
-            return  # such names cannot be registered
         if name in allowed or "*" in allowed or name == self._service.settings.host:
-            return
+            return True
+        if allowed:
+            return False
+        if self._service.tokens.required or "." not in name:  # nobody can register such a name
+            return True
         with suppress(ValueError):
-            if not allowed and ipaddress.ip_address(name):
-                return
-        fix = "Use an address of the server, or name it in the setting allowed_hosts."
-        raise InvalidRequest("Host", brief(host), fix)
+            return bool(ipaddress.ip_address(name))
+        return False
 
 
 def create_router(service: GraspService, metrics: Metrics) -> Router:
@@ -272,7 +275,7 @@ class _Work:
         async with service.admit(call, size) as ticket:
             job = await self._read_job(scope, headers, receive)
             answering = asyncio.create_task(service.answer(call, ticket, job))
-            leaving = asyncio.create_task(_gone(receive))
+            leaving = asyncio.create_task(_disconnected(receive))
             try:
                 await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
                 if not answering.done():
@@ -305,7 +308,7 @@ class _Work:
             more = message.get("more_body", False)
         query = scope["query_string"].decode("latin-1")
         content_type = headers.get("content-type", "")
-        return Job(self._method, "http", b"", 0.0, content_type, query, pieces=pieces)
+        return Job(self._method, "http", b"", content_type=content_type, query=query, pieces=pieces)
 
 
 async def _send_slowly(response: Response, send: Send) -> None:
@@ -318,7 +321,7 @@ async def _send_slowly(response: Response, send: Send) -> None:
     await send({"type": "http.response.body"})
 
 
-async def _gone(receive: Receive) -> None:
+async def _disconnected(receive: Receive) -> None:
     """Wait until the client has disconnected."""
     while (await receive())["type"] != "http.disconnect":
         pass

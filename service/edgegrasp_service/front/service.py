@@ -147,7 +147,7 @@ class GraspService:
         call.bytes_in = job.size
         self.check_size(call.bytes_in)
         self.admission.resize(ticket, call.bytes_in)
-        ticket.whole = True
+        ticket.body_arrived = True
         job = replace(job, request_id=call.request_id)
         if self._deaths:
             until, deaths = self._deaths.get(await asyncio.to_thread(_digest, job), (0.0, 0))
@@ -162,7 +162,7 @@ class GraspService:
             await self._note_deaths(job, 1 if isinstance(error, WorkerLost) else MOST_DEATHS)
             raise
         finally:
-            self.admission.took.append(time.monotonic() - began)
+            self.admission.service_seconds.append(time.monotonic() - began)
             ticket.at_work = False
         if answer.error is not None and answer.error.kind == WORKER_LOST:
             await self._note_deaths(job, 1)
@@ -272,10 +272,10 @@ class Ticket:
 
     client: str
     timeout: asyncio.Timeout  # that ends it
-    whole: bool = False  # whether its body has arrived
+    body_arrived: bool = False
     at_work: bool = False  # whether a worker has started it
     bytes: int = 0
-    left: bool = False
+    released: bool = False
     reason: ServiceError | None = None  # why it was refused
 
     def refuse(self, reason: ServiceError) -> None:
@@ -305,7 +305,7 @@ class Admission:
         self._tickets: list[Ticket] = []  # in the order they came
         self._client_bytes: Counter[str] = Counter()
         self._freed = asyncio.Event()  # set when bytes are freed
-        self.took: deque[float] = deque(maxlen=LATEST)  # seconds of the latest jobs of workers
+        self.service_seconds: deque[float] = deque(maxlen=LATEST)  # of workers' latest jobs
         self._empty = asyncio.Event()
         self._empty.set()
 
@@ -328,17 +328,17 @@ class Admission:
         remaining = deadline - asyncio.get_running_loop().time()
         if remaining <= 0.0:
             raise DeadlineExceeded()
-        wait = self._wait
+        wait = self._estimated_wait
         if self._tickets and wait * MARGIN > remaining:
-            raise self._full(
+            raise self._overloaded(
                 f"{len(self._tickets)} requests come first, which take about {wait:.3g} s, and "
                 f"the deadline is {remaining:.3g} s away"
             )
         if len(self._tickets) >= self._max_tickets:
             counts = Counter(ticket.client for ticket in self._tickets)
             holder, count = counts.most_common(1)[0]
-            if count <= counts[client] + 1 or not self._give_up(holder):
-                raise self._full(f"it holds {len(self._tickets)} requests")
+            if count <= counts[client] + 1 or not self._refuse_latest(holder):
+                raise self._overloaded(f"it holds {len(self._tickets)} requests")
         ticket = Ticket(client, asyncio.timeout_at(deadline))
         self._tickets.append(ticket)
         self._empty.clear()
@@ -351,22 +351,22 @@ class Admission:
                 raise
             raise ticket.reason or DeadlineExceeded() from None
         finally:
-            self._leave(ticket)
+            self._release(ticket)
 
-    def _give_up(self, holder: str) -> bool:
+    def _refuse_latest(self, holder: str) -> bool:
         """Refuse the latest request of a client that is not being worked on; false without one."""
         for ticket in reversed(self._tickets):
             if ticket.client == holder and not ticket.at_work:
                 held = sum(one.client == holder for one in self._tickets)
                 why = f"this client holds {held} of {self._max_tickets} places, and others wait"
-                ticket.refuse(self._full(why))
-                self._leave(ticket)
+                ticket.refuse(self._overloaded(why))
+                self._release(ticket)
                 return True
         return False
 
     def resize(self, ticket: Ticket, size: int) -> None:
         """Set the number of bytes that a request holds."""
-        if not ticket.left:
+        if not ticket.released:
             self.held_bytes += size - ticket.bytes
             self._client_bytes[ticket.client] += size - ticket.bytes
             ticket.bytes = size
@@ -390,14 +390,14 @@ class Admission:
         await self._empty.wait()
 
     @property
-    def _wait(self) -> float:
+    def _estimated_wait(self) -> float:
         """Estimated seconds until a worker begins a new request."""
-        pace = statistics.median(self.took) if self.took else 0.0
-        ahead = sum(ticket.whole for ticket in self._tickets)  # others' bodies may be late
+        pace = statistics.median(self.service_seconds) if self.service_seconds else 0.0
+        ahead = sum(ticket.body_arrived for ticket in self._tickets)  # others' bodies may be late
         return max(0, ahead + 1 - self._workers) * pace / self._workers
 
-    def _full(self, why: str) -> Overloaded:
-        seconds = max(1, math.ceil(self._wait))  # as the header Retry-After has them
+    def _overloaded(self, why: str) -> Overloaded:
+        seconds = max(1, math.ceil(self._estimated_wait))  # as the header Retry-After has them
         return Overloaded(f"The server is busy: {why}. Try again in {seconds} s.", seconds)
 
     async def _reserve(self, ticket: Ticket, size: int) -> None:
@@ -409,16 +409,16 @@ class Admission:
             holder, most = max(self._client_bytes.items(), key=lambda row: row[1], default=("", 0))
             several = sum(held.client == holder and held.bytes > 0 for held in self._tickets) > 1
             greedy = several and most > self._client_bytes[ticket.client] + size
-            if not (greedy and self._give_up(holder)):
+            if not (greedy and self._refuse_latest(holder)):
                 self._freed.clear()
                 await self._freed.wait()
         self.resize(ticket, size)
 
-    def _leave(self, ticket: Ticket) -> None:
-        if ticket.left:
+    def _release(self, ticket: Ticket) -> None:
+        if ticket.released:
             return
         self.resize(ticket, 0)
-        ticket.left = True
+        ticket.released = True
         self._tickets.remove(ticket)
         if not self._client_bytes[ticket.client]:
             del self._client_bytes[ticket.client]

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 # Memory for reading a request: numbers take about 12 times as much in Python as in JSON.
 DECODE_BYTES, DECODE_FACTOR = 512 * 2**20, 24
 ENCODINGS: dict[Transport, Any] = {"http": http_bodies, "grpc": messages}
-TO_ENCODE = 0.1  # share of a request's time that is kept for writing its answer
+ENCODE_SHARE = 0.1  # share of a request's time that is kept for writing its answer
 
 
 def load_catalogue(settings: Settings) -> "ModelCatalogue":
@@ -151,7 +151,7 @@ class _Work:
         with self._stage("finish"):
             detection: Detection = detector.finish(prepared, logits)
         if robot is not None:
-            until = self.deadline - TO_ENCODE * self.job.remaining
+            until = self.deadline - ENCODE_SHARE * self.job.remaining
             with self._stage("arm"):
                 detection = plan_picks(detection, prepared.scene, cloud.points, asked, robot, until)
         return detection

@@ -164,10 +164,6 @@ def _coordinates(message: Message) -> list[float]:
     return [getattr(message, field.name) for field in message.DESCRIPTOR.fields]
 
 
-def _corners(message: grasp_pb2.HandBox) -> list[list[float]]:
-    return [_coordinates(message.min), _coordinates(message.max)]
-
-
 def _gripper(message: grasp_pb2.GripperChoice) -> Any:
     which = message.WhichOneof("choice")
     return None if which is None else _plain(getattr(message, which))
@@ -183,9 +179,9 @@ def _support(message: grasp_pb2.Support) -> dict[str, Any] | None:
     fields = _plain_fields(message)
     if fields.pop("disabled"):
         return None
-    kinds = {kind: fields.pop(kind) for kind in ("ransac", "auto") if kind in fields}
-    for kind, more in kinds.items():
-        fields |= {"kind": kind} | more
+    for kind in ("ransac", "auto"):
+        if kind in fields:
+            fields |= {"kind": kind} | fields.pop(kind)
     return fields
 
 
@@ -200,7 +196,7 @@ _FORMS: dict[type[Message], Callable[[Any], Any]] = {
     grasp_pb2.Pixel: _coordinates,
     grasp_pb2.Vector: _coordinates,
     grasp_pb2.Quaternion: _coordinates,
-    grasp_pb2.HandBox: _corners,
+    grasp_pb2.HandBox: lambda box: [_coordinates(box.min), _coordinates(box.max)],
     grasp_pb2.GripperChoice: _gripper,
     grasp_pb2.Shape: _tagged,
     grasp_pb2.Obstacle: _tagged,

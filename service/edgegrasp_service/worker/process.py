@@ -34,7 +34,7 @@ LOST = "The worker of this request died or ran out of memory. Try again, or send
 HEADER = struct.Struct(">QQ")  # bytes of a message's JSON, and of the body that follows it
 PIECE = 2**16  # bytes of a body that the front reads or writes at a time
 
-Method = Literal["DetectGrasps", "ScoreGrasps", "RecordOutcome", "Beat"]  # Beat: nothing
+Method = Literal["DetectGrasps", "ScoreGrasps", "RecordOutcome", "Beat"]  # Beat: is it alive?
 Transport = Literal["http", "grpc"]
 
 
