@@ -155,7 +155,7 @@ def test_loss_falls_with_a_teacher_who_is_named_in_card_and_checkpoint(
 
 
 def test_a_teacher_alone_labels_views_in_which_no_grasp_was_tried(
-    make_trainer, made_up_view, teacher: Teacher, tmp_path: Path
+    make_trainer, teacher: Teacher, tmp_path: Path
 ) -> None:
     for number in range(8):
         view = made_up_view(number)

@@ -304,10 +304,8 @@ class Admission:
         self._max_bytes = max_bytes
         self._tickets: list[Ticket] = []  # in the order they came
         self._client_bytes: Counter[str] = Counter()
-        self._freed = asyncio.Event()  # set when bytes are freed
+        self._freed = asyncio.Event()  # set when a request frees bytes or its place
         self.service_seconds: deque[float] = deque(maxlen=LATEST)  # of workers' latest jobs
-        self._empty = asyncio.Event()
-        self._empty.set()
 
     @property
     def tickets(self) -> int:
@@ -341,7 +339,6 @@ class Admission:
                 raise self._overloaded(f"it holds {len(self._tickets)} requests")
         ticket = Ticket(client, asyncio.timeout_at(deadline))
         self._tickets.append(ticket)
-        self._empty.clear()
         try:
             async with ticket.timeout:
                 await self._reserve(ticket, size)
@@ -387,7 +384,9 @@ class Admission:
 
     async def empty(self) -> None:
         """Return once no request is in the server."""
-        await self._empty.wait()
+        while self._tickets:
+            self._freed.clear()
+            await self._freed.wait()
 
     @property
     def _estimated_wait(self) -> float:
@@ -422,5 +421,3 @@ class Admission:
         self._tickets.remove(ticket)
         if not self._client_bytes[ticket.client]:
             del self._client_bytes[ticket.client]
-        if not self._tickets:
-            self._empty.set()
