@@ -75,11 +75,10 @@ def select(
     T_cloud_tcp = hands @ gripper.T_hand_tcp
     clearance = clearances(scene, hands, gripper) if options.order == "clearance" else None
     free = sample.collision_free | (options.collision.mode == "ignore")
+    amiss = None
     if options.order == "score":
-        worth = preferred(scene, sample, free, rating, gripper)
-        order = np.argsort(-worth, kind="stable").astype(np.int64)
-    else:
-        order = ranked(rating, free, options.order, T_cloud_tcp[:, :3, 3] @ UP, clearance)
+        amiss = drawbacks(scene, sample.candidates.contact_index, T_cloud_tcp)
+    order = ranked(rating, free, options.order, T_cloud_tcp[:, :3, 3] @ UP, clearance, amiss)
 
     outcome = np.full(len(score), CODE[Outcome.BEYOND_TOP_K])
     good = score[order] >= options.min_score
@@ -96,20 +95,6 @@ def select(
     outcome[dropped], outcome[order] = CODE[Outcome.SUPPRESSED], CODE[Outcome.RETURNED]
     counts["suppressed"], counts["returned"] = len(dropped), len(order)
     return order, outcome
-
-
-def preferred(
-    scene: Scene, sample: Sample, free: Bools, rating: Floats, gripper: Gripper
-) -> Floats:
-    """What ratings (E,) are worth, where noise would else decide among equal ones.
-
-    Those near the best count as equal; drawbacks, and not to be `free` (E,), make less of them.
-    """
-    T_cloud_tcp = sample.candidates.T_cloud_hand @ gripper.T_hand_tcp
-    worth: Floats = np.where(free, rating, COLLIDING * rating)
-    amiss = drawbacks(scene, sample.candidates.contact_index, T_cloud_tcp)
-    worth = np.minimum(worth, (1.0 - EQUAL) * worth.max()) * np.exp(-DRAWBACK * amiss)
-    return worth
 
 
 def drawbacks(scene: Scene, contact_index: Int64, T_cloud_tcp: Float32) -> Floats:
@@ -153,9 +138,13 @@ def ranked(
     order: Literal["score", "highest", "clearance"] = "score",
     height: Floats | None = None,  # (E,) of the TCP along up, for `highest`
     clearance: Floats | None = None,  # (E,) for `clearance`
+    # (E,) `drawbacks`, for `score`: noise would else decide among scores near the best
+    amiss: Floats | None = None,
 ) -> Int64:
     """Rows best first: by `order`, and then by score."""
     worth = np.where(collision_free, score, COLLIDING * score)
+    if amiss is not None:
+        worth = np.minimum(worth, (1.0 - EQUAL) * worth.max()) * np.exp(-DRAWBACK * amiss)
     keys: tuple[Array, ...] = (-worth,)
     if order == "highest" and height is not None:
         sure = worth >= SURE_SCORE

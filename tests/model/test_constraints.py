@@ -23,7 +23,7 @@ CASES = 75  # for each seed
 ROWS = 1500  # of the cloud
 TOLERANCE = 2e-5  # metres, of float32 poses half a metre from the origin
 VOXEL_DIAGONAL = 0.0045 * math.sqrt(3)
-CLOSE = 0.15  # scores among which how the hand lies decides
+CLOSE = 0.05  # scores among which how the hand lies decides
 STEPS = 7
 
 
