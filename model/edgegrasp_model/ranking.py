@@ -29,9 +29,7 @@ GOOD_SCORE = 0.5  # score from which an object has a good grasp
 SURE_SCORE = 0.9  # score from which the order `highest` goes by height (the paper's robot policy)
 HIDDEN = 0.004  # metres of unseen space into which an object may extend
 FLAT = 0.012  # metres of visible height below which the support may block grasps
-EQUAL = 0.01  # share of a rating by which others may be below the best and count as equal
-DRAWBACK, FAR = 0.02, 0.1  # share of a rating; metres from an object's middle, or from the nearest
-TWIST = 0.07  # radians off across the line of sight, which makes its two sides unequal
+DRAWBACK, FAR = 0.01, 0.1  # of a rating; metres from an object's middle
 # Hands that are judged together: metres and radians apart; weight of a hand's own logit; factor
 # that calibrates the average.
 ALIKE, ALIKE_ANGLE, OWN, SHARPER = 0.03, math.radians(30), 0.3, 1.3
@@ -75,10 +73,10 @@ def select(
     T_cloud_tcp = hands @ gripper.T_hand_tcp
     clearance = clearances(scene, hands, gripper) if options.order == "clearance" else None
     free = sample.collision_free | (options.collision.mode == "ignore")
-    amiss = None
+    preferred = rating
     if options.order == "score":
-        amiss = drawbacks(scene, sample.candidates.contact_index, T_cloud_tcp)
-    order = ranked(rating, free, options.order, T_cloud_tcp[:, :3, 3] @ UP, clearance, amiss)
+        preferred = rating - drawbacks(scene, sample.candidates.contact_index, T_cloud_tcp)
+    order = ranked(preferred, free, options.order, T_cloud_tcp[:, :3, 3] @ UP, clearance)
 
     outcome = np.full(len(score), CODE[Outcome.BEYOND_TOP_K])
     good = score[order] >= options.min_score
@@ -98,29 +96,20 @@ def select(
 
 
 def drawbacks(scene: Scene, contact_index: Int64, T_cloud_tcp: Float32) -> Floats:
-    """The sum of what is amiss with hands (E,), of which noise changes each little.
+    """What is taken off ratings (E,), of which noise would else decide among equal ones.
 
-    A hand should be vertical, near the middle of its object as seen from above, and close level,
-    where the object is narrow and across the line of sight, where both sides are seen. Its object
-    should be near the camera, and so hidden by no other.
+    A hand should be vertical, near the middle of its object as seen from above, and close level and
+    across the line of sight, where both sides are seen; its object should be large.
     """
-    points = scene.cloud.points.astype(np.float64)
     _, row, size = np.unique(scene.object_of_point, return_inverse=True, return_counts=True)
-    middle = np.stack([np.bincount(row, axis) / size for axis in points.T], axis=1)
+    x, y = (np.bincount(row, plan) / size for plan in scene.cloud.points.T[:2])
     mine = row[contact_index]
-    x, y = (points - middle[row])[:, :2].T
-    xx, xy, yy = (np.bincount(row, each)[mine] for each in (x * x, x * y, y * y))
-    off = np.linalg.norm(T_cloud_tcp[:, :2, 3] - middle[mine, :2], axis=1) / FAR
+    apart = np.hypot(T_cloud_tcp[:, 0, 3] - x[mine], T_cloud_tcp[:, 1, 3] - y[mine])
     lean = np.hypot(T_cloud_tcp[:, 0, 2], T_cloud_tcp[:, 1, 2])
-    tilt = np.abs(T_cloud_tcp[:, 2, 1])
-    a, b = T_cloud_tcp[:, :2, 1].T / np.maximum(np.hypot(*T_cloud_tcp[:, :2, 1].T), 1e-6)
-    along = np.abs(math.cos(TWIST) * a + math.sin(TWIST) * b)  # x points to the camera
-    wide = (a * a * xx + 2 * a * b * xy + b * b * yy) / np.maximum(xx + yy, 1e-9)
-    away = np.zeros(len(middle))
-    if scene.viewpoints is not None:
-        away = np.linalg.norm(middle - scene.viewpoints[0], axis=1)
-    total: Floats = off + lean + tilt + along + wide + (away - away[mine].min())[mine] / FAR
-    return total
+    along, _, tilt = np.abs(T_cloud_tcp[:, :3, 1].T)  # x points to the camera
+    small = np.log(size[mine].max(initial=1) / size[mine]) / 3
+    taken: Floats = DRAWBACK * (np.minimum(apart / FAR, 1.0) + lean + along + tilt + small)
+    return taken
 
 
 def objects_first(order: Int64, score: Floats, number: Int64) -> Int64:
@@ -138,13 +127,9 @@ def ranked(
     order: Literal["score", "highest", "clearance"] = "score",
     height: Floats | None = None,  # (E,) of the TCP along up, for `highest`
     clearance: Floats | None = None,  # (E,) for `clearance`
-    # (E,) `drawbacks`, for `score`: noise would else decide among scores near the best
-    amiss: Floats | None = None,
 ) -> Int64:
     """Rows best first: by `order`, and then by score."""
     worth = np.where(collision_free, score, COLLIDING * score)
-    if amiss is not None:
-        worth = np.minimum(worth, (1.0 - EQUAL) * worth.max()) * np.exp(-DRAWBACK * amiss)
     keys: tuple[Array, ...] = (-worth,)
     if order == "highest" and height is not None:
         sure = worth >= SURE_SCORE
