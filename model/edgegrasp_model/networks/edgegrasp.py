@@ -4,13 +4,10 @@ Huang, Wang, Zhu, Walters, Platt: "Edge Grasp Network: A Graph-Based SE(3)-invar
 Grasp Detection", ICRA 2023, section IV. Widths below are the paper's; P points, B balls, E grasps.
 """
 
-import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from edgegrasp_camera.arrays import Float32, Int64
-from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.layers import (
@@ -22,7 +19,6 @@ from edgegrasp_model.networks.layers import (
     SharedProduct,
     ball_chunks,
     by_chunks,
-    float32_inference,
     gather_rows,
     in_chunks,
     maximum,
@@ -80,9 +76,6 @@ class PointNetConv(nn.Module):
         u = torch.cat((features, batch.points), dim=1)
         u = by_chunks(PackedLinear(weight, self.hidden.bias), u)  # (P, width)
         # The bias is the same for all neighbours: added once, after the maximum.
-        if float32_inference(u):
-            offset = weight[:, -3:].t().contiguous()  # (3, width)
-            return _convolved(u, offset, output, batch).add_(self.output.bias)
         here, pooled = batch.points @ weight[:, -3:].t(), []  # (P, width)
         for neighbors, own in in_chunks(CONVOLVED, batch.neighbors, here):
             hidden = gather_rows(u, neighbors).sub_(own.unsqueeze(1)).relu_()  # (p, k, width)
@@ -112,35 +105,3 @@ class GlobalFeature(nn.Module):
             joined = join(chunk.values, chunk.ball_of_point).relu_()  # (p, 1024)
             maximum_2.add(mlp_2(joined), chunk)
         return maximum_2.result()
-
-
-def _convolved(u: Tensor, offset: Tensor, output: PackedLinear, batch: BallBatch) -> Tensor:
-    """The maximum (P, width) of the messages of each point's neighbours, in a reused buffer."""
-    points, neighbors = batch.points.numpy(), batch.neighbors.numpy()
-    (count, k), width = neighbors.shape, u.shape[1]
-    hidden = torch.zeros(CONVOLVED * k, width)
-    pooled = torch.empty(count, width)
-    for first in range(0, count, CONVOLVED):
-        part = slice(first, min(first + CONVOLVED, count))
-        _gathered_relu(u.numpy(), points[part], offset.numpy(), neighbors[part], hidden.numpy())
-        messages = output(hidden).view(CONVOLVED, k, width)[: part.stop - part.start]
-        torch.amax(messages, dim=1, out=pooled[part])
-    return pooled
-
-
-@compiled("contract", "nsz")
-def _gathered_relu(
-    u: Float32, points: Float32, offset: Float32, neighbors: Int64, result: Float32
-) -> None:
-    """ReLU of u_j - V p_i for the neighbours (p, k) of each of p points."""
-    width, k = result.shape[1], neighbors.shape[1]
-    zero = np.float32(0.0)
-    here = np.empty(width, np.float32)
-    for i in range(len(neighbors)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        for c in range(width):
-            here[c] = x * offset[0, c] + y * offset[1, c] + z * offset[2, c]
-        for j in range(k):
-            there, row = u[neighbors[i, j]], result[i * k + j]
-            for c in range(width):
-                row[c] = max(there[c] - here[c], zero)
