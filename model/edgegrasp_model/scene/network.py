@@ -111,11 +111,11 @@ def scene_features(
 ) -> Float32:
     """The network's input (CHANNELS, H, W) for a range image; zero where there is no reading."""
     known = np.zeros(3) if up is None else np.asarray(up, dtype=np.float64)
-    features = np.zeros((CHANNELS, *points.shape[:2]), dtype=np.float32)
+    features = np.zeros((*points.shape[:2], CHANNELS), dtype=np.float32)
     _fill_features(
         np.ascontiguousarray(points), known, up is not None, np.log(footprint) + 6.0, features
     )
-    return features
+    return features.transpose(2, 0, 1)  # channels last in memory, as the network reads them
 
 
 @compiled("contract")
@@ -136,16 +136,16 @@ def _fill_features(points: Float32, up: Float64, known: bool, offset: float, out
             if np.isnan(z):
                 continue
             z = max(z, 0.05)
-            out[0, i, j] = min(max(2.0 * (z - middle[2]), -3.0), 3.0)
-            out[1, i, j] = np.log(z)
-            out[2, i, j] = np.log(z) + offset
-            out[3, i, j] = x / z
-            out[4, i, j] = y / z
+            out[i, j, 0] = min(max(2.0 * (z - middle[2]), -3.0), 3.0)
+            out[i, j, 1] = log = np.log(z)
+            out[i, j, 2] = log + offset
+            out[i, j, 3] = x / z
+            out[i, j, 4] = y / z
             if known:
                 level = up[0] * (x - middle[0]) + up[1] * (y - middle[1]) + up[2] * (z - middle[2])
-                out[8, i, j] = min(max(2.0 * level, -3.0), 3.0)
-                out[10, i, j] = 1.0
-            out[11, i, j] = 1.0
+                out[i, j, 8] = min(max(2.0 * level, -3.0), 3.0)
+                out[i, j, 10] = 1.0
+            out[i, j, 11] = 1.0
             if i < s or j < s or i >= height - s or j >= width - s:
                 continue
             ax = points[i + s, j, 0] - points[i - s, j, 0]
@@ -157,6 +157,6 @@ def _fill_features(points: Float32, up: Float64, known: bool, offset: float, out
             nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
             length = np.sqrt(nx * nx + ny * ny + nz * nz)
             if length > 0.0:  # false for NaN as well
-                out[5, i, j], out[6, i, j], out[7, i, j] = nx / length, ny / length, nz / length
+                out[i, j, 5], out[i, j, 6], out[i, j, 7] = nx / length, ny / length, nz / length
                 if known:
-                    out[9, i, j] = (up[0] * nx + up[1] * ny + up[2] * nz) / length
+                    out[i, j, 9] = (up[0] * nx + up[1] * ny + up[2] * nz) / length

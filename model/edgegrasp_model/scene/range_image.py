@@ -15,7 +15,7 @@ COVERED = 0.5  # percent of the points that may lie beyond each side of the imag
 COARSE = 40  # cells across the view in which the density of points is measured
 SPACING = 1.25  # pixels between neighbouring points, so that few pixels stay empty
 COARSEST = 0.003  # metres, of a pixel at the median depth; those of sparser clouds are divided
-DENSE = 3  # points per pixel; more add nothing
+DENSE = 2  # points per pixel; more add nothing
 SURFACE = 0.02  # metres; a point nearer by this much hides another of the same pixel
 
 
@@ -125,30 +125,38 @@ def _render(
 ) -> None:
     """For each pixel, take the nearest surface's point that is closest to the pixel's centre."""
     height, width, _ = image.shape
-    nearest = np.full((height, width), np.inf, dtype=np.float32)
-    best = np.full((height, width), np.inf, dtype=np.float32)
-    for choosing in (False, True):
-        for n in range(len(points)):
-            a = points[n, 0] - viewpoint[0]
-            b = points[n, 1] - viewpoint[1]
-            c = points[n, 2] - viewpoint[2]
-            z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c
-            if z < NEAREST:
-                continue
-            x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c
-            y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c
-            u = (x / z - corner[0]) / pixel_size
-            v = (y / z - corner[1]) / pixel_size
-            if u < 0 or v < 0 or u >= width or v >= height:
-                continue
-            i, j = int(v), int(u)
-            if not choosing:
-                nearest[i, j] = min(nearest[i, j], z)
-                continue
-            off = (u - j - 0.5) ** 2 + (v - i - 0.5) ** 2
-            if z < nearest[i, j] + SURFACE and off < best[i, j]:
-                image[i, j, 0], image[i, j, 1], image[i, j, 2] = x, y, z
-                best[i, j] = off
+    pixels = image.reshape(-1, 3)
+    nearest, best = np.full((2, len(pixels)), np.inf, dtype=np.float32)
+    pixel = np.full(len(points), -1, dtype=np.int32)
+    depth, off = np.empty((2, len(points)), dtype=np.float32)
+    for n in range(len(points)):
+        x, y, z = _in_view(points[n], viewpoint, turn)
+        if z < NEAREST:
+            continue
+        u = (x / z - corner[0]) / pixel_size
+        v = (y / z - corner[1]) / pixel_size
+        if u < 0 or v < 0 or u >= width or v >= height:
+            continue
+        i, j = int(v), int(u)
+        pixel[n] = p = i * width + j
+        depth[n], off[n] = z, (u - j - 0.5) ** 2 + (v - i - 0.5) ** 2
+        nearest[p] = min(nearest[p], depth[n])
+    for n in range(len(points)):
+        p = pixel[n]
+        if p >= 0 and depth[n] < nearest[p] + SURFACE and off[n] < best[p]:
+            best[p] = off[n]
+            pixels[p, 0], pixels[p, 1], pixels[p, 2] = _in_view(points[n], viewpoint, turn)
+
+
+@compiled("contract")
+def _in_view(point: Float32, viewpoint: Float64, turn: Float64) -> tuple[float, float, float]:
+    """A point (3,) in the camera's frame."""
+    a, b, c = point[0] - viewpoint[0], point[1] - viewpoint[1], point[2] - viewpoint[2]
+    return (
+        turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c,
+        turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c,
+        turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c,
+    )
 
 
 @compiled("contract")

@@ -143,8 +143,7 @@ def look(
     """A network's output for a range image, and its estimate of up (3,); camera frame."""
     features = scene_features(points, up, footprint)
     with torch.inference_mode(), _one_thread():
-        batch = torch.from_numpy(features)[None].contiguous(memory_format=torch.channels_last)
-        output = network(batch)
+        output = network(torch.from_numpy(features)[None])
         classes = output.classes[0].softmax(dim=0).contiguous().numpy()
         votes = output.votes[0].permute(1, 2, 0).contiguous().numpy()
         links = output.links[0].sigmoid().contiguous().numpy()

@@ -157,7 +157,9 @@ def _fitted(
     on, held = np.flatnonzero(shown.support > 0.5), np.flatnonzero(objects)
     part = Seen(seen.points[on[thinned(len(on))]], seen.viewpoint)
     around = seen.points[held[thinned(len(held), 500)]]
-    weight, up = near_objects(part.points, around), shown.up if up is None else up
+    apart = _nearest(part.points, around)
+    weight = np.where(np.isfinite(apart), 1.0, FAR_WEIGHT)
+    up = shown.up if up is None else up
     plane = fit_plane(part, weight, rng, up)
     if plane is not None and len(held) and np.median(plane.heights(around)) < -MOST_MARGIN:
         # This plane is the top of something larger, and the objects stand below it.
@@ -165,7 +167,7 @@ def _fitted(
         plane = fit_plane(part, weight, rng, up)
     if plane is None:
         return None
-    found = measured(part, _close_to(plane, part.points, around), THICK)
+    found = measured(part, _close_to(plane, part.points[apart < CLOSE]), THICK)
     places = found.frame.points(part.points)
     return found if _area(places[np.abs(places[:, 2]) < MOST_MARGIN]) > LEAST_AREA else None
 
@@ -220,12 +222,11 @@ def _up_of_cut(cloud: Float32, viewpoint: Float64) -> Float64 | None:
     return up
 
 
-def _close_to(plane: SupportPlane, points: Float32, objects: Float32) -> SupportPlane:
-    """The plane of the points (N, 3) close to objects (M, 3): of a bin's floor, not the table's."""
+def _close_to(plane: SupportPlane, points: Float32) -> SupportPlane:
+    """The plane of the points (N, 3) close to objects: of a bin's floor, not the table's."""
     held = np.abs(plane.heights(points)) < MOST_MARGIN
-    held &= near_objects(points, objects, CLOSE) == 1.0
     near, normal, offset = points[held].astype(np.float64), np.array(plane.normal), plane.offset
-    if len(near) < FEWEST or len(objects) == 0:
+    if len(near) < FEWEST:
         return plane
     for within in CLOSER:
         height = near @ normal - offset
@@ -245,12 +246,11 @@ def _least_squares(points: Float64, toward: Float64) -> tuple[Float64, float]:
     return normal, float(normal @ middle)
 
 
-def near_objects(points: Float32, objects: Float32, within: float = NEAR_OBJECTS) -> Float64:
-    """Weight of each point (N, 3) of a support: full near an object (M, 3), small elsewhere."""
+def _nearest(points: Float32, objects: Float32) -> Float64:
+    """Metres (N,) from points (N, 3) to the nearest of objects (M, 3); inf beyond NEAR_OBJECTS."""
     if len(objects) == 0:
-        return np.ones(len(points))
-    apart, _ = cKDTree(objects).query(points, distance_upper_bound=within)
-    return np.where(np.isfinite(apart), 1.0, FAR_WEIGHT)
+        return np.full(len(points), np.inf)
+    return np.asarray(cKDTree(objects).query(points, distance_upper_bound=NEAR_OBJECTS)[0])
 
 
 def by_surface(points: Float32) -> Float64:
