@@ -2,11 +2,12 @@
 
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 from pydantic import BaseModel, Field
 
@@ -14,10 +15,14 @@ from edgegrasp_cli.flags import PlannerFlags, option_flags, parse_option_flags, 
 
 if TYPE_CHECKING:
     from edgegrasp_sim.benchmark import BenchmarkConfig
+    from edgegrasp_sim.engine import ArmModel
+    from edgegrasp_sim.protocol import CameraRules
     from edgegrasp_sim.results import ResultFolder
     from edgegrasp_sim.trial import Round
 
 Option = typer.Option
+FAR = 0.5  # metres from the arm's base to the middle of a scene
+LIFT = {"retreat_length": 0.1, "retreat_direction": "up"}  # metres
 # Options of a detection that are set by the simulation, the protocol or another flag.
 DECIDED = (
     *("model", "gripper", "seed", "viewpoint", "up", "support", "objects", "workspace"),
@@ -113,8 +118,6 @@ def _plan(
     if hand is not None:
         options = options | {"gripper": hand}
     if asked.robot is not None:
-        from edgegrasp_cli.arm import benchmark_arm
-
         arm, hand, fields = benchmark_arm(asked.robot, rules.camera)
         options = fields | options
     config = BenchmarkConfig(
@@ -134,6 +137,46 @@ def _plan(
             "--server, or --planner in-process"
         )
     return config, options
+
+
+def benchmark_arm(
+    name: str, camera: "CameraRules"
+) -> "tuple[ArmModel, dict[str, Any] | None, dict[str, Any]]":
+    """The robot's arm, on the camera's side of a scene as if the camera were on its wrist.
+
+    Returns:
+        The arm, the fields of its hand's file (None: the Panda's), and the options of each request.
+
+    Raises:
+        InvalidRobot: the file cannot be used.
+    """
+    from edgegrasp_robot import load_robot
+    from edgegrasp_sim.engine import ArmModel
+    from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
+
+    robot = load_robot(name)
+    # The base stands on the table, on the camera's side; its x points to the middle of the scene.
+    azimuth = np.deg2rad(sum(camera.azimuth_degrees) / 2)
+    out = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    T_world_base = np.eye(4)
+    T_world_base[:3, 0], T_world_base[:3, 1] = -out, np.cross([0.0, 0.0, 1.0], -out)
+    T_world_base[:3, 3] = np.array([MIDDLE, MIDDLE, TABLE_HEIGHT]) + FAR * out
+    T_root_base = robot.scene.forwardKinematics(robot.home, robot.base_frame)
+    arm = ArmModel(
+        robot.model.arm,
+        T_world_base @ np.linalg.inv(T_root_base),
+        robot.flange_frame,
+        robot.T_flange_hand,
+        robot.joint_names,
+        robot.home,
+    )
+    asked = {
+        "name": robot.name,
+        "T_base_cloud": np.linalg.inv(T_world_base).tolist(),
+        "joints": robot.home.tolist(),
+    }
+    hand = None if robot.gripper.name == "panda" else robot.hand.model_dump()
+    return arm, hand, {"robot": asked, "collision": LIFT}
 
 
 def compare(
@@ -186,18 +229,31 @@ def run_rounds(
 ) -> "tuple[list[Round], dict[str, Any]]":
     """Run the remaining rounds, with a progress bar; returns all, and `run` of the manifest."""
     from rich.console import Console
+    from rich.progress import Progress, TimeElapsedColumn
 
     from edgegrasp_cli.planners import open_planner
     from edgegrasp_sim.benchmark import manifest, run_benchmark
+    from edgegrasp_sim.results import count
 
     # Fails on a wrong folder before a server is started, and prepares meshes once for all workers.
     with Console(stderr=True).status("reading objects"):
         config.object_set()
+    scene, tasks = config.scene.value, config.tasks()
+    came: list[Round] = []
     with open_planner(asked, config.protocol.planning, options) as planner:
         facts = manifest(config, planner.facts)
         if folder is not None:
             folder.open(facts)
-        with _progress(config, folder) as on_round:
+        finished = sum(folder.has(*task) for task in tasks) if folder is not None else 0
+        with Progress(*Progress.get_default_columns(), TimeElapsedColumn()) as progress:
+            bar = progress.add_task(scene, total=len(tasks), completed=finished)
+
+            def on_round(done: "Round") -> None:
+                came.append(done)
+                successes, attempts, objects = count(came).sum(axis=1)
+                text = f"{scene} GSR {successes}/{attempts} DR {successes}/{objects}"
+                progress.update(bar, advance=1, description=text)
+
             done = run_benchmark(
                 config,
                 planner.make,
@@ -207,30 +263,6 @@ def run_rounds(
                 on_round=on_round,
             )
     return done, facts["run"]
-
-
-@contextmanager
-def _progress(
-    config: "BenchmarkConfig", folder: "ResultFolder | None"
-) -> "Iterator[Callable[[Round], None]]":
-    """A progress bar with the time left; yields a function to call after each round."""
-    from rich.progress import Progress, TimeElapsedColumn
-
-    from edgegrasp_sim.results import count
-
-    tasks = config.tasks()
-    finished = sum(folder.has(*task) for task in tasks) if folder is not None else 0
-    came: list[Round] = []
-    with Progress(*Progress.get_default_columns(), TimeElapsedColumn()) as progress:
-        bar = progress.add_task(config.scene.value, total=len(tasks), completed=finished)
-
-        def on_round(done: "Round") -> None:
-            came.append(done)
-            successes, attempts, objects = count(came).sum(axis=1)
-            text = f"{config.scene.value} GSR {successes}/{attempts} DR {successes}/{objects}"
-            progress.update(bar, advance=1, description=text)
-
-        yield on_round
 
 
 def _print_summary(summary: dict[str, Any], planner: str) -> None:

@@ -3,19 +3,17 @@
 import hashlib
 import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-import numpy as np
-from numpy.typing import NDArray
-
 from edgegrasp_cli.detect import OwnDetector
 from edgegrasp_cli.flags import PlannerFlags
 from edgegrasp_client import GraspClientError, Model, ServerUnavailableError, StartCollisionError
+from edgegrasp_client.connection import local_server
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.protocol import PlanningRules
 from edgegrasp_sim.trial import PlannedGrasp, Planner, StartCollides
@@ -59,12 +57,16 @@ def open_planner(
             raise ValueError(f"model is {model}; there is no such file")
         weights, model = [*weights, file], file.stem
     asked = {"model": model, **options}
-    with _server(choice, weights) as address:
-        open_client: Callable[[float], Any] = (
-            partial(_OneThread, weights, choice.robot)
-            if address is None
-            else partial(choice.connect, address)
-        )
+    with ExitStack() as stack:
+        open_client: Callable[[float], Any]
+        if choice.planner == "in-process":
+            open_client = partial(_OneThread, weights, choice.robot)
+        else:
+            flags = [text for path in weights for text in ("--weights", str(path))]
+            if choice.robot is not None:
+                flags += ["--robots", choice.robot]
+            address = choice.server or stack.enter_context(local_server(*flags)).grpc_address
+            open_client = partial(choice.connect, address)
         with closing(open_client(CONNECT_SECONDS)) as client:
             used = model_used(client, model)
         facts: dict[str, Any] = {"name": choice.planner, "options": dict(options)}
@@ -74,21 +76,6 @@ def open_planner(
 
             facts["scene_digest"] = hashlib.sha256(WEIGHTS.read_bytes()).hexdigest()
         yield ChosenPlanner(partial(ClientPlanner, open_client, rules, asked), facts)
-
-
-@contextmanager
-def _server(choice: PlannerFlags, weights: Sequence[Path]) -> Iterator[str | None]:
-    """The address of the server to use, started if none is given; None for this process."""
-    if choice.planner == "in-process" or choice.server:
-        yield choice.server if choice.planner == "server" else None
-        return
-    from edgegrasp_client.connection import local_server
-
-    flags = [text for path in weights for text in ("--weights", str(path))]
-    if choice.robot is not None:
-        flags += ["--robots", choice.robot]
-    with local_server(*flags) as addresses:
-        yield addresses.grpc_address
 
 
 def named_planner(name: str) -> Planner:
@@ -156,17 +143,23 @@ class ClientPlanner:
         if self._client is None:
             self._client = self.open_client(REQUEST_SECONDS)
         options = request_options(observation, seed, self.rules, self.options)
-        ask = partial(
-            self._client.detect, observation.image, view_ids=view_ids(observation), **options
-        )
+        views = observation.view_ids if len(observation.camera_positions) > 1 else None
+        ask = partial(self._client.detect, observation.image, view_ids=views, **options)
         try:
             try:
-                return _best(ask().grasps, options)
+                grasps = ask().grasps
             except ServerUnavailableError:
                 self._client.wait_until_ready(REQUEST_SECONDS)
-                return _best(ask().grasps, options)
+                grasps = ask().grasps
         except (StartCollision, StartCollisionError) as error:
             raise StartCollides(str(error)) from None
+        if not grasps:
+            return None
+        best = grasps[0]  # for an arm, those with a motion are first
+        motion = best.arm.trajectory if best.arm is not None else None
+        if "robot" in options and motion is None:
+            return None
+        return PlannedGrasp(best.T_cloud_hand, best.score, best.width, motion)
 
     def close(self) -> None:
         """Close the connection."""
@@ -213,19 +206,3 @@ def request_options(
     if observation.table != "auto":  # the detector finds them itself
         options |= {"support": support, "workspace": {"min": low, "max": high}}
     return options | dict(extra)
-
-
-def view_ids(observation: Observation) -> NDArray[np.int32] | None:
-    """Which camera saw each point, where there are several."""
-    return observation.view_ids if len(observation.camera_positions) > 1 else None
-
-
-def _best(grasps: Sequence[Any], options: Mapping[str, Any]) -> PlannedGrasp | None:
-    """The first of the sorted grasps; for an arm, the first with a motion."""
-    if not grasps:
-        return None
-    best = grasps[0]
-    motion = best.arm.trajectory if best.arm is not None else None
-    if "robot" in options and motion is None:
-        return None
-    return PlannedGrasp(best.T_cloud_hand, best.score, best.width, motion)

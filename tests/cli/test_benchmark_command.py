@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edgegrasp_cli.benchmark import benchmark_arm
 from edgegrasp_cli.flags import PlannerFlags
 from edgegrasp_cli.planners import named_planner, open_planner, request_options
 from edgegrasp_model.detector import WEIGHTS_FOLDER
@@ -193,9 +194,7 @@ def test_a_model_may_be_a_file_of_weights(tmp_path: Path) -> None:
 
 def test_a_view_in_which_the_arm_touches_the_table_is_told_from_other_errors() -> None:
     pytest.importorskip("roboplan", reason="the extra robot is not installed")
-    from edgegrasp_cli.arm import benchmark_arm
-
-    fields = benchmark_arm("fr3", load_protocol("edgegrasp").camera).options
+    *_, fields = benchmark_arm("fr3", load_protocol("edgegrasp").camera)
     choice, asked = PlannerFlags(planner="in-process", robot="fr3"), LITTLE | fields
     fields["robot"]["T_base_cloud"][2][3] += 0.5  # the table, up to the hand
     with open_planner(choice, PAPER, asked) as made, pytest.raises(StartCollides, match="support"):

@@ -8,7 +8,7 @@ pytest.importorskip("roboplan", reason="the extra robot is not installed")
 
 from tests.robot.arms import picks_of
 
-from edgegrasp_cli.arm import benchmark_arm
+from edgegrasp_cli.benchmark import benchmark_arm
 from edgegrasp_robot import load_robot
 from edgegrasp_sim.arm import ArmGripper
 from edgegrasp_sim.engine import make_world
@@ -27,17 +27,15 @@ class Cell:
 
     def __init__(self, world, name):
         robot = load_robot(name)
-        arm = benchmark_arm(name, load_protocol("edgegrasp").camera)
+        arm, hand, options = benchmark_arm(name, load_protocol("edgegrasp").camera)
         OPEN_TABLE.add_to(world)
-        self.T_world_base = np.linalg.inv(arm.options["robot"]["T_base_cloud"])
+        self.T_world_base = np.linalg.inv(options["robot"]["T_base_cloud"])
         x, y, _ = self.T_world_base[:3, :3] @ AHEAD + self.T_world_base[:3, 3]
         self.cube = load_object(world, CUBE, (x, y, TABLE_HEIGHT + 0.02), (0, 0, 0, 1), 0.8)
         (grasp,) = picks_of(robot, np.eye(4), boxes=(AHEAD,)).grasps
         self.T_world_hand = self.T_world_base @ grasp.T_cloud_hand
         planned = grasp.arm.trajectory
-        self.gripper = ArmGripper(
-            world, panda() if arm.gripper is None else hand_of(arm.gripper), arm.model
-        )
+        self.gripper = ArmGripper(world, panda() if hand is None else hand_of(hand), arm)
         self.gripper.motion = planned
         half_way = robot.hand_pose(planned.positions[planned.pregrasp_row // 2])
         self.on_the_way = (self.T_world_base @ half_way)[:3, 3]
