@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 Option = typer.Option
 # Options that are set by the scene or by this command.
 DECIDED = ("viewpoint", "debug", "robot", "previous")
+SHARES = ("on_object", "from_below", "through_points")  # counts, which are shares of the best
+OVERLAPS = ("overlap_precision", "overlap_recall", "overlap_f")
 PLANE_SQUARE = 0.12  # metres, edge of the square that shows a plane at an object's foot
 LABELLED, FOUND = "#39d353", "#ff4fd8"  # colours of the planes
 ON_SUPPORT, BACKGROUND, NO_READING = (92, 112, 140), (48, 48, 52), (0, 0, 0)  # colours
@@ -64,11 +66,13 @@ def benchmark_real(
             found, refused = _ask(client, scene, fields)
             milliseconds = 1000 * (time.perf_counter() - start)
             grasps = [] if found is None else found.grasps
-            plane, labels = _plane(found), _labels(client, scene, fields, found)
+            seen = None if found is None else found.support
+            plane = None if seen is None else (np.asarray(seen.normal, np.float64), seen.offset)
+            labels = _labels(client, scene, fields, found)
             answer = np.maximum(labels + 1, 0)
-            figures = judge(scene, grasps, plane, answer, gripper, milliseconds)
-            done[scene.name] = replace(figures, refused=refused)
-            title = f"{scene.name}: {_sentence(done[scene.name])}"
+            figures = judge(scene, grasps, plane, answer, gripper, milliseconds, refused)
+            done[scene.name] = figures
+            title = f"{scene.name}: {_sentence(figures)}"
             draw(output / f"{scene.name}.png", scene, grasps[:BEST], plane, title)
             draw_labels(output / f"{scene.name}-labels.png", scene, labels)
     _write(output, model.name, fields, done)
@@ -99,12 +103,6 @@ def _labels(
     return np.full(len(scene.points), UNLABELLED)
 
 
-def _plane(detection: Any | None) -> tuple[Any, float] | None:
-    """Normal (3,) and offset of the support plane that was found, camera frame."""
-    found = None if detection is None else detection.support
-    return None if found is None else (np.asarray(found.normal, dtype=np.float64), found.offset)
-
-
 def _write(
     output: Path, model: str, options: Mapping[str, Any], done: "dict[str, SceneFigures]"
 ) -> None:
@@ -118,7 +116,7 @@ def _write(
     scenes = {name: asdict(figures) for name, figures in done.items()}
     results = {"model": model, "options": dict(options), "all": total, "scenes": scenes}
     (output / "results.json").write_text(json.dumps(results, indent=1) + "\n")
-    tables = [_grasp_table(done, total), _segmentation_table(done, total)]
+    tables = _tables(done, total)
     names = [name + part for name in done for part in ("", "-labels")]
     pictures = (image("png", (output / f"{name}.png").read_bytes(), name) for name in names)
     title = f"{model} in {len(done)} scenes of real cameras"
@@ -151,12 +149,11 @@ def summary(done: "Sequence[SceneFigures]") -> dict[str, Any]:
         "scenes": len(done),
         "refused": sum(bool(figures.refused) for figures in done),
         "best": best,
-        **{name: share(name) for name in ("on_object", "from_below", "through_points")},
+        **{name: share(name) for name in SHARES},
         "objects": sum(figures.objects for figures in apart),
         "objects_with_grasp": sum(figures.objects_with_grasp for figures in apart),
         **{name: mean(name, done) for name in ("pixel_precision", "pixel_recall")},
-        **{f"overlap_{name}": mean(f"overlap_{name}", apart) for name in ("precision", "recall")},
-        "overlap_f": mean("overlap_f", apart),
+        **{name: mean(name, apart) for name in OVERLAPS},
         "instances": sum(figures.segmentation.labelled for figures in apart),
         "instances_called": sum(figures.segmentation.called for figures in apart),
         "instances_found": sum(figures.segmentation.found for figures in apart),
@@ -169,42 +166,35 @@ def summary(done: "Sequence[SceneFigures]") -> dict[str, Any]:
 # The tables
 
 
-def _grasp_table(
+def _tables(
     done: "Mapping[str, SceneFigures]", total: Mapping[str, Any]
-) -> list[tuple[str, ...]]:
-    """Table of the best grasps."""
-    head = ("scene", "best", "on an object", "from below", "through points", "objects held", "ms")
-    rows: list[tuple[str, ...]] = [head]
+) -> tuple[list[tuple[str, ...]], list[tuple[str, ...]]]:
+    """The tables of the best grasps, and of segmentation and plane; their first rows are heads."""
+    grasps: list[tuple[str, ...]] = [
+        ("scene", "best", "on an object", "from below", "through points", "objects held", "ms")
+    ]
+    parts: list[tuple[str, ...]] = [
+        ("scene", "object pixels P/R", "overlap P/R/F", "objects found", "called", "plane")
+    ]
     for name, one in done.items():
-        counts = (one.best, one.on_object, one.from_below, one.through_points)
+        counts = (getattr(one, name) for name in ("best", *SHARES))
         held = f"{one.objects_with_grasp} of {one.objects}" if one.plane_labelled else "-"
-        rows.append((name, *map(str, counts), held, f"{one.milliseconds:.0f}"))
-    shares = (_shares(total[name]) for name in ("on_object", "from_below", "through_points"))
-    held = f"{total['objects_with_grasp']} of {total['objects']}"
-    of_best = (f"{share} %" for share in shares)
-    rows.append(("all", str(total["best"]), *of_best, held, f"{total['milliseconds']:.0f}"))
-    return rows
-
-
-def _segmentation_table(
-    done: "Mapping[str, SceneFigures]", total: Mapping[str, Any]
-) -> list[tuple[str, ...]]:
-    """Table of segmentation and plane."""
-    head = ("scene", "object pixels P/R", "overlap P/R/F", "objects found", "called", "plane")
-    rows: list[tuple[str, ...]] = [head]
-    for name, one in done.items():
+        grasps.append((name, *map(str, counts), held, f"{one.milliseconds:.0f}"))
         seen = one.segmentation
         pixels = _shares(seen.pixel_precision, seen.pixel_recall)
-        overlap = _shares(seen.overlap_precision, seen.overlap_recall, seen.overlap_f)
+        overlap = _shares(*(getattr(seen, name) for name in OVERLAPS))
         found, called = f"{seen.found} of {seen.labelled}", str(seen.called)
         known = (overlap, found, called) if one.plane_labelled else ("-", "-", "-")
-        rows.append((name, pixels, *known, "refused" if one.refused else _plane_text(one)))
+        parts.append((name, pixels, *known, "refused" if one.refused else _plane_text(one)))
+    of_best = (f"{_shares(total[name])} %" for name in SHARES)
+    held = f"{total['objects_with_grasp']} of {total['objects']}"
+    grasps.append(("all", str(total["best"]), *of_best, held, f"{total['milliseconds']:.0f}"))
     pixels = _shares(total["pixel_precision"], total["pixel_recall"])
-    overlap = _shares(*(total[f"overlap_{name}"] for name in ("precision", "recall", "f")))
+    overlap = _shares(*(total[name] for name in OVERLAPS))
     found = f"{total['instances_found']} of {total['instances']}"
     planes = f"{total['planes_right']} of {total['planes']} right"
-    rows.append(("all", pixels, overlap, found, str(total["instances_called"]), planes))
-    return rows
+    parts.append(("all", pixels, overlap, found, str(total["instances_called"]), planes))
+    return grasps, parts
 
 
 def _shares(*shares: float | None) -> str:

@@ -67,41 +67,33 @@ class Followed:
     alike: float | None = None  # share of pairs of images that have the same first grasp anew
 
 
-class Scene:
-    """A scene over time, as a camera sees it; this base class is still and has nothing to grasp."""
-
-    def look(self, seconds: float) -> dict[str, Any]:
-        """The image at a time, as arguments of `GraspClient.detect`."""
-        raise NotImplementedError
-
-    def hold(self, T_cloud_tcp: "Float64") -> None:
-        """Choose the object that moves from now on: the one nearest to a grasp."""
-
-    def moved(self, seconds: float) -> "Float64":
-        """(4, 4) T_now_start of that object, cloud frame."""
-        return np.eye(4)
-
-    def execute(self, done: Followed) -> dict[str, bool]:
-        """Which of the grasps of SUCCESSES hold an object."""
-        return {}
-
-
-class RecordedScene(Scene):
+class RecordedScene:
     """A recorded scene that stands still, in each image with new noise of a depth camera."""
 
     def __init__(self, scene: "RealScene") -> None:
         self.points = scene.points
 
     def look(self, seconds: float) -> dict[str, Any]:
-        """The points (R, 3)."""
+        """The image at a time, as arguments of `GraspClient.detect`; points (R, 3)."""
         rng, depth = np.random.default_rng(round(seconds * RATE)), self.points[:, 2]
         apart = (NOISE[0] + NOISE[1] * depth**2) * rng.standard_normal(len(depth)) / depth
         noisy = (self.points * (1.0 + apart[:, None])).astype(np.float32)
         seen = np.isfinite(noisy[:, 0]) & (rng.random(len(depth)) > MISSING)
         return {"cloud": noisy[seen], "viewpoint": (0.0, 0.0, 0.0)}
 
+    def hold(self, T_cloud_tcp: "Float64") -> None:
+        """Choose the object that moves from now on: the one nearest to a grasp; here none does."""
 
-class SimulatedScene(Scene):
+    def moved(self, seconds: float) -> "Float64":
+        """(4, 4) T_now_start of that object, cloud frame."""
+        return np.eye(4)
+
+    def execute(self, done: Followed) -> dict[str, bool]:
+        """Which of the grasps of SUCCESSES hold an object; none is tried here."""
+        return {}
+
+
+class SimulatedScene:
     """Objects on a table, one of which moves, under a structured-light camera; world frame."""
 
     def __init__(
@@ -158,6 +150,9 @@ class SimulatedScene(Scene):
         self.simulation.move(self.held, place.tolist(), turn.as_quat().tolist())
 
 
+Scene = RecordedScene | SimulatedScene
+
+
 @takes_flags()
 def benchmark_tracking(
     scenes: Annotated[
@@ -182,6 +177,8 @@ def benchmark_tracking(
     The scene moves on while an answer is computed, and images that come meanwhile are dropped. An
     answer takes the processor's time of this process; with --server, the time until it is there.
     """
+    from edgegrasp_cli.real_scenes import load_scenes
+
     names = motion or (["still"] if scenes else list(MOTIONS))
     if unknown := [name for name in names if name not in MOTIONS]:
         raise ValueError(f"--motion: got {unknown[0]!r}. Choose one of {', '.join(MOTIONS)}.")
@@ -191,14 +188,17 @@ def benchmark_tracking(
         for name in names:
             moving = MOTIONS[name]
             moving = replace(moving, seconds=moving.seconds if seconds is None else seconds)
-            made = recorded(scenes) if scenes else simulated(objects, moving, rounds)
+            if scenes:
+                made: Any = ((one.name, RecordedScene(one)) for one in load_scenes(scenes))
+            else:
+                made = ((name, one) for one in simulated(objects, moving, rounds))
             for label, scene in made:
                 followed = follow(client, scene, moving.seconds, clock)
                 if followed.first is not None:
                     followed.success = scene.execute(followed)
                     if name == "still":
                         followed.alike = found_again(client, scene)
-                    done.setdefault(label if scenes else name, []).append(followed)
+                    done.setdefault(label, []).append(followed)
     rows = {name: summary(each) for name, each in done.items()}
     output.mkdir(parents=True, exist_ok=True)
     (output / "results.json").write_text(json.dumps(rows, indent=1) + "\n")
@@ -280,16 +280,8 @@ def summary(done: list[Followed]) -> dict[str, Any]:
     }
 
 
-def recorded(folders: list[Path]) -> Iterator[tuple[str, Scene]]:
-    """Recorded scenes with their names."""
-    from edgegrasp_cli.real_scenes import load_scenes
-
-    for scene in load_scenes(folders):
-        yield scene.name, RecordedScene(scene)
-
-
-def simulated(objects: Path | None, motion: Motion, rounds: int) -> Iterator[tuple[str, Scene]]:
-    """Simulated scenes with their names; each is valid until the next one."""
+def simulated(objects: Path | None, motion: Motion, rounds: int) -> Iterator[SimulatedScene]:
+    """Simulated scenes; each is valid until the next one."""
     from edgegrasp_sim.objects import ObjectSet, SceneKind
     from edgegrasp_sim.simulation import ClutterSimulation
 
@@ -299,7 +291,7 @@ def simulated(objects: Path | None, motion: Motion, rounds: int) -> Iterator[tup
         for number in range(rounds):
             rng = np.random.default_rng(number)
             if simulation.reset(kind, rng, num_objects=OBJECTS):
-                yield f"scene {number}", SimulatedScene(simulation, motion, rng)
+                yield SimulatedScene(simulation, motion, rng)
 
 
 def _print(rows: dict[str, dict[str, Any]]) -> None:

@@ -6,7 +6,7 @@ A scene is an .npz file: docs/benchmark.md has its arrays.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +19,12 @@ from edgegrasp_camera.picture import View
 if TYPE_CHECKING:  # Numba is loaded where grasps are judged
     from edgegrasp_model.gripper import Gripper
 
-
 BEST = 10  # grasps of each scene that are judged
 GOOD_SCORE = 0.5
 FIRST_OBJECT = 2  # lower labels: 0 anything else, 1 the support plane
 BELOW = 0.1  # sine of the angle over the level; the detector's own limit, 6 degrees
 NOISE = 0.003  # metres; 98 % of the points of a depth camera's plane lie within it at 0.6 to 0.9 m
-FOUND_F = (
-    0.75  # F from which a labelled object counts as found, as in the paper of `compare_labels`
-)
+FOUND_F = 0.75  # F from which a labelled object is found, as in the paper of `compare_labels`
 MAX_ANGLE, MAX_OFFSET = 5.0, 0.010  # degrees, metres: of a plane that is right
 
 
@@ -86,9 +83,8 @@ def compare_labels(labels: Int64, answer: Int64) -> Segmentation:
     Precision, recall and F of the overlap as in Xie et al., "Unseen Object Instance Segmentation"
     (T-RO 2021): objects found and labelled are matched one to one for the greatest sum of F.
     """
-    called, labelled, common = _common_pixels(labels, answer)
-    rows, columns, f = _matches(called, labelled, common)
-    right = common[rows, columns].sum()
+    called, labelled, common, match, f = _matched(labels, answer)
+    right = common[match].sum()
     precision, recall = _share(right, called.sum()), _share(right, labelled.sum())
     return Segmentation(
         pixel_precision=_share(common.sum(), called.sum()),
@@ -107,30 +103,30 @@ def renumbered(labels: Int64, answer: Int64) -> Int64:
 
     Those that are matched to none get higher numbers.
     """
-    called, labelled, common = _common_pixels(labels, answer)
-    rows, columns, _ = _matches(called, labelled, common)
+    called, _, _, (rows, columns), _ = _matched(labels, answer)
     numbers = np.concatenate([[0], labels.max(initial=0) + 1 + np.arange(len(called))])
     numbers[rows + 1] = np.unique(labels[labels > 0])[columns]
     _, place = np.unique(np.concatenate([[0], answer]), return_inverse=True)
     return np.asarray(numbers[place[1:]])
 
 
-def _common_pixels(labels: Int64, answer: Int64) -> tuple[Int64, Int64, Int64]:
-    """Pixels of each object called (C,), of each labelled (L,), and of each pair (C, L)."""
+def _matched(
+    labels: Int64, answer: Int64
+) -> tuple[Int64, Int64, Int64, tuple[Int64, Int64], Float64]:
+    """Pixels of objects called (C,), labelled (L,) and of pairs (C, L); the matches and their F.
+
+    Matches are rows and columns (M,) of pairs that overlap, for the greatest sum of F.
+    """
     names, row = np.unique(np.concatenate([[0], answer]), return_inverse=True)
     truths, column = np.unique(np.concatenate([[0], labels]), return_inverse=True)
     pair = row[1:] * len(truths) + column[1:]
     count = np.bincount(pair, minlength=len(names) * len(truths)).reshape(len(names), -1)
-    return count[1:].sum(axis=1), count[:, 1:].sum(axis=0), count[1:, 1:]
-
-
-def _matches(called: Int64, labelled: Int64, common: Int64) -> tuple[Int64, Int64, Float64]:
-    """Rows, columns and F (M,) of the pairs that overlap, matched for the greatest sum of F."""
+    called, labelled, common = count[1:].sum(axis=1), count[:, 1:].sum(axis=0), count[1:, 1:]
     f = 2 * common / np.maximum(called[:, None] + labelled, 1)
     rows, columns = linear_sum_assignment(f, maximize=True)
     overlap = f[rows, columns] > 0
-    rows, columns = rows[overlap], columns[overlap]
-    return rows, columns, f[rows, columns]
+    match = rows[overlap], columns[overlap]
+    return called, labelled, common, match, f[match]
 
 
 def _share(part: np.integer, whole: np.integer) -> float:
@@ -189,9 +185,8 @@ def load_scene(file: Path) -> RealScene:
         with np.load(file) as archive:
             arrays = dict(archive)
     except (OSError, ValueError) as error:
-        raise ValueError(
-            f"{file.name}: {error}. Give what numpy.savez(file, ...) writes."
-        ) from None
+        fix = "Give what numpy.savez(file, ...) writes."
+        raise ValueError(f"{file.name}: {error}. {fix}") from None
     checked = _Arrays(file.name, arrays)
     normal, offset = _plane(checked)
     request, points = _cloud(checked)
@@ -202,8 +197,12 @@ def load_scene(file: Path) -> RealScene:
     rgb = arrays.get("rgb")
     if rgb is not None:
         checked.get("rgb", "u", "a colour of three bytes for each pixel", points.shape)
-    camera = _camera(arrays.get("intrinsics"), points)
-    if camera is None:
+    camera, intrinsics = None, arrays.get("intrinsics")
+    if points.ndim == 3 and intrinsics is not None:
+        camera = View((points.shape[0], points.shape[1]), *intrinsics.tolist())
+    elif points.ndim == 3:
+        camera = View.of_image(points)
+    if camera is None:  # it is unknown, or could not have seen them
         seen = points[np.isfinite(points).all(axis=-1)].reshape(-1, 3)
         camera, rgb = View.of(seen, np.zeros(3), (0, -1, 0) if normal is None else normal), None
     return RealScene(
@@ -226,6 +225,7 @@ def judge(
     answer: Int64,  # (R,) number of the object that each point is on, from 1; 0: on no object
     gripper: "Gripper",  # that the grasps are for
     milliseconds: float,  # from the request to the answer
+    refused: str = "",  # the reason, if the request was refused
 ) -> SceneFigures:
     """Evaluate an answer."""
     best = grasps[:BEST]
@@ -248,6 +248,7 @@ def judge(
         plane_labelled=apart,
         segmentation=compare_labels(scene.object_of_point, called),
         milliseconds=milliseconds,
+        refused=refused,
     )
 
 
@@ -282,12 +283,11 @@ def _compare(scene: RealScene, normal: Array, offset: float) -> PlaneFigures:
     return PlaneFigures(angle, apart, angle <= MAX_ANGLE and apart <= MAX_OFFSET)
 
 
-class _Arrays:
+class _Arrays(NamedTuple):
     """The arrays of a file; an invalid one raises ValueError."""
 
-    def __init__(self, file: str, arrays: Mapping[str, Array]) -> None:
-        self.file = file
-        self.arrays = arrays
+    file: str
+    arrays: Mapping[str, Array]
 
     def get(
         self, field: str, kinds: str, wanted: str, shape: tuple[int, ...] | None = None
@@ -323,22 +323,10 @@ def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32]:
         depth = arrays.get("depth", "u", "(H, W) uint16 millimetres")
         values = arrays.get("intrinsics", "f", "fx, fy, cx, cy beside depth", (4,)).tolist()
         view = DepthView(intrinsics_of(values))
-        cloud = fuse_depth_images([depth], [view])
-        return {"depth_images": [{"depth": depth, "intrinsics": values}]}, np.asarray(
-            cloud.points, dtype=np.float32
-        )
+        points = np.asarray(fuse_depth_images([depth], [view]).points, dtype=np.float32)
+        return {"depth_images": [{"depth": depth, "intrinsics": values}]}, points
     wanted = "(H, W, 3) or (N, 3) float32 metres, or depth and intrinsics"
     points = arrays.get("points", "f", wanted)
     if points.ndim not in (2, 3) or points.shape[-1] != 3:
         arrays.refuse("points", f"shape {points.shape}", wanted)
     return {"cloud": points, "viewpoint": (0.0, 0.0, 0.0)}, points.astype(np.float32)
-
-
-def _camera(intrinsics: Array | None, points: Float32) -> View | None:
-    """The camera of an image or an organised cloud; None without one."""
-    if points.ndim != 3:
-        return None
-    shape = points.shape[0], points.shape[1]
-    if intrinsics is not None:
-        return View(shape, *intrinsics.tolist())
-    return View.of_image(points)

@@ -237,7 +237,7 @@ def test_the_grasp_of_a_recorded_scene_stays_where_it_is(run, tmp_path: Path) ->
 def test_the_grasp_of_an_object_on_a_belt_moves_with_it() -> None:
     client = OwnDetector()
     scenes = simulated(None, MOTIONS["belt-10"], 1)
-    _, scene = next(scenes)
+    scene = next(scenes)
     done = follow(client, scene, 0.2, clock=lambda: 0.0)
     assert np.linalg.norm(scene.moved(0.2)[:3, 3]) == pytest.approx(0.02)
     assert len(done.off) >= 3
