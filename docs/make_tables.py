@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +24,14 @@ BOUNDS = (
 
 def pages() -> dict[Path, str]:
     """The text of each page with its table."""
-    made: dict[str, Callable[[], Rows]] = {"options.md": _options, "settings.md": _settings}
-    found = {}
-    for name, rows in made.items():
-        page = Path(__file__).parent / name
-        header, *lines = rows()
-        table = "".join(f"| {' | '.join(line)} |\n" for line in (header, ["---"] * 4, *lines))
-        found[page] = BLOCK.sub(
-            lambda match, table=table: f"{match[1]}\n{table}\n{match[2]}",  # type: ignore[misc]
-            page.read_text(),
-        )
-    return found
+    folder = Path(__file__).parent
+    made = {folder / "options.md": _options(), folder / "settings.md": _settings()}
+    return {page: _with_table(page.read_text(), *rows) for page, rows in made.items()}
+
+
+def _with_table(text: str, header: list[str], *rows: list[str]) -> str:
+    lines = (f"| {' | '.join(row)} |\n" for row in (header, ["---"] * 4, *rows))
+    return BLOCK.sub(lambda match: f"{match[1]}\n{''.join(lines)}\n{match[2]}", text)
 
 
 def _options() -> Rows:

@@ -93,6 +93,19 @@ def _print_version(asked: bool) -> None:
         raise typer.Exit
 
 
+app = typer.Typer(
+    cls=LazyGroup,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="edgegrasp view    edgegrasp detect cloud.ply --picture grasps.png    "
+    "edgegrasp COMMAND -h",
+)
+for _name, (_, _, _text) in COMMANDS.items():
+    app.command(_name, help=_text, cls=TyperCommand)(lambda: None)
+
+
+@app.callback(help="Grasp detection as a service: point clouds in, scored 6-DoF grasps out.")
 def _common(
     version: Annotated[
         bool,
@@ -105,25 +118,6 @@ def _common(
     ] = False,
 ) -> None:
     """The flags of the program itself."""
-
-
-def _program() -> typer.Typer:
-    help_text = "Grasp detection as a service: point clouds in, scored 6-DoF grasps out."
-    program = typer.Typer(
-        cls=LazyGroup,
-        no_args_is_help=True,
-        pretty_exceptions_enable=False,
-        context_settings={"help_option_names": ["-h", "--help"]},
-        epilog="edgegrasp view    edgegrasp detect cloud.ply --picture grasps.png    "
-        "edgegrasp COMMAND -h",
-    )
-    program.callback(help=help_text)(_common)
-    for name, (_, _, text) in COMMANDS.items():
-        program.command(name, help=text, cls=TyperCommand)(lambda: None)
-    return program
-
-
-app = _program()
 
 
 def main() -> None:

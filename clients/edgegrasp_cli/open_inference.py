@@ -81,9 +81,8 @@ def open_inference(
     """
     with asked.connect(asked.server) as client:
         models = Models(client, name, asked.timeout)
-        with grpc_server(models, f"{host}:{grpc_port}", MAX_BODY_BYTES):
-            app = http_app(models, MAX_BODY_BYTES)
-            uvicorn.run(app, host=host, port=http_port, log_level="warning")
+        with grpc_server(models, f"{host}:{grpc_port}"):
+            uvicorn.run(http_app(models), host=host, port=http_port, log_level="warning")
 
 
 def refusal(error: errors.GraspClientError) -> tuple[str, int, str]:
@@ -124,13 +123,14 @@ class Models:
         parameters: Mapping[str, Any],
         timeout: float | None,
         wanted: Sequence[str] = (),
-    ) -> tuple[Tensors, dict[str, str]]:
+    ) -> tuple[list[tuple[dict[str, Any], Array]], dict[str, str]]:
         """Grasps of `points`, or of `depth` with `intrinsics`; parameters are options.
 
         `timeout` among them is in microseconds; `wanted` are names of outputs, empty: all.
 
         Returns:
-            Outputs in the order of OUTPUTS, and the answer's parameters.
+            Outputs in the order of OUTPUTS, each described by name, datatype and shape; and the
+            answer's parameters.
         """
         asked = {key: option_of_text(value) for key, value in parameters.items()}
         options: Any = {key: value for key, value in asked.items() if key not in NOT_OPTIONS}
@@ -155,13 +155,16 @@ class Models:
         found = self._client.detect(**cloud, **options, timeout=seconds)
         grasps = found.grasps
         poses = np.array([grasp.T_cloud_hand for grasp in grasps], "<f4").reshape(-1, 4, 4)
-        outputs = {
+        made = {
             "T_cloud_hand": poses,
             "score": np.array([grasp.score for grasp in grasps], "<f4"),
             "width": np.array([grasp.width for grasp in grasps], "<f4"),
             "object": np.array([-1 if g.object is None else g.object for g in grasps], "<i4"),
         }
-        outputs = {each: outputs[each] for each in wanted or OUTPUTS}
+        outputs = [
+            ({"name": each, "datatype": OUTPUTS[each][0], "shape": made[each].shape}, made[each])
+            for each in dict.fromkeys(wanted or OUTPUTS)
+        ]
         return outputs, {"model": found.model, "warnings": " ".join(found.warnings)}
 
 
@@ -179,17 +182,19 @@ def tensor(name: str, datatype: str, shape: Any, data: Any) -> Array:
 
 
 def _metadata(name: str) -> dict[str, Any]:
-    def tensors(table: Mapping[str, tuple[str, list[int]]]) -> list[dict[str, Any]]:
-        return [{"name": n, "datatype": kind, "shape": shape} for n, (kind, shape) in table.items()]
-
-    described = {"name": name, "versions": [VERSION], "platform": PLATFORM}
-    return {**described, "inputs": tensors(INPUTS), "outputs": tensors(OUTPUTS)}
+    described: dict[str, Any] = {"name": name, "versions": [VERSION], "platform": PLATFORM}
+    for side, table in (("inputs", INPUTS), ("outputs", OUTPUTS)):
+        described[side] = [
+            {"name": each, "datatype": kind, "shape": shape}
+            for each, (kind, shape) in table.items()
+        ]
+    return described
 
 
 @contextmanager
-def grpc_server(models: Models, address: str, max_body_bytes: int) -> Iterator[int]:
+def grpc_server(models: Models, address: str) -> Iterator[int]:
     """Serve `inference.GRPCInferenceService` while the context lasts; gives its port."""
-    options = [("grpc.max_receive_message_length", max_body_bytes)]
+    options = [("grpc.max_receive_message_length", MAX_BODY_BYTES)]
     server = grpc.server(ThreadPoolExecutor(PARALLEL_CALLS), options=options)
     add_GRPCInferenceServiceServicer_to_server(_Servicer(models), server)
     port = server.add_insecure_port(address)
@@ -226,18 +231,16 @@ class _Servicer(GRPCInferenceServiceServicer):
     def ModelInfer(self, request: Any, context: Any) -> Any:  # noqa: N802
         name, wanted = request.model_name, [each.name for each in request.outputs]
         with _aborting(context):
-            tensors, given = _grpc_inputs(request), _grpc_parameters(request.parameters)
+            given = {name: _value(one) for name, one in request.parameters.items()}
+            tensors = _grpc_inputs(request)
             if request.model_version:
                 self._models.check(name, request.model_version)
             seconds = context.time_remaining()
             outputs, parameters = self._models.infer(name, tensors, given, seconds, wanted)
         fields: dict[str, Any] = {
             "parameters": {key: {"string_param": text} for key, text in parameters.items()},
-            "outputs": [
-                {"name": each, "datatype": OUTPUTS[each][0], "shape": array.shape}
-                for each, array in outputs.items()
-            ],
-            "raw_output_contents": [array.tobytes() for array in outputs.values()],
+            "outputs": [described for described, _ in outputs],
+            "raw_output_contents": [array.tobytes() for _, array in outputs],
         }
         named = {"model_name": name, "model_version": VERSION, "id": request.id}
         return messages.ModelInferResponse(**named, **fields)
@@ -266,15 +269,12 @@ def _grpc_inputs(request: Any) -> Tensors:
     return tensors
 
 
-def _grpc_parameters(parameters: Mapping[str, Any]) -> dict[str, Any]:
-    values = {}
-    for name, each in parameters.items():
-        kind = each.WhichOneof("parameter_choice")
-        values[name] = None if kind is None else getattr(each, kind)
-    return values
+def _value(parameter: Any) -> Any:
+    kind = parameter.WhichOneof("parameter_choice")
+    return None if kind is None else getattr(parameter, kind)
 
 
-def http_app(models: Models, max_body_bytes: int) -> Starlette:
+def http_app(models: Models) -> Starlette:
     """The REST paths of the protocol."""
 
     def answers(body_of: Callable[..., Any]) -> Callable[[Request], Response]:
@@ -300,8 +300,8 @@ def http_app(models: Models, max_body_bytes: int) -> Starlette:
         body = bytearray()
         async for chunk in request.stream():
             body += chunk
-            if len(body) > max_body_bytes:
-                raise errors.PayloadTooLargeError(f"The body is over {max_body_bytes:,} bytes.")
+            if len(body) > MAX_BODY_BYTES:
+                raise errors.PayloadTooLargeError(f"The body is over {MAX_BODY_BYTES:,} bytes.")
         header = request.headers.get("inference-header-content-length")
         name = request.path_params["name"]
         if "version" in request.path_params:
@@ -345,15 +345,7 @@ def _http_infer(models: Models, name: str, body: bytearray, header: str | None) 
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise invalid("body", repr(error), "Give the JSON of an inference request.") from None
     found, said = models.infer(name, tensors, parameters, None, wanted)
-    outputs = [
-        {
-            "name": each,
-            "datatype": OUTPUTS[each][0],
-            "shape": array.shape,
-            "data": array.ravel().tolist(),
-        }
-        for each, array in found.items()
-    ]
+    outputs = [described | {"data": array.ravel().tolist()} for described, array in found]
     named = {"model_name": name, "model_version": VERSION, "id": request.get("id", "")}
     return {**named, "parameters": said, "outputs": outputs}
 

@@ -9,6 +9,11 @@ import typer
 
 robot = typer.Typer(help="Make and check robot files.", no_args_is_help=True)
 
+NO_OFFSET = """
+[T_flange_hand]
+position = [0.0, 0.0, 0.0]
+quaternion = [0.0, 0.0, 0.0, 1.0]
+"""
 GripperName = Annotated[str, typer.Option(help="Name of a gripper that ships, or its file.")]
 Links = Annotated[str, typer.Option(help="Link of the URDF.")]
 
@@ -38,14 +43,8 @@ def add(
         "flange_frame": flange,
         "gripper": gripper,
     }
-    lines = [f"{name} = {json.dumps(value)}" for name, value in fields.items()]
-    pose = [
-        "",
-        "[T_flange_hand]",
-        "position = [0.0, 0.0, 0.0]",
-        "quaternion = [0.0, 0.0, 0.0, 1.0]",
-    ]
-    output.write_text("\n".join([*lines, *pose, ""]))
+    lines = [f"{name} = {json.dumps(value)}\n" for name, value in fields.items()]
+    output.write_text("".join([*lines, NO_OFFSET]))
     print(f"{output}: now set T_flange_hand, and home, max_velocity, max_acceleration if need be.")
     check(output)
 

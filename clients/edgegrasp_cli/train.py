@@ -4,8 +4,9 @@ import shlex
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from pydantic import Field
@@ -13,9 +14,6 @@ from pydantic import Field
 from edgegrasp_cli.benchmark import Cluster, interruptible
 from edgegrasp_cli.flags import takes_flags
 from edgegrasp_training.options import GenerationOptions, TrainingOptions
-
-if TYPE_CHECKING:
-    from edgegrasp_training.training import Trainer
 
 Option = typer.Option
 
@@ -96,6 +94,10 @@ def train(
     from rich.progress import Progress
 
     from edgegrasp_training.outcomes import recalibrate
+    from edgegrasp_training.recipes import recipe
+    from edgegrasp_training.teacher import Teacher
+    from edgegrasp_training.training import Trainer
+    from edgegrasp_training.views import find_views, split_by_scene
 
     if asked.outcomes is not None:
         if asked.start_from is None or data:
@@ -104,7 +106,14 @@ def train(
         return
     if not data:
         raise ValueError("data: got nothing. Name folders of views, or --outcomes.")
-    trainer = _trainer(data, asked)
+    views, validation = split_by_scene(find_views(data), asked.validation_share, asked.seed)
+    metadata, teacher = recipe(asked.model), None
+    if asked.teacher is not None:
+        teacher = Teacher(asked.teacher, metadata.network.crop_radius)
+    trainer = Trainer(
+        metadata, views, validation, asked.run, asked, asked.device, teacher, asked.start_from
+    )
+    print(f"{len(views)} training and {len(validation)} validation views")
     with Progress() as progress:
         task = progress.add_task("steps", total=asked.steps, completed=trainer.step)
 
@@ -118,24 +127,6 @@ def train(
         print(f"validation loss {evaluation.loss:.4f}, AUROC {evaluation.auroc:.4f}: {asked.run}")
     else:
         print(f"paused at step {trainer.step}; the same command continues")
-
-
-def _trainer(data: list[Path], asked: TrainFlags) -> "Trainer":
-    """The trainer for the views of these folders."""
-    from edgegrasp_training.recipes import recipe
-    from edgegrasp_training.teacher import Teacher
-    from edgegrasp_training.training import Trainer
-    from edgegrasp_training.views import find_views, split_by_scene
-
-    views, validation = split_by_scene(find_views(data), asked.validation_share, asked.seed)
-    metadata, teacher = recipe(asked.model), None
-    if asked.teacher is not None:
-        teacher = Teacher(asked.teacher, metadata.network.crop_radius)
-    trainer = Trainer(
-        metadata, views, validation, asked.run, asked, asked.device, teacher, asked.start_from
-    )
-    print(f"{len(views)} training and {len(validation)} validation views")
-    return trainer
 
 
 def generate_scenes(
@@ -156,16 +147,9 @@ def generate_scenes(
     meshes = sorted(objects.glob("*/train/*_visual.obj"))
     if not meshes:
         raise ValueError(f"objects: got {objects}. Give a folder with */train/*_visual.obj.")
-    with (
-        interruptible("generate-scenes", resumes=True),
-        ProcessPoolExecutor(workers) as pool,
-    ):
-        parts = [
-            pool.submit(generate, output, meshes, files, seed, part, workers)
-            for part in range(workers)
-        ]
-        for part in parts:
-            part.result()
+    part = partial(generate, output, meshes, files, seed, parts=workers)
+    with interruptible("generate-scenes", resumes=True), ProcessPoolExecutor(workers) as pool:
+        list(pool.map(part, range(workers)))  # raises what a part does
     print(f"{len(list(output.glob('scenes-????.npz')))} files in {output}.")
 
 

@@ -18,10 +18,8 @@ pytest.importorskip("uvicorn", reason="the extra `open-inference` is not install
 
 import uvicorn
 
-from edgegrasp_cli.open_inference import Models, grpc_server, http_app, refusal
+from edgegrasp_cli.open_inference import MAX_BODY_BYTES, Models, grpc_server, http_app, refusal
 from edgegrasp_client import GraspClient, GraspClientError
-
-LIMIT = 200_000  # bytes
 
 
 @pytest.fixture(scope="module")
@@ -29,13 +27,13 @@ def gateway(dummy_server) -> Iterator[dict[str, str]]:
     """Addresses of a gateway in this process, by transport."""
     with GraspClient(dummy_server.grpc_address) as client:
         models = Models(client, "grasps", 60.0)
-        config = uvicorn.Config(http_app(models, LIMIT), port=0, log_level="error")
+        config = uvicorn.Config(http_app(models), port=0, log_level="error")
         server = uvicorn.Server(config)
         bound = config.bind_socket()
         bound.listen()  # what connects before the thread runs waits, and is not refused
         thread = threading.Thread(target=server.run, args=([bound],))
         thread.start()
-        with grpc_server(models, "127.0.0.1:0", LIMIT) as port:
+        with grpc_server(models, "127.0.0.1:0") as port:
             yield {"http": f"127.0.0.1:{bound.getsockname()[1]}", "grpc": f"127.0.0.1:{port}"}
         server.should_exit = True
         thread.join()
@@ -123,7 +121,7 @@ def test_a_request_in_json(post, gateway, cloud) -> None:
         ({"parameters": {"seed": "[" * 20_000}}, "grasps", 400, "options.seed"),
         ({"id": "\ud800"}, "grasps", 400, "Give the JSON"),
         ({"name": "\ud800"}, "grasps", 400, "inputs: got"),
-        (b" " * (LIMIT + 1), "grasps", 413, "200,000 bytes"),
+        (b" " * (MAX_BODY_BYTES + 1), "grasps", 413, "33,554,432 bytes"),
         ({"parameters": {"seed": -1}}, "grasps", 400, "options.seed: got -1."),
     ],
 )
