@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from edgegrasp_cli.real_scenes import RealScene, SceneFigures
 
 Option = typer.Option
+Rows = list[tuple[str, ...]]
 # Options that are set by the scene or by this command.
 DECIDED = ("viewpoint", "debug", "robot", "previous")
 SHARES = ("on_object", "from_below", "through_points")  # counts, which are shares of the best
@@ -116,7 +117,7 @@ def _write(
     scenes = {name: asdict(figures) for name, figures in done.items()}
     results = {"model": model, "options": dict(options), "all": total, "scenes": scenes}
     (output / "results.json").write_text(json.dumps(results, indent=1) + "\n")
-    tables = _tables(done, total)
+    tables = [_grasp_table(done, total), _segmentation_table(done, total)]
     names = [name + part for name in done for part in ("", "-labels")]
     pictures = (image("png", (output / f"{name}.png").read_bytes(), name) for name in names)
     title = f"{model} in {len(done)} scenes of real cameras"
@@ -166,35 +167,37 @@ def summary(done: "Sequence[SceneFigures]") -> dict[str, Any]:
 # The tables
 
 
-def _tables(
-    done: "Mapping[str, SceneFigures]", total: Mapping[str, Any]
-) -> tuple[list[tuple[str, ...]], list[tuple[str, ...]]]:
-    """The tables of the best grasps, and of segmentation and plane; their first rows are heads."""
-    grasps: list[tuple[str, ...]] = [
-        ("scene", "best", "on an object", "from below", "through points", "objects held", "ms")
-    ]
-    parts: list[tuple[str, ...]] = [
-        ("scene", "object pixels P/R", "overlap P/R/F", "objects found", "called", "plane")
-    ]
+def _grasp_table(done: "Mapping[str, SceneFigures]", total: Mapping[str, Any]) -> Rows:
+    """Table of the best grasps."""
+    head = ("scene", "best", "on an object", "from below", "through points", "objects held", "ms")
+    rows: Rows = [head]
     for name, one in done.items():
-        counts = (getattr(one, name) for name in ("best", *SHARES))
+        counts = (str(getattr(one, count)) for count in ("best", *SHARES))
         held = f"{one.objects_with_grasp} of {one.objects}" if one.plane_labelled else "-"
-        grasps.append((name, *map(str, counts), held, f"{one.milliseconds:.0f}"))
-        seen = one.segmentation
-        pixels = _shares(seen.pixel_precision, seen.pixel_recall)
-        overlap = _shares(*(getattr(seen, name) for name in OVERLAPS))
-        found, called = f"{seen.found} of {seen.labelled}", str(seen.called)
-        known = (overlap, found, called) if one.plane_labelled else ("-", "-", "-")
-        parts.append((name, pixels, *known, "refused" if one.refused else _plane_text(one)))
+        rows.append((name, *counts, held, f"{one.milliseconds:.0f}"))
     of_best = (f"{_shares(total[name])} %" for name in SHARES)
     held = f"{total['objects_with_grasp']} of {total['objects']}"
-    grasps.append(("all", str(total["best"]), *of_best, held, f"{total['milliseconds']:.0f}"))
+    rows.append(("all", str(total["best"]), *of_best, held, f"{total['milliseconds']:.0f}"))
+    return rows
+
+
+def _segmentation_table(done: "Mapping[str, SceneFigures]", total: Mapping[str, Any]) -> Rows:
+    """Table of segmentation and plane."""
+    head = ("scene", "object pixels P/R", "overlap P/R/F", "objects found", "called", "plane")
+    rows: Rows = [head]
+    for name, one in done.items():
+        seen = one.segmentation
+        pixels = _shares(seen.pixel_precision, seen.pixel_recall)
+        overlap = _shares(*(getattr(seen, share) for share in OVERLAPS))
+        found, called = f"{seen.found} of {seen.labelled}", str(seen.called)
+        known = (overlap, found, called) if one.plane_labelled else ("-", "-", "-")
+        rows.append((name, pixels, *known, "refused" if one.refused else _plane_text(one)))
     pixels = _shares(total["pixel_precision"], total["pixel_recall"])
     overlap = _shares(*(total[name] for name in OVERLAPS))
     found = f"{total['instances_found']} of {total['instances']}"
     planes = f"{total['planes_right']} of {total['planes']} right"
-    parts.append(("all", pixels, overlap, found, str(total["instances_called"]), planes))
-    return grasps, parts
+    rows.append(("all", pixels, overlap, found, str(total["instances_called"]), planes))
+    return rows
 
 
 def _shares(*shares: float | None) -> str:

@@ -144,9 +144,8 @@ def models(*, asked: DetectorFlags) -> None:
     from rich.console import Console
     from rich.table import Column, Table
 
-    name = Column("model", no_wrap=True)
-    architecture = Column("architecture", no_wrap=True)
-    table = Table(name, architecture, "parameters", "gripper", "device", box=box.SIMPLE)
+    names = (Column(name, no_wrap=True) for name in ("model", "architecture"))
+    table = Table(*names, "parameters", "gripper", "device", box=box.SIMPLE)
     waiting = Console(stderr=True).status("Loading weights…")
     with waiting, open_client(asked) as client:
         found = client.models()
@@ -219,8 +218,7 @@ class OwnDetector:
         """The weights that are available."""
         from edgegrasp_client import Model
 
-        rows = self._catalogue.describe()
-        return [Model(**{name: row[name] for name in Model.__dataclass_fields__}) for row in rows]
+        return [Model(**facts) for facts in self._catalogue.describe()]
 
     @cached_property
     def _catalogue(self) -> "ModelCatalogue":
@@ -234,8 +232,7 @@ def _check_outputs(asked: DetectFlags, fields: Mapping[str, Any]) -> None:
     """Raise ValueError, before any work, if a picture or trajectory could not be written."""
     if asked.trajectory is not None and "robot" not in fields:
         raise ValueError("--trajectory: got no robot. Give --robot, --joints and --base.")
-    path = asked.picture
-    if path is None:
+    if (path := asked.picture) is None:
         return
     if path.suffix.lower() not in PICTURES:
         raise ValueError(f"--picture: got {path.name!r}. Name a file {' or '.join(PICTURES)}.")
@@ -274,16 +271,12 @@ def _robot_option(asked: DetectFlags) -> dict[str, Any]:
 
 def _write_trajectory(file: Path, detection: Any) -> None:
     """Write the best pick and its trajectory; raises ValueError if there is none."""
-    moving = [one for one in detection.grasps if one.arm is not None and one.arm.trajectory]
-    if not moving:
-        counts = ", ".join(f"{count} {name}" for name, count in detection.counts.items())
-        raise ValueError(f"--trajectory: the arm has no way to any grasp ({counts}).")
-    motion = {
-        name: value.tolist() if isinstance(value, np.ndarray) else value
-        for name, value in vars(moving[0].arm.trajectory).items()
-    }
-    motion |= {"T_cloud_hand": moving[0].T_cloud_hand.tolist(), "width": moving[0].width}
-    file.write_text(json.dumps(motion))
+    moving = (one for one in detection.grasps if one.arm is not None and one.arm.trajectory)
+    best = next(moving, None)
+    if best is None:
+        raise ValueError(f"--trajectory: the arm has no way to any grasp ({_counts(detection)}).")
+    motion = {**vars(best.arm.trajectory), "T_cloud_hand": best.T_cloud_hand, "width": best.width}
+    file.write_text(json.dumps(motion, default=np.ndarray.tolist))
 
 
 def _depth_images(file: Path | None, asked: DetectFlags) -> "list[DepthImage] | None":
@@ -327,7 +320,7 @@ def _print_detection(detection: Any) -> None:
         )
     console = Console()
     console.print(table)
-    console.print(", ".join(f"{count} {name}" for name, count in detection.counts.items()))
+    console.print(_counts(detection))
     console.print(f"{detection.model}: {detection.seconds.get('total', 0.0):.2f} s")
     for warning in detection.warnings:
         console.print(f"Warning: {warning}")
@@ -335,3 +328,7 @@ def _print_detection(detection: Any) -> None:
 
 def _numbers(vector: Any) -> str:
     return " ".join(f"{value:+.3f}" for value in vector)
+
+
+def _counts(detection: Any) -> str:
+    return ", ".join(f"{count} {name}" for name, count in detection.counts.items())

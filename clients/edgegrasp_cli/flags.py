@@ -41,20 +41,18 @@ class Connection(BaseModel):
         from edgegrasp_client import GraspClient, Tls
 
         files = (self.tls_ca, self.tls_certificate, self.tls_key)
+        token = os.environ.get(TOKEN_VARIABLE) or None
+        try:
+            if self.token_file is not None:
+                token = self.token_file.read_text().strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ValueError(f"token file {self.token_file}: {error}") from error
         return GraspClient(
             address,
             timeout=timeout or self.timeout,
-            token=self._token(),
+            token=token,
             tls=Tls(*files) if self.tls or any(files) else None,
         )
-
-    def _token(self) -> str | None:
-        if self.token_file is None:
-            return os.environ.get(TOKEN_VARIABLE) or None
-        try:
-            return self.token_file.read_text().strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ValueError(f"token file {self.token_file}: {error}") from error
 
 
 class PlannerFlags(Connection):

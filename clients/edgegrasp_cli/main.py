@@ -50,15 +50,14 @@ def load_command(name: str) -> Any:
         found = importlib.import_module(f"edgegrasp_cli.{module}")
     except ModuleNotFoundError as error:
         sys.exit(_missing(name, error))
-    function = getattr(found, name.replace("-", "_"))
-    if isinstance(function, typer.Typer):  # a group of commands
-        for command in function.registered_commands:
-            if command.callback is not None:
-                command.callback = _ending_with_a_sentence(name, command.callback)
-        return typer.main.get_command(function)
-    single = typer.Typer(add_completion=False)
-    single.command(name)(_ending_with_a_sentence(name, function))
-    return typer.main.get_command(single)
+    program = getattr(found, name.replace("-", "_"))
+    if not isinstance(program, typer.Typer):  # a single command, not a group of them
+        function, program = program, typer.Typer(add_completion=False)
+        program.command(name)(function)
+    for command in program.registered_commands:
+        if command.callback is not None:
+            command.callback = _ending_with_a_sentence(name, command.callback)
+    return typer.main.get_command(program)
 
 
 def _ending_with_a_sentence(name: str, function: Callable[..., None]) -> Callable[..., None]:

@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 from pydantic import Field
@@ -86,13 +86,13 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
     from mcp.server.mcpserver import MCPServer
 
     tools = _Tools(client, folder)
-    functions: list[Callable[..., Any]] = [
+    functions = (
         tools.generate_grasps_from_point_cloud,
         tools.generate_grasps_from_depth,
         tools.visualize_grasps,
         tools.edgegrasp_health_check,
         tools.edgegrasp_server_info,
-    ]
+    )
     return MCPServer(
         "edgegrasp",
         instructions=INSTRUCTIONS,
@@ -205,12 +205,9 @@ class _Tools:
     def _image(
         self, name: str, intrinsics: list[float], scale: float | None, pose: Matrix | None
     ) -> "DepthImage":
-        image: DepthImage = {"depth": self._path(name), "intrinsics": intrinsics}
-        if scale is not None:
-            image["depth_scale"] = scale
-        if pose is not None:
-            image["T_cloud_camera"] = pose
-        return image
+        given = {"intrinsics": intrinsics, "depth_scale": scale, "T_cloud_camera": pose}
+        said = {field: value for field, value in given.items() if value is not None}
+        return cast("DepthImage", {"depth": self._path(name), **said})
 
     def _in_image(
         self, asked: dict[str, Any], mask: str | None, pose: Matrix | None
@@ -344,10 +341,10 @@ def _short(found: "Detection") -> str:
 
 def _short_plan(plan: "ArmPlan") -> dict[str, Any]:
     """The joints at each stop of an arm, and how long its motion takes."""
-    stops = ("pregrasp_joints", "grasp_joints", "place_joints")
-    joints = {name: value for name in stops if (value := getattr(plan, name)) is not None}
     found: dict[str, Any] = {"reachable": plan.reachable}
-    found |= {name: _digits(value, 4) for name, value in joints.items()}
+    for name in ("pregrasp_joints", "grasp_joints", "place_joints"):
+        if (joints := getattr(plan, name)) is not None:
+            found[name] = _digits(joints, 4)
     if plan.trajectory is not None:
         found["seconds"] = round(float(plan.trajectory.times[-1]), 2)
     return found

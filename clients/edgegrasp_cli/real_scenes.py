@@ -83,7 +83,7 @@ def compare_labels(labels: Int64, answer: Int64) -> Segmentation:
     Precision, recall and F of the overlap as in Xie et al., "Unseen Object Instance Segmentation"
     (T-RO 2021): objects found and labelled are matched one to one for the greatest sum of F.
     """
-    called, labelled, common, match, f = _matched(labels, answer)
+    match, called, labelled, common, f = _matched(labels, answer)
     right = common[match].sum()
     precision, recall = _share(right, called.sum()), _share(right, labelled.sum())
     return Segmentation(
@@ -103,7 +103,7 @@ def renumbered(labels: Int64, answer: Int64) -> Int64:
 
     Those that are matched to none get higher numbers.
     """
-    called, _, _, (rows, columns), _ = _matched(labels, answer)
+    (rows, columns), called, *_ = _matched(labels, answer)
     numbers = np.concatenate([[0], labels.max(initial=0) + 1 + np.arange(len(called))])
     numbers[rows + 1] = np.unique(labels[labels > 0])[columns]
     _, place = np.unique(np.concatenate([[0], answer]), return_inverse=True)
@@ -112,10 +112,11 @@ def renumbered(labels: Int64, answer: Int64) -> Int64:
 
 def _matched(
     labels: Int64, answer: Int64
-) -> tuple[Int64, Int64, Int64, tuple[Int64, Int64], Float64]:
-    """Pixels of objects called (C,), labelled (L,) and of pairs (C, L); the matches and their F.
+) -> tuple[tuple[Int64, Int64], Int64, Int64, Int64, Float64]:
+    """Rows and columns (M,) of the pairs that overlap, matched for the greatest sum of F.
 
-    Matches are rows and columns (M,) of pairs that overlap, for the greatest sum of F.
+    Also the pixels of each object called (C,), of each labelled (L,) and of each pair (C, L), and
+    the F of the matches (M,).
     """
     names, row = np.unique(np.concatenate([[0], answer]), return_inverse=True)
     truths, column = np.unique(np.concatenate([[0], labels]), return_inverse=True)
@@ -126,7 +127,7 @@ def _matched(
     rows, columns = linear_sum_assignment(f, maximize=True)
     overlap = f[rows, columns] > 0
     match = rows[overlap], columns[overlap]
-    return called, labelled, common, match, f[match]
+    return match, called, labelled, common, f[match]
 
 
 def _share(part: np.integer, whole: np.integer) -> float:
