@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,28 +15,22 @@ Command = Callable[..., str]
 TOP_DOWN = "examples.your_planner:plan"
 
 
+def invoke(code: int, *words: object) -> str:
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == code, result.output
+    return result.output
+
+
 @pytest.fixture(scope="session")
 def run() -> Command:
     """Run a command that succeeds; gives what it prints."""
-
-    def run(*words: object) -> str:
-        result = CliRunner().invoke(app, [str(word) for word in words])
-        assert result.exit_code == 0, result.output
-        return result.output
-
-    return run
+    return partial(invoke, 0)
 
 
 @pytest.fixture(scope="session")
 def refused() -> Command:
     """Run a command that ends with a message; gives the message."""
-
-    def refused(*words: object) -> str:
-        result = CliRunner().invoke(app, [str(word) for word in words])
-        assert result.exit_code == 1, result.output
-        return result.output
-
-    return refused
+    return partial(invoke, 1)
 
 
 @pytest.fixture(scope="session")

@@ -125,10 +125,8 @@ def test_depth_images_that_cannot_be_read(camera_files, file, refused) -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--seed", "-1"], "options.seed: got -1."),
         (["--model", "resnet"], "options.model: got 'resnet'. Use one of: dummy."),
         (["--up", "0,0"], "options.up"),
-        (["--collision", "dodge"], "options.collision: got 'dodge'."),
     ],
 )
 def test_a_bad_option_is_named(options, sentence, file, dummy_server, refused) -> None:

@@ -84,12 +84,11 @@ def test_a_missing_package_names_the_extra(missing, words, extra, refused, monke
     assert f"pip install 'edgegrasp[{extra}]'" in refused(*words)
 
 
-@pytest.mark.parametrize("command", ["generate-data", "benchmark-tracking"])
-def test_a_missing_engine_is_named(command: str, refused, monkeypatch, tmp_path: Path) -> None:
+@pytest.mark.parametrize("words", [["generate-data", "FOLDER"], ["benchmark-tracking"]])
+def test_a_missing_engine_is_named(words: list[str], refused, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    folder = [tmp_path] if command == "generate-data" else []
-    assert f"edgegrasp {command}: " in (said := refused(command, *folder))
+    assert f"edgegrasp {words[0]}: " in (said := refused(*words))
     assert "is installed: pip install 'edgegrasp[sim]'" in said or "pip install mujoco" in said
 
 

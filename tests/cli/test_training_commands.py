@@ -51,10 +51,16 @@ def test_training_pauses_goes_on_and_is_recalibrated(data, run, tmp_path) -> Non
         (("benchmark", "--rounds", "0"), "rounds is 0"),
         (("benchmark", "--protocol", "paper"), "choose one of bin, bin-full, edgegrasp"),
         (("benchmark", "--collision", "dodge"), "options.collision: got 'dodge'"),
+        (("benchmark", "--planner", "guess"), "choose one of server, in-process"),
+        (("benchmark", "--planner", ":loads"), "or module:callable"),
         (("benchmark", "--planner", "no_such:planner"), "cannot be loaded"),
+        (("benchmark", "--planner", "json:no_such"), "cannot be loaded"),
+        (("benchmark", "--planner", "math:pi"), "is not callable"),
         (("benchmark", "--ray", "10.0.0.1:6379"), "pass --server"),
         (("benchmark", "--model", "absent.safetensors"), "no such file"),
+        (("benchmark", "--model", "a.safetensors", "--server", ":1"), "server's own weights"),
         (("benchmark", "--server", "127.0.0.1:1"), "UNAVAILABLE"),
+        (("benchmark-tracking", "--motion", "fast"), "Choose one of still, pushed"),
     ],
 )
 def test_wrong_arguments_end_with_a_sentence(words, message, data, refused, tmp_path, monkeypatch):
