@@ -1,6 +1,6 @@
 """The gRPC transport: requests, answers and errors as messages."""
 
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import grpc.aio
@@ -54,8 +54,6 @@ HEALTH_CHECK = "/grpc.health.v1.Health/Check"
 SERVING = b"\x08\x01"
 
 ERROR_METADATA = "edgegrasp-error-bin"
-
-Filled = tuple[Message, object]  # a message, and the mapping of its fields that goes into it
 
 _BY_CODE: dict[grpc.StatusCode, type[GraspClientError]] = {
     grpc.StatusCode.DEADLINE_EXCEEDED: DeadlineError,
@@ -260,8 +258,7 @@ def fill(message: Message, value: object, path: str) -> None:
     Raises:
         InvalidRequestError: The message cannot hold the value. The server checks everything else.
     """
-    if (form := _FORMS.get(type(message))) is not None:
-        message, value = form(message, value, path)
+    message, value = _target(message, value, path)
     if not isinstance(value, Mapping):
         raise invalid(path, repr(value)[:80], f"Give a mapping with {_known(message)}.")
     message.SetInParent()
@@ -303,91 +300,57 @@ def _known(message: Message) -> str:
     return ", ".join(f.name for f in message.DESCRIPTOR.fields if f.name not in internal)
 
 
-def _options(message: Message, value: Any, path: str) -> Filled:
-    """One viewpoint may be given without a list, and objects as a choice of some."""
-    if isinstance(value.get("objects"), Mapping):
-        value = {**value, "object_choice": value["objects"]}
-        del value["objects"]
-    viewpoint = value.get("viewpoint")
-    listed = isinstance(viewpoint, list) and bool(viewpoint) and isinstance(viewpoint[0], list)
-    if viewpoint is None or listed:
-        return message, value
-    return message, {**value, "viewpoint": [viewpoint]}
-
-
-def _coordinates(message: Message, value: Any, path: str) -> Filled:
+def _target(message: Any, value: Any, path: str) -> tuple[Any, Any]:
+    """What to fill, and with which fields; JSON writes some messages in another way."""
     names = [field.name for field in message.DESCRIPTOR.fields]
-    if not isinstance(value, Sequence) or len(value) != len(names):
-        count = {2: "two", 3: "three", 4: "four"}[len(names)]
-        raise invalid(path, repr(value)[:80], f"Give {count} numbers: {', '.join(names)}.")
-    return message, dict(zip(names, value, strict=True))
-
-
-def _corners(message: Message, value: Any, path: str) -> Filled:
-    if not isinstance(value, Sequence) or len(value) != 2:
-        raise invalid(path, repr(value)[:80], "Give two corners: [min, max].")
-    return message, {"min": value[0], "max": value[1]}
-
-
-def _gripper(message: Any, value: Any, path: str) -> Filled:
-    return (message, {"name": value}) if isinstance(value, str) else (message.geometry, value)
-
-
-def _shape(message: Message, value: Any, path: str) -> Filled:
-    kinds = [field.name for field in message.DESCRIPTOR.fields]
-    if not isinstance(value, Mapping) or value.get("kind") not in kinds:
-        kind = repr(value.get("kind") if isinstance(value, Mapping) else value)[:80]
-        raise invalid(path, kind, f"Set its kind to one of {', '.join(kinds)}.")
-    return getattr(message, value["kind"]), _without_kind(value)
-
-
-def _support(message: Any, value: Any, path: str) -> Filled:
-    if value is None or value == "none":
-        return message, {"disabled": True}
-    value = {"kind": value} if isinstance(value, str) else value
-    if not isinstance(value, Mapping):
-        raise invalid(path, repr(value)[:80], "Give a mapping with normal and offset.")
-    kind = value.get("kind", "plane")
-    if kind in ("auto", "ransac"):
-        return getattr(message, kind), _without_kind(value)
-    if kind != "plane" or {"auto", "ransac"} & value.keys():
-        raise invalid(path, repr(kind)[:80], "Set its kind to one of auto, plane, ransac, none.")
-    return message, _without_kind(value)
-
-
-def _suppression(message: Message, value: Any, path: str) -> Filled:
-    return message, {"disabled": True} if value is None else value
-
-
-def _collision(message: Message, value: Any, path: str) -> Filled:
-    return message, {"mode": value} if isinstance(value, str) else value
-
-
-def _with_pose(message: Message, value: Any, path: str) -> Filled:
-    """A pose may also be given as rows, like an array."""
-    for name, pose in value.items() if isinstance(value, Mapping) else ():
-        if name.startswith("T_") and pose and all(isinstance(row, list) for row in pose):
-            value = {**value, name: [number for row in pose for number in row]}
+    fields = dict(value) if isinstance(value, Mapping) else {}
+    match message.DESCRIPTOR.name:
+        case "DetectOptions":  # one viewpoint may be given without a list
+            if isinstance(fields.get("objects"), Mapping):
+                fields["object_choice"] = fields.pop("objects")
+            viewpoint = fields.get("viewpoint")
+            listed = isinstance(viewpoint, list) and viewpoint and isinstance(viewpoint[0], list)
+            if viewpoint is not None and not listed:
+                fields["viewpoint"] = [viewpoint]
+            return message, fields
+        case "RobotArm" | "Place" if fields:  # a pose may also be given as rows, like an array
+            for name, pose in fields.items():
+                if name.startswith("T_") and pose and all(isinstance(row, list) for row in pose):
+                    fields[name] = [number for row in pose for number in row]
+            return message, fields
+        case "Pixel" | "Vector" | "Quaternion":
+            if not isinstance(value, Sequence) or len(value) != len(names):
+                count = {2: "two", 3: "three", 4: "four"}[len(names)]
+                raise invalid(path, repr(value)[:80], f"Give {count} numbers: {', '.join(names)}.")
+            return message, dict(zip(names, value, strict=True))
+        case "HandBox":
+            if not isinstance(value, Sequence) or len(value) != 2:
+                raise invalid(path, repr(value)[:80], "Give two corners: [min, max].")
+            return message, {"min": value[0], "max": value[1]}
+        case "GripperChoice":
+            named = isinstance(value, str)
+            return (message, {"name": value}) if named else (message.geometry, value)
+        case "Shape" | "Obstacle":
+            kind = fields.pop("kind", None)
+            if kind not in names:
+                found = kind if isinstance(value, Mapping) else value
+                fix = f"Set its kind to one of {', '.join(names)}."
+                raise invalid(path, repr(found)[:80], fix)
+            return getattr(message, kind), fields
+        case "Support":
+            if value is None or value == "none":
+                return message, {"disabled": True}
+            if not isinstance(value, Mapping | str):
+                raise invalid(path, repr(value)[:80], "Give a mapping with normal and offset.")
+            kind = value if isinstance(value, str) else fields.pop("kind", "plane")
+            if kind in ("auto", "ransac"):
+                return getattr(message, kind), fields
+            if kind != "plane" or {"auto", "ransac"} & fields.keys():
+                fix = "Set its kind to one of auto, plane, ransac, none."
+                raise invalid(path, repr(kind)[:80], fix)
+            return message, fields
+        case "Suppression" if value is None:
+            return message, {"disabled": True}
+        case "Collision" if isinstance(value, str):
+            return message, {"mode": value}
     return message, value
-
-
-def _without_kind(value: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: part for name, part in value.items() if name != "kind"}
-
-
-# Messages that JSON does not write field by field: the message to fill, and its fields.
-_FORMS: dict[type[Message], Callable[[Any, Any, str], Filled]] = {
-    grasp_pb2.DetectOptions: _options,
-    grasp_pb2.RobotArm: _with_pose,
-    grasp_pb2.Place: _with_pose,
-    grasp_pb2.Pixel: _coordinates,
-    grasp_pb2.Vector: _coordinates,
-    grasp_pb2.Quaternion: _coordinates,
-    grasp_pb2.HandBox: _corners,
-    grasp_pb2.GripperChoice: _gripper,
-    grasp_pb2.Shape: _shape,
-    grasp_pb2.Obstacle: _shape,
-    grasp_pb2.Support: _support,
-    grasp_pb2.Suppression: _suppression,
-    grasp_pb2.Collision: _collision,
-}
