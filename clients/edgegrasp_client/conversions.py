@@ -142,10 +142,7 @@ def moveit_grasp(
         "id": name,
         "pre_grasp_posture": _posture(joints, grasp.width, header),
         "grasp_posture": _posture(joints, 0.0, header),
-        "grasp_pose": {
-            "header": header,
-            "pose": pose_fields(T_cloud_link),
-        },
+        "grasp_pose": {"header": header, "pose": pose_fields(T_cloud_link)},
         "grasp_quality": float(grasp.score),
         "pre_grasp_approach": _translation(approach, approach_distance, header),
         "post_grasp_retreat": _translation(-approach, retreat_distance, header),
@@ -221,20 +218,25 @@ def isaac_grasps(
     Raises:
         ModuleNotFoundError: The extra `yaml` is not installed.
     """
-    T_object_cloud = _matrix(T_object_cloud)
-    T_hand_gripper = _matrix(T_hand_gripper)
     link = {"isaac-sim": "_link", "isaac-ros": ""}[dialect]
+    found: Message = {}
+    for number, grasp in enumerate(grasps):
+        T_object_hand = _matrix(T_object_cloud) @ _matrix(grasp.T_cloud_hand)
+        pose = pose_fields(T_object_hand @ _matrix(T_hand_gripper))
+        w, *xyz = (pose["orientation"][axis] for axis in "wxyz")
+        found[f"grasp_{number}"] = {
+            "confidence": float(grasp.score),
+            "position": list(pose["position"].values()),
+            "orientation": {"w": w, "xyz": xyz},
+            "cspace_position": _joint_positions(joints.at(0.0)),
+            "pregrasp_cspace_position": _joint_positions(joints.at(grasp.width)),
+        }
     file = {
         "format": "isaac_grasp",
         "format_version": 1.0,
         f"object_frame{link}": object_frame,
         f"gripper_frame{link}": gripper_frame,
-        "grasps": {
-            f"grasp_{number}": _isaac_fields(
-                grasp, T_object_cloud @ _matrix(grasp.T_cloud_hand) @ T_hand_gripper, joints
-            )
-            for number, grasp in enumerate(grasps)
-        },
+        "grasps": found,
     }
     return str(_yaml().safe_dump(file, sort_keys=False, default_flow_style=None, width=200))
 
@@ -281,13 +283,9 @@ def matrix_from_quaternion(quaternion: ArrayLike) -> Float64:
     if not np.isfinite(length) or length < 1e-12:
         raise ValueError(f"quaternion: got {q.tolist()}. Give x, y, z, w that are not all zero.")
     x, y, z, w = q / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # cross @ v: the axis times v
+    rotation: Float64 = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    return rotation
 
 
 def _matrix(pose: ArrayLike | None) -> Float64:
@@ -311,11 +309,7 @@ def _posture(joints: FingerJoints, opening: float, header: Message) -> Message:
         "effort": [],
         "time_from_start": {"sec": 0, "nanosec": 0},
     }
-    return {
-        "header": header,
-        "joint_names": list(joints.names),
-        "points": [point],
-    }
+    return {"header": header, "joint_names": list(joints.names), "points": [point]}
 
 
 def _translation(direction: Float64, distance: float, header: Message) -> Message:
@@ -330,18 +324,6 @@ def _translation(direction: Float64, distance: float, header: Message) -> Messag
 def xyz_fields(vector: Array) -> Message:
     """A vector (3,) as the fields x, y, z."""
     return {axis: float(value) for axis, value in zip("xyz", vector, strict=True)}
-
-
-def _isaac_fields(grasp: Grasp, T_object_gripper: Float64, joints: FingerJoints) -> Message:
-    pose = pose_fields(T_object_gripper)
-    w, *xyz = (pose["orientation"][axis] for axis in "wxyz")
-    return {
-        "confidence": float(grasp.score),
-        "position": list(pose["position"].values()),
-        "orientation": {"w": w, "xyz": xyz},
-        "cspace_position": _joint_positions(joints.at(0.0)),
-        "pregrasp_cspace_position": _joint_positions(joints.at(grasp.width)),
-    }
 
 
 def _isaac_grasp(name: str, fields: Any) -> IsaacGrasp:

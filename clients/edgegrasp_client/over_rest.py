@@ -138,38 +138,35 @@ def call_of(request: Request) -> Call:
     query = {name: _text(f"options.{name}", value) for name, value in request.options.items()}
     short = sum(map(len, query.values())) < MAX_QUERY
     if short and not (cloud is None or is_point_cloud2(cloud) or request.arrays):
-        file = cloud_file(cloud)
-        headers = {"content-type": f"application/x-{file.format}"}
+        file_format, data = cloud_file(cloud)
+        headers = {"content-type": f"application/x-{file_format}"}
         post = {"method": "POST", "url": "/v1/grasps", "headers": headers}
-        return {**post, "params": query, "content": file.data}
+        return {**post, "params": query, "content": data}
     parts: dict[str, Part] = {"options": _json_part("options", request.options)}
     if cloud is None:
         images = enumerate(request.depth_images or ())
         fields = [depth_image_fields(image, number) for number, image in images]
         if len(fields) == 1:
             (image,) = fields
-            parts["depth"] = _depth_part(image.pop("depth"))
+            depth = image.pop("depth")
+            if depth["encoding"] == "png":
+                parts["depth"] = ("depth.png", depth["data"], "image/png")
+            else:
+                pixels = np.frombuffer(depth["data"], ENCODINGS[depth["encoding"]])
+                content = npy_bytes(pixels.reshape(depth["height"], depth["width"]))
+                parts["depth"] = ("depth.npy", content, "application/x-npy")
             parts |= {name: _json_part(name, value) for name, value in image.items()}
         else:
             parts["depth_images"] = _json_part("depth_images", fields)
     elif is_point_cloud2(cloud):
         parts["point_cloud2"] = _json_part("point_cloud2", point_cloud2_fields(cloud))
     else:
-        file = cloud_file(cloud)
-        parts["cloud"] = (f"cloud.{file.format}", file.data, f"application/x-{file.format}")
+        file_format, data = cloud_file(cloud)
+        parts["cloud"] = (f"cloud.{file_format}", data, f"application/x-{file_format}")
     for name, array in request.arrays.items():
         parts[name] = (f"{name}.npy", npy_bytes(array), "application/x-npy")
     path = "/v1/grasps:score" if request.scores else "/v1/grasps"
     return {"method": "POST", "url": path, "files": parts}
-
-
-def _depth_part(depth: Mapping[str, Any]) -> Part:
-    """A file of the fields of edgegrasp.v1.Depth."""
-    if depth["encoding"] == "png":
-        return "depth.png", depth["data"], "image/png"
-    pixels = np.frombuffer(depth["data"], ENCODINGS[depth["encoding"]])
-    image = pixels.reshape(depth["height"], depth["width"])
-    return "depth.npy", npy_bytes(image), "application/x-npy"
 
 
 def _json_part(name: str, value: object) -> Part:

@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, TypeGuard, cast
+from typing import Any, TypeGuard, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -193,25 +193,20 @@ def object_in_scene(
 # The forms of the wire
 
 
-class CloudFile(NamedTuple):
-    """A point cloud file."""
-
-    format: str  # one of FILE_FORMATS
-    data: bytes
-
-
 def float32_points(cloud: Cloud) -> Float32 | None:
     """The cloud as (N, 3) float32 if it is an array of N points, else None."""
-    if not isinstance(cloud, np.ndarray) or cloud.dtype not in (np.float32, np.float64):
+    if not isinstance(cloud, np.ndarray) or cloud.shape[1:] != (3,):
         return None
-    if cloud.ndim != 2 or cloud.shape[1] != 3:
+    if cloud.dtype not in (np.float32, np.float64):
         return None
     with np.errstate(over="ignore"):  # the server refuses infinity
         return np.ascontiguousarray(cloud, dtype=np.float32)
 
 
-def cloud_file(cloud: Cloud) -> CloudFile:
-    """The cloud as a file; an array of a wrong shape is sent as is, and the server refuses it.
+def cloud_file(cloud: Cloud) -> tuple[str, bytes]:
+    """The cloud as a file, its format first, which is one of FILE_FORMATS.
+
+    An array of a wrong shape is sent as it is, and the server refuses it.
 
     Raises:
         InvalidRequestError: It is neither an array of numbers nor a readable file of a known
@@ -220,7 +215,7 @@ def cloud_file(cloud: Cloud) -> CloudFile:
     if isinstance(cloud, np.ndarray):
         points = float32_points(cloud)
         try:
-            return CloudFile("npy", npy_bytes(cloud if points is None else points))
+            return "npy", npy_bytes(cloud if points is None else points)
         except ValueError:
             fix = "Send float32 or float64 metres."
             raise invalid("cloud", f"dtype {cloud.dtype}", fix) from None
@@ -233,7 +228,7 @@ def cloud_file(cloud: Cloud) -> CloudFile:
         fix = f"Give one of: {', '.join(FILE_FORMATS)}; a depth image as one of depth_images."
         raise invalid("cloud", repr(path.name), fix)
     try:
-        return CloudFile(file_format, path.read_bytes())
+        return file_format, path.read_bytes()
     except OSError as error:
         raise invalid("cloud", f"{path} ({error.strerror})", "Give a readable file.") from None
 
@@ -285,24 +280,19 @@ def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
     if pose.shape != (4, 4) or pose.dtype.kind not in "iuf":
         value = f"shape {pose.shape}, dtype {pose.dtype}"
         raise invalid(f"{path}.T_cloud_camera", value, "Give a 4 x 4 matrix.")
-    scale = {name: image[name] for name in ("depth_scale",) if name in image}
-    return {
-        "depth": _depth_fields(image["depth"], f"{path}.depth"),
-        "intrinsics": _intrinsics_fields(image["intrinsics"], f"{path}.intrinsics"),
-        "T_cloud_camera": pose.astype(np.float64).tolist(),
-        **scale,
-    }
-
-
-def _intrinsics_fields(intrinsics: object, path: str) -> dict[str, float]:
-    """fx, fy, cx and cy of a mapping, of four numbers or of a matrix (3, 3) or (9,)."""
+    depth = _depth_fields(image["depth"], f"{path}.depth")
     try:
-        numbers = intrinsics_of(intrinsics)._asdict()
-        return {name: float(number) for name, number in numbers.items()}
+        camera = intrinsics_of(image["intrinsics"])._asdict()
+        intrinsics = {name: float(number) for name, number in camera.items()}
     except (TypeError, ValueError):
-        pass
-    fix = "Give fx, fy, cx, cy in pixels, or the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."
-    raise invalid(path, repr(intrinsics)[:80], fix)
+        fix = "Give fx, fy, cx, cy in pixels, or the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."
+        raise invalid(f"{path}.intrinsics", repr(image["intrinsics"])[:80], fix) from None
+    fields = {
+        "depth": depth,
+        "intrinsics": intrinsics,
+        "T_cloud_camera": pose.astype(float).tolist(),
+    }
+    return fields | ({"depth_scale": image["depth_scale"]} if "depth_scale" in image else {})
 
 
 def _depth_fields(depth: object, path: str) -> dict[str, Any]:

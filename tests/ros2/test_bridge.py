@@ -151,7 +151,7 @@ def test_a_depth_image_with_its_camera(client, make_image, camera, kind, encodin
     scene = Scene(depth=make_image(depth, encoding, padding=6), camera=camera)
     found = bridge.detect(client, scene, Settings(), {}, lookup)
     expected = client.detect(depth_images=[{"depth": depth, "intrinsics": MATRIX}]).grasps
-    assert found.frame_id == "camera"
+    assert found.header["frame_id"] == "camera"
     np.testing.assert_allclose(
         [grasp.T_cloud_hand for grasp in found.grasps],
         [grasp.T_cloud_hand for grasp in expected],

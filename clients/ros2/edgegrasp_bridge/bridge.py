@@ -142,12 +142,9 @@ class Inbox:
         Raises:
             ValueError: The mask is too old, or the image that it was made of has not come.
         """
-        return self._seen(mask_age)._replace(joints=self._joints)
-
-    def _seen(self, mask_age: float) -> Scene:
         sources = self._clouds or self._depths
         if not sources:
-            return Scene()
+            return Scene(joints=self._joints)
         source, mask = sources[-1], self._mask if mask_age > 0 else None
         if mask is not None:
             age = _seconds(source.header.stamp) - _seconds(mask.header.stamp)
@@ -159,11 +156,12 @@ class Inbox:
                 raise ValueError("No image has the stamp of the mask. Copy the image's header.")
             source = same[-1]
         if sources is self._clouds:
-            return Scene(cloud=source, mask=mask)
+            return Scene(cloud=source, mask=mask, joints=self._joints)
         latest = {each.header.frame_id: each for each in self._depths} if mask is None else {}
         latest.pop(source.header.frame_id, None)
         others = tuple((each, self._camera_of(each)) for each in latest.values())
-        return Scene(depth=source, camera=self._camera_of(source), mask=mask, others=others)
+        camera = self._camera_of(source)
+        return Scene(None, source, camera, mask, others, self._joints)
 
     def _camera_of(self, depth: Any) -> Any:
         """The CameraInfo of an image: that of its frame, or the only one."""
@@ -175,15 +173,9 @@ class Inbox:
 class Found:
     """Grasps in one frame."""
 
-    grasps: list[Grasp]  # T_cloud_hand and approach_direction are in frame_id
+    grasps: list[Grasp]  # T_cloud_hand and approach_direction are in the header's frame
     detection: Detection  # as the server answered it, in the frame of the cloud
-    frame_id: str
-    stamp: Message
-
-    @property
-    def header(self) -> Message:
-        """std_msgs/Header."""
-        return {"stamp": self.stamp, "frame_id": self.frame_id}
+    header: Message  # std_msgs/Header
 
 
 def detect(
@@ -244,8 +236,13 @@ def detect(
         tracker.take(found)
     target = settings.target_frame or frame_id
     T_target_cloud = lookup(target, frame_id, stamp)
-    grasps = [_moved(grasp, T_target_cloud) for grasp in found.grasps]
-    return Found(grasps, found, target, {"sec": stamp.sec, "nanosec": stamp.nanosec})
+    poses = [(T_target_cloud @ grasp.T_cloud_hand).astype(np.float32) for grasp in found.grasps]
+    grasps = [
+        replace(grasp, T_cloud_hand=pose, approach_direction=pose[:3, 2])
+        for grasp, pose in zip(found.grasps, poses, strict=True)
+    ]
+    taken = {"sec": stamp.sec, "nanosec": stamp.nanosec}
+    return Found(grasps, found, {"stamp": taken, "frame_id": target})
 
 
 def pose_array(found: Found, back: float = 0.0) -> Message:
@@ -291,9 +288,9 @@ def moveit_grasps(found: Found, settings: Settings, lookup: Lookup) -> Message:
     grasps = [
         moveit_grasp(
             grasp,
-            found.frame_id,
+            found.header["frame_id"],
             name=f"grasp_{number}",
-            stamp=found.stamp,
+            stamp=found.header["stamp"],
             joints=settings.joints,
             T_hand_link=T_hand_link,
             approach_distance=settings.approach_distance,
@@ -309,14 +306,30 @@ def object_results(found: Found, settings: Settings, object_id: str = "", most: 
 
     `object_id` names the object whose cloud was sent; empty: all, by their numbers.
     """
-    numbers = [thing.number for thing in found.detection.objects]
-    groups: list[tuple[str, list[Grasp]]] = [
-        (str(number), [each for each in found.grasps if each.object == number])
-        for number in numbers
-    ]
-    if object_id or not numbers:
-        groups = [(object_id, found.grasps)]
-    return {"results": [_object_result(found, settings, *group, most) for group in groups]}
+    detection = found.detection
+    groups = {
+        str(thing.number): [each for each in found.grasps if each.object == thing.number]
+        for thing in detection.objects
+    }
+    if object_id or not groups:
+        groups = {object_id: found.grasps}
+    stages = ", ".join(f"{count} {stage}" for stage, count in detection.counts.items())
+    why = " ".join([f"No grasp: {stages}.", *detection.warnings])
+    results: list[Message] = []
+    for name, grasps in groups.items():
+        candidates = [
+            {
+                "pose": {"header": found.header, "pose": pose_fields(grasp.T_cloud_hand)},
+                "confidence": min(max(float(grasp.score), 0.0), 1.0),
+                "width": float(grasp.width),
+                "pregrasp": pose_fields(grasp.pregrasp(settings.approach_distance)),
+                "retreat": pose_fields(grasp.retreat(settings.retreat_distance)),
+            }
+            for grasp in (grasps[:most] if most else grasps)
+        ]
+        said = {"success": bool(candidates), "message": "" if candidates else why}
+        results.append({"object_id": name, **said, "candidates": candidates})
+    return {"results": results}
 
 
 def failed_result(object_id: str, why: Exception) -> Message:
@@ -324,29 +337,6 @@ def failed_result(object_id: str, why: Exception) -> Message:
     message = f"{type(why).__name__}: {why}"
     failure = {"object_id": object_id, "success": False, "message": message, "candidates": []}
     return {"results": [failure]}
-
-
-def _object_result(
-    found: Found, settings: Settings, name: str, grasps: list[Grasp], most: int
-) -> Message:
-    stages = ", ".join(f"{count} {stage}" for stage, count in found.detection.counts.items())
-    candidates = [
-        {
-            "pose": {"header": found.header, "pose": pose_fields(grasp.T_cloud_hand)},
-            "confidence": min(max(float(grasp.score), 0.0), 1.0),
-            "width": float(grasp.width),
-            "pregrasp": pose_fields(grasp.pregrasp(settings.approach_distance)),
-            "retreat": pose_fields(grasp.retreat(settings.retreat_distance)),
-        }
-        for grasp in (grasps[:most] if most else grasps)
-    ]
-    why = " ".join([f"No grasp: {stages}.", *found.detection.warnings])
-    return {
-        "object_id": name,
-        "success": bool(candidates),
-        "message": "" if candidates else why,
-        "candidates": candidates,
-    }
 
 
 def depth_array(image: Any) -> Array:
@@ -434,15 +424,6 @@ def _depth_points(scene: Scene) -> Float32:
     """Points (N, 3) of the scene's depth image, camera frame; NaN where there is no reading."""
     intrinsics = intrinsics_of(camera_matrix(scene.camera))
     return unproject(metres(depth_array(scene.depth)), intrinsics).reshape(-1, 3)
-
-
-def _moved(grasp: Grasp, T_target_cloud: Float64) -> Grasp:
-    pose = T_target_cloud @ grasp.T_cloud_hand
-    return replace(
-        grasp,
-        T_cloud_hand=pose.astype(np.float32),
-        approach_direction=pose[:3, 2].astype(np.float32),
-    )
 
 
 def _seconds(stamp: Any) -> float:

@@ -3,6 +3,7 @@
 
 import importlib
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -55,7 +56,7 @@ class EdgeGraspNode(Node):
         inputs, actions = MutuallyExclusiveCallbackGroup(), ReentrantCallbackGroup()
         self._motions = [self.create_publisher(JointTrajectory, name, 1) for name in MOTIONS]
         for topic, (kind, field) in INPUTS.items():
-            take = self._take(field)
+            take = partial(self._take, field)
             self.create_subscription(
                 kind, topic, take, qos_profile_sensor_data, callback_group=inputs
             )
@@ -69,7 +70,7 @@ class EdgeGraspNode(Node):
                 self.get_logger().warning(f"{package} is not installed: no action {name}")
                 continue
             topic = "plan_grasps" if name == "GraspPlanning" else "generate_grasps"
-            execute = self._executing(kind, answer, failed)
+            execute = partial(self._execute, kind, answer, failed)
             ActionServer(self, kind, topic, execute, callback_group=actions)
 
     def _read(self) -> Any:
@@ -77,19 +78,14 @@ class EdgeGraspNode(Node):
         values = [parameter.value for parameter in self.get_parameters(names)]
         return bridge.read_parameters(dict(zip(names, values, strict=True)))
 
-    def _take(self, field: str) -> Any:
-        def take(message: Any) -> None:
-            mask_age = self.get_parameter("mask_age").value
-            if (
-                self._inbox.take(field, message, mask_age)
-                and self.get_parameter("on_message").value
-            ):
-                try:
-                    self._detect(follow=self.get_parameter("follow").value)
-                except Exception as error:  # tf2's too: the node goes on with the next message
-                    self.get_logger().warning(f"{type(error).__name__}: {error}")
-
-        return take
+    def _take(self, field: str, message: Any) -> None:
+        mask_age = self.get_parameter("mask_age").value
+        new = self._inbox.take(field, message, mask_age)
+        if new and self.get_parameter("on_message").value:
+            try:
+                self._detect(follow=self.get_parameter("follow").value)
+            except Exception as error:  # tf2's too: the node goes on with the next message
+                self.get_logger().warning(f"{type(error).__name__}: {error}")
 
     def _detect(self, object_cloud: Any = None, follow: bool = False) -> Any:
         settings, options = self._read()
@@ -113,20 +109,17 @@ class EdgeGraspNode(Node):
             publisher.publish(message)
         return found, settings
 
-    def _executing(self, kind: Any, answer: Any, failed: Any) -> Any:
-        def execute(goal: Any) -> Any:
-            result = kind.Result()
-            try:
-                set_message_fields(result, answer(goal.request))
-                goal.succeed()
-            except Exception as error:  # tf2's too: a goal that fails is reported, the node goes on
-                self.get_logger().error(f"{type(error).__name__}: {error}")
-                if failed is not None:
-                    set_message_fields(result, failed(goal.request.object_id, error))
-                goal.abort()
-            return result
-
-        return execute
+    def _execute(self, kind: Any, answer: Any, failed: Any, goal: Any) -> Any:
+        result = kind.Result()
+        try:
+            set_message_fields(result, answer(goal.request))
+            goal.succeed()
+        except Exception as error:  # tf2's too: a goal that fails is reported, the node goes on
+            self.get_logger().error(f"{type(error).__name__}: {error}")
+            if failed is not None:
+                set_message_fields(result, failed(goal.request.object_id, error))
+            goal.abort()
+        return result
 
     def _plan(self, goal: Any) -> bridge.Message:
         cluster = goal.object.point_cluster
