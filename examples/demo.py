@@ -40,7 +40,11 @@ def main(seed: int, output: Path, engine: str | None = None) -> None:
         over_grpc, over_rest = detect_over_both(seen, seed)
         report("gRPC", over_grpc)
         report("REST", over_rest)
-        if not same(over_grpc, over_rest):
+        scores_and_poses = [
+            [(grasp.score, grasp.T_cloud_hand.tolist()) for grasp in found.grasps]
+            for found in (over_grpc, over_rest)
+        ]
+        if scores_and_poses[0] != scores_and_poses[1]:
             sys.exit("error: gRPC and REST gave different grasps.")
         print("gRPC and REST gave the same grasps, to the last bit.\n")
         if len(over_grpc.grasps) < FEWEST_GRASPS:
@@ -107,14 +111,6 @@ def write_ply(path: Path, cloud: NDArray[np.float32], colors: NDArray[np.uint8])
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud)}\n"
     rows = np.concatenate([cloud.astype("<f4").view(np.uint8), colors], axis=1)
     path.write_bytes(f"{head}{axes}{shades}end_header\n".encode() + rows.tobytes())
-
-
-def same(one: Detection, other: Detection) -> bool:
-    """Whether two detections hold the same grasps in the same order."""
-    return len(one.grasps) == len(other.grasps) and all(
-        a.score == b.score and np.array_equal(a.T_cloud_hand, b.T_cloud_hand)
-        for a, b in zip(one.grasps, other.grasps, strict=True)
-    )
 
 
 if __name__ == "__main__":

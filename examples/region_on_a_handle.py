@@ -6,12 +6,11 @@ The image is the playground's sample; a region is drawn there with the mouse, to
 """
 
 import sys
-from importlib.resources import files
 from pathlib import Path
 
 from edgegrasp_client import DepthImage, GraspClient, Region
 
-SAMPLE = Path(str(files("edgegrasp_service"))) / "playground/samples/depth.png"
+SAMPLE = Path(__file__).with_name("sample") / "depth.png"
 IMAGE: DepthImage = {"depth": SAMPLE, "intrinsics": (540.0, 540.0, 320.0, 239.0)}
 HANDLE: Region = {
     "include": [{"kind": "sphere", "center": (0.122, 0.098, 0.497), "radius": 0.022}]

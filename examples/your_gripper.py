@@ -7,12 +7,11 @@ describes the fields; `edgegrasp serve --grippers FILE.toml` gives them a name.
 """
 
 import sys
-from importlib.resources import files
 from pathlib import Path
 
 from edgegrasp_client import DepthImage, GraspClient, GripperGeometry
 
-SAMPLE = Path(str(files("edgegrasp_service"))) / "playground/samples/depth.png"
+SAMPLE = Path(__file__).with_name("sample") / "depth.png"
 IMAGE: DepthImage = {"depth": SAMPLE, "intrinsics": (540.0, 540.0, 320.0, 239.0)}
 SMALL: GripperGeometry = {
     "name": "small",

@@ -8,13 +8,13 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Floats, Int64
+from edgegrasp_camera.arrays import Array, Bools, Float64, Floats, Int64
 from edgegrasp_camera.clouds import CloudInput
 
 Points = Float64
@@ -38,17 +38,6 @@ MAP = "viridis"  # colours of scores from 0 to 1
 OUTLINE = "#10151d"
 REGION = "#4cc9f0"
 EDGES = [(a, b) for a in range(8) for b in range(8) if a < b and bin(a ^ b).count("1") == 1]
-
-
-class Drawable(Protocol):
-    """A grasp that can be drawn, such as the client's or the detector's."""
-
-    @property
-    def score(self) -> float: ...  # noqa: D102
-    @property
-    def T_cloud_hand(self) -> Float32: ...  # noqa: D102, N802  # (4, 4)
-    @property
-    def width(self) -> float: ...  # noqa: D102  # metres
 
 
 @dataclass(frozen=True)
@@ -201,8 +190,11 @@ class Picture:
                 pixels, _ = self.view.project(line)
                 self._axes.plot(*pixels.T, style, color=REGION, linewidth=1.6)
 
-    def grasps(self, grasps: Sequence[Drawable], palm_and_tip: tuple[float, float] = PANDA) -> None:
-        """Draw a fork for every grasp, the best last, and the scale of their scores."""
+    def grasps(self, grasps: Sequence[Any], palm_and_tip: tuple[float, float] = PANDA) -> None:
+        """Draw a fork for every grasp, the best last, and the scale of their scores.
+
+        They have a score, a T_cloud_hand (4, 4) and a width in metres, as the server's have.
+        """
         from matplotlib import colormaps
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import Normalize
@@ -261,7 +253,7 @@ def draw_grasps(
     # `.png` or `.jpg` file to write, whose folder must exist; or where to write a PNG.
     path: Path | BinaryIO,
     cloud: ArrayLike,  # (N, 3) metres
-    grasps: Sequence[Drawable],  # best first
+    grasps: Sequence[Any],  # as for `Picture.grasps`, best first
     *,
     camera_position: ArrayLike,  # (3,) metres, cloud frame; the picture looks from there
     title: str,  # a line below it

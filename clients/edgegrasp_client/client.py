@@ -151,8 +151,7 @@ class AsyncGraspClient:
     ) -> None:
         """Tell a server with an `outcomes_file` what became of a grasp; REST only."""
         tried = {"model": detection.model, "score": float(grasp.score), "held": bool(held)}
-        call = partial(self._transport.record_outcome, tried)
-        await self._retried(call, timeout)
+        await self._retried(partial(self._transport.record_outcome, tried), timeout)
 
     async def ready(self, *, timeout: float | None = None) -> bool:
         """Whether the server can answer requests; False if it is unreachable or still loading."""
@@ -172,11 +171,9 @@ class AsyncGraspClient:
         await self._transport.close()
 
     async def __aenter__(self) -> Self:
-        """Itself."""
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Close the connection."""
         await self.close()
 
     def _seconds(self, timeout: float | None) -> float:
@@ -285,11 +282,9 @@ class GraspClient:
             asyncio.run_coroutine_threadsafe(end(), _loop())
 
     def __enter__(self) -> Self:
-        """Itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the connection."""
         self.close()
 
 

@@ -175,14 +175,12 @@ def read_field(message: Message, name: str) -> Any:
 def _error_of(error: Any) -> GraspClientError:
     """The exception for a failed call, as the server describes it or by its status code."""
     code, message = error.code(), error.details() or ""
-    for name, value in error.trailing_metadata() or ():
-        if name == ERROR_METADATA:
-            try:
-                detail = grasp_pb2.ErrorDetail.FromString(bytes(value))
-            except DecodeError:
-                break
-            return _described(message, detail)
-    return _BY_CODE.get(code, ProtocolError)(f"{code.name}: {message}")
+    metadata = dict(error.trailing_metadata() or ())
+    try:
+        detail = grasp_pb2.ErrorDetail.FromString(metadata[ERROR_METADATA])
+    except (DecodeError, KeyError):
+        return _BY_CODE.get(code, ProtocolError)(f"{code.name}: {message}")
+    return _described(message, detail)
 
 
 def _described(message: str, detail: grasp_pb2.ErrorDetail) -> GraspClientError:

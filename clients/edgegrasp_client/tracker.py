@@ -116,8 +116,7 @@ class GraspTracker:
             self._since = self._every  # perhaps a bad image: look once more for the same grasp
             return
         if self._searching:
-            self._objects, self._since = {}, 1
-            self._last = None
+            self._objects, self._since, self._last = {}, 1, None
         self._objects |= {one.number: one for one in detection.objects if one.surface is not None}
         if detection.grasps:
             self._last, score = detection, detection.grasps[0].score

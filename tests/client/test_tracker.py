@@ -1,7 +1,7 @@
 """What the tracker sends: the latest image, and what the last answer said."""
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -67,6 +67,18 @@ def test_after_a_bad_answer_it_looks_for_others_too(bad: Detection) -> None:
     assert sent["grasps"][0]["id"] == 0  # the one to keep if it is there after all
 
 
+def followed(camera: Iterator[Any], at_work: Callable[[], Any] = bool) -> list[Any]:
+    """The images that a tracker sends to a server, which calls `at_work` for each."""
+
+    def stream(requests: Any) -> Iterator[StreamAnswer]:
+        for _ in requests:
+            at_work()
+            yield StreamAnswer("", answer("started"))
+
+    client: Any = SimpleNamespace(detect_stream=stream)
+    return [image["cloud"][0, 0] for image, _ in GraspTracker().follow(client, camera)]
+
+
 def test_images_that_come_while_one_is_at_work_are_dropped_but_for_the_latest() -> None:
     read = threading.Event()
 
@@ -75,13 +87,7 @@ def test_images_that_come_while_one_is_at_work_are_dropped_but_for_the_latest() 
             yield {"cloud": CLOUD + number}
         read.set()
 
-    def stream(requests: Any) -> Iterator[StreamAnswer]:
-        for _ in requests:
-            read.wait()
-            yield StreamAnswer("", answer("started"))
-
-    client: Any = SimpleNamespace(detect_stream=stream)
-    seen = [image["cloud"][0, 0] for image, _ in GraspTracker().follow(client, camera())]
+    seen = followed(camera(), read.wait)
     assert seen[-1] == 9
     assert len(seen) <= 2
 
@@ -91,10 +97,5 @@ def test_an_error_of_the_camera_is_raised() -> None:
         yield {"cloud": CLOUD}
         raise OSError("unplugged")
 
-    def stream(requests: Any) -> Iterator[StreamAnswer]:
-        for _ in requests:
-            yield StreamAnswer("", answer("started"))
-
-    client: Any = SimpleNamespace(detect_stream=stream)
     with pytest.raises(OSError, match="unplugged"):
-        list(GraspTracker().follow(client, camera()))
+        followed(camera())

@@ -28,19 +28,6 @@ DEFINITIONS = {
         moveit_msgs/GripperTranslation post_place_retreat
         float32 max_contact_force
         string[] allowed_touch_objects""",
-    "grasping_msgs/msg/ObjectProperty": "string name\nstring value",
-    "grasping_msgs/msg/Object": """
-        std_msgs/Header header
-        string name
-        string support_surface
-        grasping_msgs/ObjectProperty[] properties
-        sensor_msgs/PointCloud2 point_cluster
-        shape_msgs/SolidPrimitive[] primitives
-        geometry_msgs/Pose[] primitive_poses
-        shape_msgs/Mesh[] meshes
-        geometry_msgs/Pose[] mesh_poses
-        shape_msgs/Plane surface""",
-    "grasping_msgs/msg/GraspPlanning_Goal": "grasping_msgs/Object object\nstring group_name",
     "grasping_msgs/msg/GraspPlanning_Result": "moveit_msgs/Grasp[] grasps",
 }
 

@@ -152,6 +152,7 @@ def test_a_depth_image_with_its_camera(client, make_image, camera, kind, encodin
     found = bridge.detect(client, scene, Settings(), {}, lookup)
     expected = client.detect(depth_images=[{"depth": depth, "intrinsics": MATRIX}]).grasps
     assert found.header["frame_id"] == "camera"
+    assert bridge.trajectories(found) == []
     np.testing.assert_allclose(
         [grasp.T_cloud_hand for grasp in found.grasps],
         [grasp.T_cloud_hand for grasp in expected],
@@ -235,12 +236,15 @@ def test_an_object_and_its_scene_come_apart(asked, make_cloud, make_image, camer
     assert asked.cloud is cluster
 
 
-def test_no_grasp_says_why(asked, sent, make_cloud, cloud) -> None:
+def test_no_grasp_and_an_aborted_goal_say_why(asked, sent, make_cloud, cloud) -> None:
     found = bridge.detect(asked, Scene(make_cloud(cloud)), Settings(), {}, lookup)
-    fields = bridge.object_results(found, Settings(), "mug")
-    (each,) = sent("edgegrasp_ros2/msg/GenerateGrasps_Result", fields).results
-    assert not each.success
-    assert "No grasp: 500 points" in each.message
+    for fields, message in (
+        (bridge.object_results(found, Settings(), "mug"), "No grasp: 500 points"),
+        (bridge.failed_result("mug", LookupError("no frame")), "LookupError: no frame"),
+    ):
+        (each,) = sent("edgegrasp_ros2/msg/GenerateGrasps_Result", fields).results
+        assert (each.object_id, each.success) == ("mug", False)
+        assert message in each.message
 
 
 def test_a_mask_is_of_the_image_it_was_made_of_and_grows_old(make_image, camera) -> None:
@@ -367,15 +371,3 @@ def test_an_arm_that_is_not_known_is_not_planned_for(
     scene = Scene(make_cloud(cloud), joints=joints)
     with pytest.raises(ValueError, match=message):
         bridge.detect(planning, scene, Settings(), {"robot": {"name": name}}, lookup)
-
-
-def test_an_aborted_goal_says_why(sent) -> None:
-    fields = bridge.failed_result("mug", LookupError("no frame base"))
-    (each,) = sent("edgegrasp_ros2/msg/GenerateGrasps_Result", fields).results
-    assert (each.object_id, each.success) == ("mug", False)
-    assert each.message == "LookupError: no frame base"
-
-
-def test_without_a_robot_there_is_no_trajectory(client, make_cloud, cloud) -> None:
-    found = bridge.detect(client, Scene(make_cloud(cloud)), Settings(), {}, lookup)
-    assert bridge.trajectories(found) == []
