@@ -2,35 +2,26 @@
 
 usage: python examples/without_a_server.py
 
-Needs the extra `service`. The cloud is a made-up box of 5 x 8 x 6 cm on a table at z = 0.
+Needs the extra `service`. The array is the playground's sample, as points of its camera.
 """
+
+from pathlib import Path
 
 import numpy as np
 
+from edgegrasp_camera.files import sent_cloud
 from edgegrasp_model.detector import ModelCatalogue
-from edgegrasp_model.options import DetectOptions, SupportPlane
+from edgegrasp_model.options import DetectOptions
 
-
-def box_cloud(rng: np.random.Generator) -> np.ndarray:
-    """Points on the surface of the box, except its bottom.  # (6000, 3) float32 metres."""
-    size = np.array([0.05, 0.08, 0.06])
-    points = rng.uniform(0.0, size, (6000, 3))
-    face = rng.integers(5, size=len(points))
-    axis, far = face % 3, face // 3 == 0
-    rows = np.arange(len(points))
-    points[rows, axis] = np.where(far, size[axis], 0.0)
-    return points.astype(np.float32)
+SAMPLE = Path(__file__).with_name("sample") / "depth.png"
+IMAGE = {"depth": SAMPLE, "intrinsics": (540.0, 540.0, 320.0, 239.0)}
 
 
 def main() -> None:
-    """Print the five best grasps of the box."""
-    detector = ModelCatalogue.load().get("")
-    options = DetectOptions(
-        viewpoint=(0.3, 0.4, 0.5),
-        support=SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.0),
-        top_k=5,
-    )
-    detection = detector.detect(box_cloud(np.random.default_rng(0)), options)
+    """Print the five best grasps of the sample."""
+    points = np.asarray(sent_cloud(None, [IMAGE]).points)  # (480, 640, 3) metres, NaN for holes
+    options = DetectOptions(viewpoint=(0.0, 0.0, 0.0), top_k=5)
+    detection = ModelCatalogue.load().get("").detect(points, options)
     for grasp in detection.grasps:
         print(f"score {grasp.score:.3f}, approach {np.round(grasp.approach_direction, 2)}")
     print("counts:", detection.counts)

@@ -116,7 +116,9 @@ class GrpcTransport:
             except Exception as error:  # gRPC would only log it
                 failed.append(error)
 
-        call: Any = self._method("DetectGraspsStream")(messages(), metadata=self._metadata)
+        read = grasp_pb2.DetectGraspsStreamResponse.FromString
+        method = self._channel.stream_stream(f"/{SERVICE}/DetectGraspsStream", None, read)
+        call: Any = method(messages(), metadata=self._metadata)
         try:
             async for answer in call:
                 if answer.HasField("detection"):
@@ -148,16 +150,11 @@ class GrpcTransport:
         """Close the channel."""
         await self._channel.close(None)
 
-    def _method(self, name: str) -> Any:
-        """A method of the service; it takes serialized requests."""
-        streams = name.endswith("Stream")
-        method = self._channel.stream_stream if streams else self._channel.unary_unary
-        response = getattr(grasp_pb2, f"{name}Response")
-        return method(f"/{SERVICE}/{name}", None, response.FromString)
-
     async def _call(self, name: str, request: bytes, timeout: float) -> Any:
+        """The answer of a method of the service to a serialized request."""
+        response = getattr(grasp_pb2, f"{name}Response")
+        method = self._channel.unary_unary(f"/{SERVICE}/{name}", None, response.FromString)
         try:
-            method = self._method(name)
             return await method(request, timeout=timeout, metadata=self._metadata)
         except grpc.RpcError as error:
             raise _error_of(error) from None
@@ -205,7 +202,6 @@ def wire_of(request: Request) -> list[bytes | memoryview]:
     if cloud is None:
         for which, image in enumerate(request.depth_images or ()):
             view, fields = grasp_pb2.DepthImage(), depth_image_fields(image, which)
-            fields["T_cloud_camera"] = np.ravel(fields["T_cloud_camera"]).tolist()
             data = _field(view.depth, "data", fields["depth"].pop("data"))
             fill(view, fields, f"depth_images.{which}")
             whole = view.SerializeToString(), *_field(view, "depth", *data)
@@ -311,7 +307,9 @@ def _target(message: Any, value: Any, path: str) -> tuple[Any, Any]:
             if viewpoint is not None and not listed:
                 fields["viewpoint"] = [viewpoint]
             return message, fields
-        case "RobotArm" | "Place" if fields:  # a pose may also be given as rows, like an array
+        case "DepthImage" | "RobotArm" | "Place" if (
+            fields
+        ):  # a pose may also be given as rows, like an array
             for name, pose in fields.items():
                 if name.startswith("T_") and pose and all(isinstance(row, list) for row in pose):
                     fields[name] = [number for row in pose for number in row]

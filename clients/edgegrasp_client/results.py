@@ -72,7 +72,6 @@ _STAGES = (
     *("clear_of_support", "checked", "collision_free", "given", "scored", "above_min_score"),
     *("suppressed", "on_arm", "hand_collision", "out_of_reach", "arm_collision", "no_place"),
     *("reachable", "with_trajectory", "returned", "description", "network", "ranking", "arm"),
-    *("total"),
 )
 
 Record = TypeVar("Record")

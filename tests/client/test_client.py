@@ -188,9 +188,8 @@ def test_answers_are_those_of_single_requests(client, cloud) -> None:
     for seed, answer in enumerate(answers):
         assert answer.request_id == str(seed)
         alone = client.detect(cloud, seed=seed, top_k=3)
-        found = answer.result()
-        assert [grasp.score for grasp in found.grasps] == [grasp.score for grasp in alone.grasps]
-        assert found.counts == alone.counts
+        assert_same(answer.result(), alone)
+        assert answer.result().counts == alone.counts
 
 
 def test_what_cannot_be_sent_ends_the_stream_after_what_went_before(client, cloud) -> None:
