@@ -143,15 +143,10 @@ def _read_npz(data: bytes, max_points: int) -> CloudInput:
         known = {*NPZ_IMAGE, "rgb"} if members.keys() >= NPZ_IMAGE else {*NPZ_CLOUD, "rgb"}
         if not members.keys() & {"points", *(known & NPZ_IMAGE)}:
             raise ValueError(f"with {', '.join(sorted(members)[:5])}, and no array points")
-        contents = {
-            name: _unzipped(archive, info, max_points)
-            for name, info in members.items()
-            if name in known
-        }
-    arrays: dict[str, Any] = {
-        name: read_npy(content, max_points, "cloud" if name == "points" else name)
-        for name, content in contents.items()
-    }
+        arrays: dict[str, Any] = {}
+        for name in [name for name in members if name in known]:
+            content = _unzipped(archive, members[name], max_points)
+            arrays[name] = read_npy(content, max_points, "cloud" if name == "points" else name)
     rgb, unread = arrays.pop("rgb", None), sorted(members.keys() - known)
     said = (f"arrays of the file that are not read: {', '.join(unread[:5])}.",) if unread else ()
     if "depth" in arrays:

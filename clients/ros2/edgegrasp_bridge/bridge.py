@@ -205,10 +205,9 @@ def detect(
     """
     if scene.header is None and object_cloud is not None:
         scene, object_cloud = Scene(cloud=object_cloud), None
-    header = scene.header
-    if header is None:
+    if scene.header is None:
         raise ValueError("No cloud and no depth image has come yet.")
-    frame_id, stamp = header.frame_id, header.stamp
+    frame_id, stamp = scene.header.frame_id, scene.header.stamp
     asked = _from_frames(scene, settings, lookup) | dict(tracker.options() if tracker else options)
     if scene.mask is not None and object_cloud is None:
         asked = dict(on_mask(image_array(scene.mask), asked))
@@ -236,21 +235,15 @@ def detect(
         tracker.take(found)
     target = settings.target_frame or frame_id
     T_target_cloud = lookup(target, frame_id, stamp)
-    poses = [(T_target_cloud @ grasp.T_cloud_hand).astype(np.float32) for grasp in found.grasps]
-    grasps = [
-        replace(grasp, T_cloud_hand=pose, approach_direction=pose[:3, 2])
-        for grasp, pose in zip(found.grasps, poses, strict=True)
-    ]
+    grasps = [_moved(grasp, T_target_cloud) for grasp in found.grasps]
     taken = {"sec": stamp.sec, "nanosec": stamp.nanosec}
     return Found(grasps, found, {"stamp": taken, "frame_id": target})
 
 
 def pose_array(found: Found, back: float = 0.0) -> Message:
     """geometry_msgs/PoseArray of the hand's frame, best first; `back`: metres before the grasp."""
-    return {
-        "header": found.header,
-        "poses": [pose_fields(each.pregrasp(back)) for each in found.grasps],
-    }
+    poses = [pose_fields(each.pregrasp(back)) for each in found.grasps]
+    return {"header": found.header, "poses": poses}
 
 
 def marker_array(found: Found) -> Message:
@@ -259,7 +252,6 @@ def marker_array(found: Found) -> Message:
     gripper = found.detection.gripper
     for number, grasp in enumerate(found.grasps):
         pieces = fork(grasp.T_cloud_hand, grasp.width, (gripper.palm_z, gripper.tip_z))
-        ends = pieces.reshape(-1, 3)
         score = float(grasp.score)
         marker = {
             "header": found.header,
@@ -268,7 +260,7 @@ def marker_array(found: Found) -> Message:
             "type": LINE_LIST,
             "scale": {"x": LINE_WIDTH, "y": 0.0, "z": 0.0},
             "color": {"r": 1.0 - score, "g": score, "b": 0.0, "a": 1.0},
-            "points": [xyz_fields(end) for end in ends],
+            "points": [xyz_fields(end) for end in pieces.reshape(-1, 3)],
         }
         markers.append(marker)
     return {"markers": markers}
@@ -424,6 +416,11 @@ def _depth_points(scene: Scene) -> Float32:
     """Points (N, 3) of the scene's depth image, camera frame; NaN where there is no reading."""
     intrinsics = intrinsics_of(camera_matrix(scene.camera))
     return unproject(metres(depth_array(scene.depth)), intrinsics).reshape(-1, 3)
+
+
+def _moved(grasp: Grasp, T_target_cloud: Float64) -> Grasp:
+    pose = (T_target_cloud @ grasp.T_cloud_hand).astype(np.float32)
+    return replace(grasp, T_cloud_hand=pose, approach_direction=pose[:3, 2])
 
 
 def _seconds(stamp: Any) -> float:
