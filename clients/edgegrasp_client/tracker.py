@@ -51,31 +51,23 @@ class GraspTracker:
             An image and its answer. Raises GraspClientError, and whatever `images` raises.
         """
         latest: queue.Queue[Any] = queue.Queue(1)
-        asked, stopped = threading.Semaphore(1), threading.Event()
-        at_work: list[Mapping[str, Any]] = []
-
-        def requests() -> Iterator[StreamRequest]:
-            while True:
-                asked.acquire()
-                image = latest.get()
+        requests: queue.Queue[StreamRequest | None] = queue.Queue()
+        stopped = threading.Event()
+        threading.Thread(target=_read, args=(images, latest, stopped), daemon=True).start()
+        answers = client.detect_stream(iter(requests.get, None))
+        try:
+            while (image := latest.get()) is not None:
                 if isinstance(image, Exception):
                     raise image
-                if image is None or stopped.is_set():
+                requests.put(StreamRequest(**{**image, **self.options()}))
+                if (answer := next(answers, None)) is None:
                     return
-                at_work.append(image)
-                yield StreamRequest(**{**image, **self.options()})
-
-        threading.Thread(target=_read, args=(images, latest, stopped), daemon=True).start()
-        answers = client.detect_stream(requests())
-        try:
-            for answer in answers:
                 detection = answer.result()
                 self.take(detection)
-                yield at_work.pop(), detection
-                asked.release()  # only now: an image taken earlier would be old
+                yield image, detection
         finally:
             stopped.set()
-            asked.release()
+            requests.put(None)
             _put(latest, None)
 
     def options(self) -> DetectOptions:
