@@ -225,12 +225,15 @@ def _record(fields: Iterable[tuple[str, str, int]], order: str) -> np.dtype[Any]
 
 
 def _read_records(
-    body: bytes, record: np.dtype[Any], count: int, max_points: int, text: bool
+    body: bytes, record: np.dtype[Any], count: int, max_points: int, encoding: str
 ) -> Records:
     """Read `count` records, after checking that the body holds as many."""
-    columns = sum(math.prod(record[name].shape) for name in record.names or ())
     if count > max_points:
         raise too_many(count, max_points)
+    if encoding == "binary_compressed":
+        return _read_compressed_records(body, record, count)
+    text = encoding == "ascii"
+    columns = sum(math.prod(record[name].shape) for name in record.names or ())
     if count < 1 or count * (columns if text else record.itemsize) > len(body):
         raise ValueError(f"{len(body)} bytes of data where the header promises {count} rows")
     if not text:
@@ -283,7 +286,7 @@ def _read_ply(data: bytes, max_points: int) -> CloudInput:
         PLY_ORDERS[encoding],
     )
     count, body = int(lines[elements[0]][2]), data[end.end() :]
-    return cloud_of_records(_read_records(body, record, count, max_points, encoding == "ascii"))
+    return cloud_of_records(_read_records(body, record, count, max_points, encoding))
 
 
 # .pcd
@@ -308,23 +311,15 @@ def _read_pcd(data: bytes, max_points: int) -> CloudInput:
         for name, kind, count in zip(names, kinds, counts, strict=True)
     ]
     record, count, body = _record(fields, "<"), int(header["POINTS"][0]), data[end.end() :]
-    if end[1] == b"binary_compressed":
-        rows = _read_compressed_records(body, record, count, max_points)
-    else:
-        rows = _read_records(body, record, count, max_points, end[1] == b"ascii")
-    cloud = cloud_of_records(rows)
+    cloud = cloud_of_records(_read_records(body, record, count, max_points, end[1].decode()))
     height, width = (int(header.get(name, ["1"])[0]) for name in ("HEIGHT", "WIDTH"))
     if height < 2 or height * width != count:
         return cloud
     return replace(cloud, points=np.asarray(cloud.points).reshape(height, width, 3))
 
 
-def _read_compressed_records(
-    body: bytes, record: np.dtype[Any], count: int, max_points: int
-) -> Records:
+def _read_compressed_records(body: bytes, record: np.dtype[Any], count: int) -> Records:
     """Read `count` records that are compressed field by field: all x, then all y, and so on."""
-    if count > max_points:
-        raise too_many(count, max_points)
     packed, unpacked = struct.unpack_from("<II", body)
     if len(body) - 8 < packed or unpacked != count * record.itemsize:
         raise ValueError(f"{len(body)} bytes of compressed data where more are promised")
