@@ -78,7 +78,7 @@ def detect_over_both(seen: Observation, seed: int) -> tuple[Detection, Detection
         "suppression": {"translation": 0.02, "rotation": 3.2},  # one grasp every 2 cm
     }
     print("Starting a server, which loads its weights …", flush=True)
-    with local_server("--log-level", "warning") as addresses:
+    with local_server() as addresses:
         print(f"Server: {addresses.http_url} and gRPC {addresses.grpc_address}\n")
         with GraspClient(addresses.grpc_address, timeout=TIMEOUT) as client:
             over_grpc = client.detect(seen.cloud, **options)

@@ -167,10 +167,10 @@ class Picture:
         grey = 70 + 165 * lit(depth, abs(self.view.fx), self.view.fy)
         return np.repeat(grey[..., None], 3, axis=2)
 
-    def lines(self, points: ArrayLike, color: str, width: float) -> None:
+    def lines(self, points: ArrayLike, color: str, width: float, style: str = "-") -> None:
         """Draw a line through points (K, 3), cloud frame."""
         pixels, _ = self.view.project(points)
-        self._axes.plot(*pixels.T, color=color, linewidth=width)
+        self._axes.plot(*pixels.T, style, color=color, linewidth=width)
 
     def outline(self, mask: Bools) -> None:
         """Draw the border of a mask (H, W) in white."""
@@ -187,8 +187,7 @@ class Picture:
             drawn += [(shape, ":") for shape in region.get("exclude", ())]
         for shape, style in drawn:
             for line in _lines_of(shape):
-                pixels, _ = self.view.project(line)
-                self._axes.plot(*pixels.T, style, color=REGION, linewidth=1.6)
+                self.lines(line, REGION, 1.6, style)
 
     def grasps(self, grasps: Sequence[Any], palm_and_tip: tuple[float, float] = PANDA) -> None:
         """Draw a fork for every grasp, the best last, and the scale of their scores.
@@ -339,7 +338,6 @@ def fork(
 
 def _lines_of(shape: Mapping[str, Any]) -> Iterator[Points]:
     """Edges of a box, or circles of a ball, as lines (K, 3); nothing of other shapes."""
-    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     kind = shape.get("kind")
     if kind == "sphere":
         angle = np.linspace(0, 2 * np.pi, 60)
@@ -349,11 +347,10 @@ def _lines_of(shape: Mapping[str, Any]) -> Iterator[Points]:
     elif kind in ("box", "oriented_box"):
         if kind == "box":
             low, high = np.asarray(shape["min"]), np.asarray(shape["max"])
-            corners = (low + high) / 2 + corners * (high - low) / 2
-        else:
-            *axis, w = np.asarray(shape.get("quaternion", (0.0, 0.0, 0.0, 1.0)))  # xyzw
-            corners = corners * shape["half_extents"]
-            across = 2 * np.cross(axis, corners)
-            corners = shape["center"] + corners + w * across + np.cross(axis, across)
+            shape = {"center": (low + high) / 2, "half_extents": (high - low) / 2}
+        *axis, w = np.asarray(shape.get("quaternion", (0.0, 0.0, 0.0, 1.0)))  # xyzw
+        corners = list(itertools.product((-1.0, 1.0), repeat=3)) * np.asarray(shape["half_extents"])
+        across = 2 * np.cross(axis, corners)
+        corners = shape["center"] + corners + w * across + np.cross(axis, across)
         for first, second in EDGES:
             yield corners[[first, second]]
