@@ -56,10 +56,13 @@ class GraspTracker:
         threading.Thread(target=_read, args=(images, latest, stopped), daemon=True).start()
         answers = client.detect_stream(iter(requests.get, None))
         try:
-            while (image := latest.get()) is not None:
+            while True:
+                image = latest.get()
                 if isinstance(image, Exception):
                     raise image
-                requests.put(StreamRequest(**{**image, **self.options()}))
+                requests.put(
+                    None if image is None else StreamRequest(**{**image, **self.options()})
+                )
                 if (answer := next(answers, None)) is None:
                     return
                 detection = answer.result()
