@@ -19,7 +19,7 @@ from edgegrasp_service.errors import PayloadTooLarge
 POINTS = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
 MANY = 1000
 MIB = 2**20
-
+NAMES_THE_END = b"comment none", b"comment end_header is below"
 
 GOOD_FILES = {
     "npy": npy(POINTS),
@@ -27,9 +27,9 @@ GOOD_FILES = {
     "npy, big endian": npy(POINTS.astype(">f4")),
     "npz": npz(points=POINTS, colors=POINTS),
     "npz, one array": npz(anything=POINTS),
-    "ply": ply(POINTS),
+    "ply": ply(POINTS).replace(*NAMES_THE_END),
     "ply, big endian": ply(POINTS, "binary_big_endian"),
-    "ply, text": ply(POINTS, "ascii"),
+    "ply, text": ply(POINTS, "ascii").replace(*NAMES_THE_END),
     "pcd": pcd(POINTS),
     "pcd, text": pcd(POINTS, "ascii"),
     "pcd, compressed": pcd(POINTS, "binary_compressed"),
@@ -121,10 +121,8 @@ TWO_POINTS = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 1\nPOINTS 2\
 BAD_FILES = [  # and what is said of their value, and of what to send
     ("npz", npz(a=POINTS, b=POINTS), "a, b", "points=points"),
     ("npz", npz(), "no array points", "points=points"),
-    *(
-        ("npz", npz_packed_by(method), "", "savez")
-        for method in (zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2)
-    ),
+    ("npz", npz_packed_by(zipfile.ZIP_LZMA), "", "savez"),
+    ("npz", npz_packed_by(zipfile.ZIP_BZIP2), "", "savez"),
     ("npy", npy_of_text(1), "", "writes"),
     ("npy", npy_of_text(2), "", "writes"),
     *(
@@ -299,13 +297,6 @@ def test_organised_clouds_keep_their_shape() -> None:
         read_file("npy", npy(organised), 39)
     with pytest.raises(PayloadTooLarge):
         decode_points(organised.tolist(), 39)
-
-
-def test_a_comment_that_names_the_end_of_the_header() -> None:
-    for encoding in ("ascii", "binary_little_endian"):
-        data = ply(POINTS, encoding).replace(b"comment none", b"comment end_header is below")
-        points = read_file("ply", data, MANY).points
-        np.testing.assert_array_equal(np.asarray(points, np.float32), POINTS)
 
 
 # What is small on the way in and large inside is refused before it is large.
