@@ -86,13 +86,7 @@ _BY_KIND: dict[str, type[GraspClientError]] = {
 
 
 def error_of_kind(
-    kind: str,
-    message: str,
-    field: str,
-    value: str,
-    fix: str,
-    *,
-    retry_after: float | None = None,
+    kind: str, message: str, field: str, value: str, fix: str, retry_after: float | None
 ) -> GraspClientError:
     """The exception for an error reported by the server."""
     error = _BY_KIND.get(kind, ProtocolError)

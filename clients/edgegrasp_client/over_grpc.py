@@ -181,10 +181,8 @@ def _error_of(error: Any) -> GraspClientError:
 
 
 def _described(message: str, detail: grasp_pb2.ErrorDetail) -> GraspClientError:
-    retry_after = detail.retry_after if detail.HasField("retry_after") else None
-    return error_of_kind(
-        detail.kind, message, detail.field, detail.value, detail.fix, retry_after=retry_after
-    )
+    retry_after = read_field(detail, "retry_after")
+    return error_of_kind(detail.kind, message, detail.field, detail.value, detail.fix, retry_after)
 
 
 # Requests

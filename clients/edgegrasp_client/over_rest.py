@@ -195,9 +195,10 @@ def _described(problem: Mapping[str, Any], response: httpx.Response) -> GraspCli
     kind = str(problem.get("type", ""))
     if not kind.startswith(KIND_PREFIX):
         return _foreign(response)
-    said = [str(problem.get(name, "")) for name in ("detail", "field", "value", "fix")]
-    kind = kind.removeprefix(KIND_PREFIX)
-    return error_of_kind(kind, *said, retry_after=problem.get("retry_after"))
+    names = ("detail", "field", "value", "fix")
+    message, field, value, fix = (str(problem.get(name, "")) for name in names)
+    retry_after = problem.get("retry_after")
+    return error_of_kind(kind.removeprefix(KIND_PREFIX), message, field, value, fix, retry_after)
 
 
 def _foreign(response: httpx.Response) -> GraspClientError:
