@@ -305,9 +305,8 @@ def _target(message: Any, value: Any, path: str) -> tuple[Any, Any]:
             if viewpoint is not None and not listed:
                 fields["viewpoint"] = [viewpoint]
             return message, fields
-        case "DepthImage" | "RobotArm" | "Place" if (
-            fields
-        ):  # a pose may also be given as rows, like an array
+        case "DepthImage" | "RobotArm" | "Place" if fields:
+            # A pose may also be given as rows, like an array.
             for name, pose in fields.items():
                 if name.startswith("T_") and pose and all(isinstance(row, list) for row in pose):
                     fields[name] = [number for row in pose for number in row]
