@@ -6,14 +6,13 @@ that a bowl or a ring is as hollow for a finger as it is for a camera.
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
 from edgegrasp_camera.arrays import Float64, Int64
 
 Numbers = Float64 | list[float]
-Part = tuple[Float64, Int64]  # vertices (V, 3) metres, triangles (F, 3) facing outwards
+Mesh = tuple[Float64, Int64]  # vertices (V, 3) metres, triangles (F, 3) facing outwards
 Random = np.random.Generator
 
 FINE, COARSE = 28, 16  # corners of a circle: of a solid part, and of a wall of as many parts
@@ -21,37 +20,33 @@ LIE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # turns z t
 RAISE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # turns y to z
 
 
-class HouseholdMesh(NamedTuple):
-    """An object in metres, standing on z = 0 about the z axis."""
+def household_mesh(rng: Random) -> tuple[str, list[Mesh]]:
+    """Draw an object of any family: its name, and closed convex parts that may overlap.
 
-    family: str  # one of `FAMILIES`
-    parts: list[Part]  # closed and convex; they may overlap
-
-
-def household_mesh(rng: Random, family: str | None = None) -> HouseholdMesh:
-    """Draw an object, of any family unless one is named."""
-    name = family or NAMES[int(rng.integers(len(NAMES)))]
-    parts = FAMILIES[name](rng)
+    They stand on z = 0 about the z axis.
+    """
+    family, make = list(FAMILIES.items())[int(rng.integers(len(FAMILIES)))]
+    parts = make(rng)
     points = np.concatenate([vertices for vertices, _ in parts])
     low, high = points.min(axis=0), points.max(axis=0)
     origin = np.array([*(low + high)[:2] / 2, low[2]])
-    return HouseholdMesh(name, [(vertices - origin, faces) for vertices, faces in parts])
+    return family, [(vertices - origin, faces) for vertices, faces in parts]
 
 
-def _can(rng: Random) -> list[Part]:
+def _can(rng: Random) -> list[Mesh]:
     radius, height = rng.uniform(0.025, 0.05), rng.uniform(0.03, 0.18)
     rim = rng.uniform(0.001, 0.006)
     return [_solid([radius - rim, radius, radius, radius - rim], [0, rim, height - rim, height])]
 
 
-def _bottle(rng: Random) -> list[Part]:
+def _bottle(rng: Random) -> list[Mesh]:
     radius, height = rng.uniform(0.02, 0.05), rng.uniform(0.12, 0.32)
     neck, shoulder = radius * rng.uniform(0.25, 0.6), height * rng.uniform(0.45, 0.8)
     cap, top = neck * rng.uniform(1.0, 1.3), height * rng.uniform(0.85, 0.93)
     slope = min(radius - neck, top - shoulder) * rng.uniform(0.5, 1.0)
-    outline = _oval(rng.uniform(0.4, 1.0)) * (1.0, rng.uniform(0.5, 1.0))
+    outline = oval(rng.uniform(0.4, 1.0)) * (1.0, rng.uniform(0.5, 1.0))
     if rng.random() < 0.6:
-        outline = _oval()
+        outline = oval()
     foot = min(0.004, radius / 5)
     body = [radius - foot, radius, radius, neck + 0.3 * (radius - neck), neck]
     heights = [0.0, foot, shoulder, shoulder + 0.75 * slope, shoulder + slope]
@@ -59,14 +54,14 @@ def _bottle(rng: Random) -> list[Part]:
     return [*parts, _solid([cap, cap], [top - 0.01, height])]
 
 
-def _jar(rng: Random) -> list[Part]:
+def _jar(rng: Random) -> list[Mesh]:
     radius, height = rng.uniform(0.025, 0.055), rng.uniform(0.05, 0.16)
     lid, top = radius * rng.uniform(0.75, 1.05), height - rng.uniform(0.01, 0.02)
     body = _solid([0.93 * radius, radius, radius, lid * 0.95], [0.0, 0.004, 0.85 * top, top])
     return [body, _solid([lid, lid], [top, height])]
 
 
-def _bowl(rng: Random) -> list[Part]:
+def _bowl(rng: Random) -> list[Mesh]:
     """Round or oval; a third has the straight handle of a pan."""
     radius, depth, wall = rng.uniform(0.04, 0.11), rng.uniform(0.025, 0.09), rng.uniform(2e-3, 5e-3)
     flat = rng.uniform(0.35, 0.7)
@@ -81,12 +76,12 @@ def _bowl(rng: Random) -> list[Part]:
     return _placed(parts, np.diag([1.0, rng.uniform(0.7, 1.0), 1.0]))
 
 
-def _cup(rng: Random) -> list[Part]:
+def _cup(rng: Random) -> list[Mesh]:
     radius, height, wall = rng.uniform(0.03, 0.05), rng.uniform(0.05, 0.12), rng.uniform(3e-3, 5e-3)
     bottom = radius * rng.uniform(0.65, 1.0)
     parts = _shell([bottom, radius], [0.0, height], wall, rng.uniform(0.004, 0.008))
     loop, thick = height * rng.uniform(0.2, 0.32), rng.uniform(0.0025, 0.0045)
-    section = _oval(0.6, 8) * (thick, thick * rng.uniform(1.0, 2.0)) + (loop, 0.0)
+    section = oval(0.6, 8) * (thick, thick * rng.uniform(1.0, 2.0)) + (loop, 0.0)
     handle = _wedges(section, np.linspace(-np.pi / 2, np.pi / 2, 7))
     squash = np.diag([rng.uniform(0.8, 1.4), 1.0, 1.0])
     inset = (radius + bottom) / 2 - wall
@@ -95,7 +90,7 @@ def _cup(rng: Random) -> list[Part]:
     return [*parts, *handle, *both]
 
 
-def _plate(rng: Random) -> list[Part]:
+def _plate(rng: Random) -> list[Mesh]:
     radius, height, wall = rng.uniform(0.06, 0.15), rng.uniform(0.01, 0.03), rng.uniform(3e-3, 6e-3)
     well = radius * rng.uniform(0.5, 0.75)
     step = radius * rng.uniform(0.04, 0.15)
@@ -103,7 +98,7 @@ def _plate(rng: Random) -> list[Part]:
     return _shell([well, well + step, radius], [0.0, rise, height], wall, wall)
 
 
-def _glass(rng: Random) -> list[Part]:
+def _glass(rng: Random) -> list[Mesh]:
     radius, height = rng.uniform(0.025, 0.045), rng.uniform(0.07, 0.17)
     wall = rng.uniform(0.002, 0.004)
     if rng.random() < 0.65:
@@ -115,20 +110,20 @@ def _glass(rng: Random) -> list[Part]:
     return [foot, _solid([thick, thick], [0.0, stem + wall]), *_placed(bowl, (0.0, 0.0, stem))]
 
 
-def _carton(rng: Random) -> list[Part]:
+def _carton(rng: Random) -> list[Mesh]:
     """A closed box; half of them fit the hand on no side."""
     least = 0.085 if rng.random() < 0.5 else 0.02
     size = np.exp(rng.uniform(np.log(least), np.log(0.28), size=3))
     return [_box(size, (0.0, 0.0, 0.0), rng.uniform(0.0, 0.03))]
 
 
-def _tray(rng: Random) -> list[Part]:
+def _tray(rng: Random) -> list[Mesh]:
     x, y = rng.uniform(0.06, 0.28, size=2)
     z, wall = rng.uniform(0.025, 0.12), rng.uniform(0.002, 0.006)
     return [_box((x, y, wall), (0.0, 0.0, wall / 2)), *_walls(x, y, z, wall)]
 
 
-def _book(rng: Random) -> list[Part]:
+def _book(rng: Random) -> list[Mesh]:
     """Covers are a little larger than the pages; a quarter of the books stand."""
     x, y, z = rng.uniform(0.1, 0.28), rng.uniform(0.08, 0.21), rng.uniform(0.008, 0.06)
     cover, inset = rng.uniform(0.001, 0.003), rng.uniform(0.0, 0.005)
@@ -137,7 +132,7 @@ def _book(rng: Random) -> list[Part]:
     return _placed(parts, RAISE) if rng.random() < 0.25 else parts
 
 
-def _torch(rng: Random) -> list[Part]:
+def _torch(rng: Random) -> list[Mesh]:
     """Lying, or standing on its head."""
     grip, length = rng.uniform(0.009, 0.018), rng.uniform(0.08, 0.22)
     head, neck = grip * rng.uniform(1.1, 2.0), length * rng.uniform(0.15, 0.35)
@@ -146,9 +141,9 @@ def _torch(rng: Random) -> list[Part]:
     return parts if rng.random() < 0.25 else _placed(parts, LIE)
 
 
-def _hammer(rng: Random) -> list[Part]:
+def _hammer(rng: Random) -> list[Mesh]:
     length, grip = rng.uniform(0.18, 0.33), rng.uniform(0.010, 0.017)
-    handle = _placed([_loft(_oval() * (0.75, 1.0), [grip, grip, 0.7 * grip], [0, 0.4, 1])], LIE)
+    handle = _placed([_loft(oval() * (0.75, 1.0), [grip, grip, 0.7 * grip], [0, 0.4, 1])], LIE)
     thick, span = rng.uniform(0.018, 0.036), rng.uniform(0.07, 0.13)
     poll, claw = np.array([length, span / 2, 0.0]), np.array([length, -span / 2, 0.0])
     middle = (poll + claw) / 2
@@ -156,16 +151,16 @@ def _hammer(rng: Random) -> list[Part]:
     return [*_placed(handle, np.diag([length, 1.0, 1.0])), *head]
 
 
-def _screwdriver(rng: Random) -> list[Part]:
+def _screwdriver(rng: Random) -> list[Mesh]:
     grip, handle = rng.uniform(0.009, 0.018), rng.uniform(0.06, 0.12)
     shaft, length = rng.uniform(0.002, 0.005), rng.uniform(0.05, 0.17)
-    outline = _oval(1.0, int(rng.choice([6, 8, FINE])))
+    outline = oval(1.0, int(rng.choice([6, 8, FINE])))
     body = _loft(outline, [0.7 * grip, grip, grip, 0.6 * grip], [0, 0.15, 0.7, 1])
     parts = _placed([body], np.diag([1.0, 1.0, handle]))
     return _placed([*parts, _solid([shaft, shaft], [handle - 0.01, handle + length])], LIE)
 
 
-def _spanner(rng: Random) -> list[Part]:
+def _spanner(rng: Random) -> list[Mesh]:
     """A flat bar, with an open jaw at one end and a ring or a jaw at the other."""
     length, thick = rng.uniform(0.1, 0.26), rng.uniform(0.004, 0.01)
     parts = [_box((length, rng.uniform(0.008, 0.018), thick), (0.0, 0.0, 0.0))]
@@ -180,15 +175,15 @@ def _spanner(rng: Random) -> list[Part]:
     return parts
 
 
-def _scissors(rng: Random) -> list[Part]:
+def _scissors(rng: Random) -> list[Mesh]:
     blade, thick = rng.uniform(0.05, 0.12), rng.uniform(0.002, 0.004)
     spread, shank = rng.uniform(0.08, 0.35), rng.uniform(0.03, 0.06)
     loop, rod = rng.uniform(0.013, 0.022), rng.uniform(0.003, 0.005)
-    parts: list[Part] = []
+    parts: list[Mesh] = []
     for side in (-1.0, 1.0):
         outline = np.array([[-shank, -0.006], [blade, -0.001], [blade, 0.001], [-shank, 0.006]])
         flat = _loft(outline, [1.0, 1.0], [0.0, thick])
-        eye = _wedges(_oval(1.0, 8) * rod + (loop, 0.0), np.linspace(0, 2 * np.pi, COARSE + 1))
+        eye = _wedges(oval(1.0, 8) * rod + (loop, 0.0), np.linspace(0, 2 * np.pi, COARSE + 1))
         long = np.diag([rng.uniform(1.0, 1.5), 1.0, 1.0])
         eye = _placed(eye, long, (-shank - loop, side * 0.3 * loop, thick / 2))
         c, s = np.cos(side * spread / 2), np.sin(side * spread / 2)
@@ -197,7 +192,7 @@ def _scissors(rng: Random) -> list[Part]:
     return [*parts, _solid([0.005, 0.005], [-thick, 2 * thick])]
 
 
-def _clamp(rng: Random) -> list[Part]:
+def _clamp(rng: Random) -> list[Mesh]:
     reach, opening = rng.uniform(0.03, 0.08), rng.uniform(0.03, 0.11)
     bar, thick = rng.uniform(0.010, 0.018), rng.uniform(0.008, 0.015)
     side = opening / 2 + bar / 2
@@ -213,22 +208,22 @@ def _clamp(rng: Random) -> list[Part]:
     return [*parts, _rod(tip, tip - (0.0, 0.006, 0.0), 0.6 * thick, 0.6 * thick)]
 
 
-def _pen(rng: Random) -> list[Part]:
+def _pen(rng: Random) -> list[Mesh]:
     radius, length = rng.uniform(0.0035, 0.01), rng.uniform(0.11, 0.18)
     cap = radius * rng.uniform(1.0, 1.2)
     body = _loft(
-        _oval(1.0, int(rng.choice([6, FINE]))), [0.3 * radius, radius, radius], [0, 0.02, length]
+        oval(1.0, int(rng.choice([6, FINE]))), [0.3 * radius, radius, radius], [0, 0.02, length]
     )
     return _placed([body, _solid([cap, cap], [length * rng.uniform(0.6, 0.9), length])], LIE)
 
 
-def _fruit(rng: Random) -> list[Part]:
+def _fruit(rng: Random) -> list[Mesh]:
     """A sphere to a spindle, a third of them a pear or a banana."""
     kind = rng.random()
     if kind < 0.15:
         radius, bend = rng.uniform(0.014, 0.02), rng.uniform(0.06, 0.11)
         angles = np.linspace(0.0, rng.uniform(1.0, 1.7), 7)
-        parts = _wedges(_oval(1.0, 8) * radius + (bend, 0.0), angles)
+        parts = _wedges(oval(1.0, 8) * radius + (bend, 0.0), angles)
         for angle, way in ((0.0, -1.0), (angles[-1], 1.0)):
             along = way * np.array([-np.sin(angle), np.cos(angle), 0.0])
             centre = bend * np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -251,13 +246,13 @@ def _fruit(rng: Random) -> list[Part]:
     return _placed(parts, LIE) if kind > 0.7 else parts
 
 
-def _bag(rng: Random) -> list[Part]:
+def _bag(rng: Random) -> list[Mesh]:
     """A bulged box, some with the flat seam of a packet at both ends."""
     x, y, z = rng.uniform((0.06, 0.04, 0.02), (0.26, 0.18, 0.12))
     sharp = rng.uniform(0.3, 0.8)
     turn = np.linspace(-0.48, 0.48, 12) * np.pi
     heights = np.sign(turn) * np.abs(np.sin(turn)) ** sharp
-    body = _loft(_oval(rng.uniform(0.3, 0.7)), np.cos(turn) ** sharp, heights)
+    body = _loft(oval(rng.uniform(0.3, 0.7)), np.cos(turn) ** sharp, heights)
     lean = np.array([[x / 2, 0.0, 0.0], [0.0, y / 2, 0.0], [0.0, 0.0, z / 2]])
     lean[:2, 2] = rng.uniform(-0.1, 0.1, size=2) * z
     parts = _placed([body], lean)
@@ -266,32 +261,31 @@ def _bag(rng: Random) -> list[Part]:
     return _placed(parts, LIE.T) if rng.random() < 0.3 else parts
 
 
-def _ring(rng: Random) -> list[Part]:
+def _ring(rng: Random) -> list[Mesh]:
     """A roll of tape, a pipe, a bracelet; some stand on their edge."""
     outer, height = rng.uniform(0.025, 0.07), rng.uniform(0.008, 0.07)
     inner = outer * rng.uniform(0.45, 0.93)
-    section = _oval(1.0, 8) if rng.random() < 0.4 else _rectangle(2.0, 2.0)
+    section = oval(1.0, 8) if rng.random() < 0.4 else _rectangle(2.0, 2.0)
     section = section * ((outer - inner) / 2, height / 2) + ((inner + outer) / 2, 0.0)
     parts = _wedges(section, np.linspace(0.0, 2 * np.pi, COARSE + 5))
     return _placed(parts, RAISE) if rng.random() < 0.15 else parts
 
 
-def _frame(rng: Random) -> list[Part]:
+def _frame(rng: Random) -> list[Mesh]:
     x, y = rng.uniform(0.06, 0.28, size=2)
     bar, thick = min(rng.uniform(0.006, 0.03), 0.2 * min(x, y)), rng.uniform(0.006, 0.03)
     return _walls(x, y, thick, bar)
 
 
-FAMILIES: dict[str, Callable[[Random], list[Part]]] = {
+FAMILIES: dict[str, Callable[[Random], list[Mesh]]] = {
     "can": _can, "bottle": _bottle, "jar": _jar, "bowl": _bowl, "cup": _cup, "plate": _plate,
     "glass": _glass, "carton": _carton, "tray": _tray, "book": _book, "torch": _torch,
     "hammer": _hammer, "screwdriver": _screwdriver, "spanner": _spanner, "scissors": _scissors,
     "clamp": _clamp, "pen": _pen, "fruit": _fruit, "bag": _bag, "ring": _ring, "frame": _frame,
 }  # fmt: skip
-NAMES = tuple(FAMILIES)
 
 
-def _oval(sharp: float = 1.0, corners: int = FINE) -> Float64:
+def oval(sharp: float = 1.0, corners: int = FINE) -> Float64:
     """(corners, 2) a circle of radius one; below one, `sharp` squares it off."""
     angle = 2 * np.pi * (np.arange(corners) + 0.5) / corners
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -303,20 +297,35 @@ def _rectangle(x: float, y: float) -> Float64:
     return np.array([[-x, -y], [x, -y], [x, y], [-x, y]]) / 2
 
 
-def _loft(outline: Float64, widths: Numbers, heights: Numbers) -> Part:
-    """A convex outline (S, 2), counter-clockwise, scaled by a width at each ascending height."""
+def lofted(outline: Float64, widths: Numbers, heights: Numbers) -> Float64:
+    """An outline (S, 2) scaled by a width at each height: (R, S, 3)."""
     rings = np.empty((len(widths), len(outline), 3))
     rings[..., :2] = outline * np.asarray(widths)[:, None, None]
     rings[..., 2] = np.asarray(heights)[:, None]
+    return rings
+
+
+def swept(section: Float64, angles: Float64) -> Float64:
+    """Radii and heights (S, 2), or (R, S, 2) one for each angle, turned about z: (R, S, 3)."""
+    rings = np.empty((len(angles), section.shape[-2], 3))
+    rings[..., 0] = np.cos(angles)[:, None] * section[..., 0]
+    rings[..., 1] = np.sin(angles)[:, None] * section[..., 0]
+    rings[..., 2] = section[..., 1]
+    return rings
+
+
+def _loft(outline: Float64, widths: Numbers, heights: Numbers) -> Mesh:
+    """A solid with a convex outline (S, 2), counter-clockwise; heights ascend."""
+    rings = lofted(outline, widths, heights)
     return rings.reshape(-1, 3), _faces(*rings.shape[:2])
 
 
-def _solid(radii: Numbers, heights: Numbers) -> Part:
+def _solid(radii: Numbers, heights: Numbers) -> Mesh:
     """A solid of revolution about z; its profile is convex."""
-    return _loft(_oval(), radii, heights)
+    return _loft(oval(), radii, heights)
 
 
-def _box(size: Float64 | tuple[float, ...], centre: tuple[float, ...], cut: float = 0.0) -> Part:
+def _box(size: Float64 | tuple[float, ...], centre: tuple[float, ...], cut: float = 0.0) -> Mesh:
     """A box; `cut` of its size is taken off its upright edges."""
     x, y, z = np.asarray(size) / 2
     outline = _rectangle(2 * x, 2 * y)
@@ -327,14 +336,14 @@ def _box(size: Float64 | tuple[float, ...], centre: tuple[float, ...], cut: floa
     return _placed([_loft(outline, [1.0, 1.0], [-z, z])], centre)[0]
 
 
-def _walls(x: float, y: float, z: float, thick: float) -> list[Part]:
+def _walls(x: float, y: float, z: float, thick: float) -> list[Mesh]:
     """Four bars around an opening, x by y outside and z high."""
     sides = -1.0, 1.0
     parts = [_box((x, thick, z), (0.0, side * (y - thick) / 2, z / 2)) for side in sides]
     return parts + [_box((thick, y, z), (side * (x - thick) / 2, 0.0, z / 2)) for side in sides]
 
 
-def _rod(start: Float64, end: Float64, first: float, last: float) -> Part:
+def _rod(start: Float64, end: Float64, first: float, last: float) -> Mesh:
     """A round rod from one point to another, with the radius at each."""
     along = end - start
     length = float(np.linalg.norm(along))
@@ -342,21 +351,18 @@ def _rod(start: Float64, end: Float64, first: float, last: float) -> Part:
     x = np.cross(z, (0.0, 0.0, 1.0) if abs(z[2]) < 0.9 else (1.0, 0.0, 0.0))
     x /= np.linalg.norm(x)
     frame = np.stack([x, np.cross(z, x), z], axis=1)
-    vertices, faces = _loft(_oval(1.0, COARSE), [first, last], [0.0, length])
+    vertices, faces = _loft(oval(1.0, COARSE), [first, last], [0.0, length])
     return vertices @ frame.T + start, faces
 
 
-def _wedges(section: Float64, angles: Float64) -> list[Part]:
+def _wedges(section: Float64, angles: Float64) -> list[Mesh]:
     """A convex section (P, 2) of radius and height, swept about z: a part between two angles."""
-    rings = np.empty((len(angles), len(section), 3))
-    rings[..., 0] = np.cos(angles)[:, None] * section[:, 0]
-    rings[..., 1] = np.sin(angles)[:, None] * section[:, 0]
-    rings[..., 2] = section[:, 1]
+    rings = swept(section, angles)
     faces = _faces(2, len(section))[:, ::-1]
     return [(rings[k : k + 2].reshape(-1, 3), faces) for k in range(len(angles) - 1)]
 
 
-def _shell(radii: Numbers, heights: Numbers, wall: float, floor: float) -> list[Part]:
+def _shell(radii: Numbers, heights: Numbers, wall: float, floor: float) -> list[Mesh]:
     """A vessel: its outer profile from the foot up, the thickness of its wall and its floor."""
     outside = np.stack([radii, heights], axis=1)
     way = np.diff(outside, axis=0)
@@ -365,14 +371,14 @@ def _shell(radii: Numbers, heights: Numbers, wall: float, floor: float) -> list[
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     inside = outside + wall * np.stack([-way[:, 1], way[:, 0]], axis=1)
     angles = 2 * np.pi * (np.arange(COARSE + 1) + 0.5) / COARSE
-    parts = [_loft(_oval(1.0, COARSE), [outside[0, 0]] * 2, [0.0, floor])]
+    parts = [_loft(oval(1.0, COARSE), [outside[0, 0]] * 2, [0.0, floor])]
     for k in range(len(way) - 1):
         section = np.array([outside[k], outside[k + 1], inside[k + 1], inside[k]])
         parts += _wedges(section, angles)
     return parts
 
 
-def _placed(parts: list[Part], *moves: Float64 | tuple[float, ...]) -> list[Part]:
+def _placed(parts: list[Mesh], *moves: Float64 | tuple[float, ...]) -> list[Mesh]:
     for move in map(np.asarray, moves):
         if move.ndim == 2:
             parts = [(vertices @ move.T, faces) for vertices, faces in parts]

@@ -33,7 +33,7 @@ def make_pool(rng: np.random.Generator, objects: Sequence[Path]) -> list[PoolMes
     meshes = [_mesh(objects[k].read_text()) for k in chosen]
     meshes += [_mesh(drawn_shape(int(k))) for k in rng.permutation(NUM_DRAWN)[: NUM_POOL // 5]]
     while len(meshes) < NUM_POOL:
-        meshes.append(merged(household_mesh(rng).parts))
+        meshes.append(merged(household_mesh(rng)[1]))
     return [
         pool_mesh(rng, softened(rng, mesh) if rng.random() < SOFT_SHARE else mesh)
         for mesh in meshes

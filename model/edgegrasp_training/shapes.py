@@ -7,21 +7,13 @@ have hollows that a camera sees into but nothing can enter. Household objects ar
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
-from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from edgegrasp_camera.arrays import Float64, Int64
 from edgegrasp_sim.engine import OBJECT_MASS
-from edgegrasp_sim.objects import (
-    ObjectModel,
-    ObjectSet,
-    as_obj,
-    blob,
-    write_object,
-    write_parts,
-)
-from edgegrasp_training.household import household_mesh
+from edgegrasp_sim.objects import ObjectModel, ObjectSet, as_obj, blob, write_object, write_parts
+from edgegrasp_training.household import household_mesh, lofted, oval, swept
 
 STRETCH = 1.35  # greatest factor along an axis; its inverse is the least
 MADE_SHARE = 0.5  # of a scene's objects that are computed
@@ -47,7 +39,9 @@ def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -
     for _ in range(NUM_VARIED):
         draw = rng.random()
         if draw < MADE_SHARE:
-            model = made_object(DRAWN_NAMES[int(rng.integers(NUM_DRAWN))], folder / "made")
+            number = int(rng.integers(NUM_DRAWN))
+            name = f"made-drawn-{number:03d}"
+            model = ObjectModel(name, write_object(name, drawn_shape(number), folder / "made"))
         elif draw < MADE_SHARE + BLOB_SHARE:
             number, scale = int(rng.integers(*TRAINING_BLOBS)), float(rng.uniform(*BLOB_SCALE))
             model = blob(number, folder / "made", scale)
@@ -56,7 +50,7 @@ def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -
         factors = np.exp(rng.uniform(-np.log(STRETCH), np.log(STRETCH), size=3))
         if rng.random() < SYMMETRIC_SHARE:
             factors[1] = factors[0]
-        drawn[model.name] = stretched(model, (factors[0], factors[1], factors[2]), folder)
+        drawn[model.name] = stretched(model, factors, folder)
     return ObjectSet(f"{objects.name} varied", tuple(drawn.values()))
 
 
@@ -76,16 +70,17 @@ def household_objects(folder: Path, count: int, rng: np.random.Generator) -> Obj
     return ObjectSet("household", tuple(models))
 
 
-def stretched(model: ObjectModel, factors: tuple[float, float, float], folder: Path) -> ObjectModel:
-    """Write an object that is stretched along x, y and z.
+def stretched(model: ObjectModel, factors: Float64, folder: Path) -> ObjectModel:
+    """Write an object that is stretched by factors (3,) along x, y and z.
 
     Raises:
         ValueError: It does not consist of meshes alone.
     """
     tree = ElementTree.parse(model.urdf)
     for shape in (*tree.iter("visual"), *tree.iter("collision")):
-        mesh = shape.find("geometry/mesh")
-        if mesh is None or _is_shifted(shape):
+        mesh, origin = shape.find("geometry/mesh"), shape.find("origin")
+        shift = "" if origin is None else " ".join(origin.attrib.values())
+        if mesh is None or any(float(each) for each in shift.split()):
             raise ValueError(f"{model.urdf}: has shapes that cannot be stretched; use plain meshes")
         own = np.array([float(each) for each in mesh.get("scale", "1 1 1").split()])
         mesh.set("scale", " ".join(f"{each:.5f}" for each in own * factors))
@@ -97,17 +92,6 @@ def stretched(model: ObjectModel, factors: tuple[float, float, float], folder: P
     path = folder / f"{model.name}.urdf"
     tree.write(path)
     return replace(model, urdf=path, origin=model)
-
-
-def _is_shifted(shape: Element) -> bool:
-    origin = shape.find("origin")
-    values = [] if origin is None else [*origin.attrib.values()]
-    return any(float(each) for value in values for each in value.split())
-
-
-def made_object(name: str, folder: Path) -> ObjectModel:
-    """Write a computed object, one of DRAWN_NAMES, into a folder."""
-    return ObjectModel(name, write_object(name, drawn_shape(DRAWN_NAMES.index(name)), folder))
 
 
 def drawn_shape(index: int) -> str:
@@ -151,10 +135,10 @@ def _plain(rng: np.random.Generator) -> Rings:
     corners = int(rng.choice([4, 4, 6, FINE_CIRCLE, FINE_CIRCLE, FINE_CIRCLE]))
     width, depth = rng.uniform(*PLAIN_WIDTH, size=2)
     half_height = rng.uniform(*PLAIN_HEIGHT) / 2.0
-    ring = _ring(corners) * (np.sqrt(2.0) if corners == 4 else 1.0)
-    ring = ring * (width / 2.0, (depth if corners == 4 else width) / 2.0, 1.0)
+    ring = oval(1.0, corners) * (np.sqrt(2.0) if corners == 4 else 1.0)
+    ring = ring * (width / 2.0, (depth if corners == 4 else width) / 2.0)
     top = rng.uniform(0.7, 1.0) if rng.random() < 0.3 else 1.0
-    return _straight(ring, [1.0, top], [-half_height, half_height])
+    return lofted(ring, [1.0, top], [-half_height, half_height])
 
 
 def _bodies(rng: np.random.Generator) -> list[Rings]:
@@ -176,12 +160,12 @@ def _bodies(rng: np.random.Generator) -> list[Rings]:
 def _body(rng: np.random.Generator) -> Rings:
     """A box, a prism, a cylinder, a frustum or an ellipsoid within two units."""
     corners = int(rng.choice([4, 4, 6, CIRCLE, CIRCLE]))
-    ring = _ring(corners) * (np.sqrt(2.0) if corners == 4 else 1.0)
+    ring = oval(1.0, corners) * (np.sqrt(2.0) if corners == 4 else 1.0)
     if corners == CIRCLE and rng.random() < 0.3:
         angle = np.linspace(-0.49 * np.pi, 0.49 * np.pi, 9)
-        return _straight(ring, list(np.cos(angle)), list(np.sin(angle)))
+        return lofted(ring, np.cos(angle), np.sin(angle))
     taper = rng.uniform(0.4, 1.0) if rng.random() < 0.3 else 1.0
-    return _straight(ring, [1.0, taper], [-1.0, 1.0])
+    return lofted(ring, [1.0, taper], [-1.0, 1.0])
 
 
 def _bottle(rng: np.random.Generator) -> list[Rings]:
@@ -190,8 +174,8 @@ def _bottle(rng: np.random.Generator) -> list[Rings]:
     widths = np.clip(0.5 + np.cumsum(rng.normal(0.0, 0.22, rows)), 0.15, 1.1)
     heights = np.sort(rng.uniform(-1.0, 1.0, rows)) * rng.uniform(0.6, 2.0)
     heights += 0.05 * np.arange(rows)  # no two at one height
-    ring = _ring(int(rng.choice([4, 8, CIRCLE, CIRCLE]))) * (1.0, rng.uniform(0.5, 1.0), 1.0)
-    return [_straight(ring, list(widths), list(heights))]
+    ring = oval(1.0, int(rng.choice([4, 8, CIRCLE, CIRCLE]))) * (1.0, rng.uniform(0.5, 1.0))
+    return [lofted(ring, widths, heights)]
 
 
 def _plate(rng: np.random.Generator) -> list[Rings]:
@@ -201,64 +185,39 @@ def _plate(rng: np.random.Generator) -> list[Rings]:
         radii = np.where(np.arange(corners) % 2, 1.0, rng.uniform(0.35, 0.9))
     else:
         radii = rng.uniform(0.4, 1.0, corners)
-    ring = _ring(corners, radii) * (1.0, rng.uniform(0.4, 1.0), 1.0)
+    ring = oval(1.0, corners) * radii[:, None] * (1.0, rng.uniform(0.4, 1.0))
     height = rng.uniform(0.08, 0.45)
-    return [_straight(ring, [1.0, rng.uniform(0.85, 1.0)], [0.0, height])]
+    return [lofted(ring, [1.0, rng.uniform(0.85, 1.0)], [0.0, height])]
 
 
 def _bow(rng: np.random.Generator) -> list[Rings]:
     """A bent rod: bananas, horseshoes, handles."""
     turn = np.linspace(0.0, rng.uniform(np.pi / 3, 1.8 * np.pi), 16)
     taper = 1.0 - rng.uniform(0.0, 0.7) * np.abs(turn / turn[-1] - 0.5)
-    ring = _ring(int(rng.choice([4, 8, 12]))) * (1.0, rng.uniform(0.5, 1.6), 1.0)
-    return [_bent(ring, turn, rng.uniform(0.12, 0.45) * taper)]
+    ring = oval(1.0, int(rng.choice([4, 8, 12]))) * (1.0, rng.uniform(0.5, 1.6))
+    thick = rng.uniform(0.12, 0.45) * taper
+    return [swept(thick[:, None, None] * ring + (1.0, 0.0), turn)]
 
 
 def _hoop(rng: np.random.Generator) -> list[Rings]:
     """A bent rod that closes: rings, tapes, nuts, sleeves."""
     corners = int(rng.choice([4, 8, 12]))
-    ring = _ring(corners) * (np.sqrt(2.0) if corners == 4 else 1.0)
+    ring = oval(1.0, corners) * (np.sqrt(2.0) if corners == 4 else 1.0)
     thick = rng.uniform(0.08, 0.48)
     height = np.exp(rng.uniform(np.log(0.4), np.log(4.0)))
     turn = np.linspace(0.0, 2.0 * np.pi, int(rng.choice([7, 9, 25, 25, 25])))
-    return [_bent(ring * (1.0, height, 1.0), turn, np.full(len(turn), thick))]
+    return [swept(thick * (ring * (1.0, height)) + (1.0, 0.0), turn)]
 
 
 def _pot(rng: np.random.Generator) -> list[Rings]:
     """Walls and a floor: cups, bowls, boxes without a lid."""
     corners = int(rng.choice([4, 6, CIRCLE, CIRCLE]))
     bottom, wall, floor = rng.uniform(0.5, 1.1), rng.uniform(0.06, 0.3), rng.uniform(0.08, 0.5)
-    ring = _ring(corners) * (1.0, rng.uniform(0.5, 1.0), 1.0)
+    ring = oval(1.0, corners) * (1.0, rng.uniform(0.5, 1.0))
     height = rng.uniform(0.5, 2.5)
     inside = 1.0 - wall, max(bottom - wall, 0.1)
     heights = [0.0, height, height, floor * height]
-    return [_straight(ring, [bottom, 1.0, *inside], heights)]
+    return [lofted(ring, [bottom, 1.0, *inside], heights)]
 
 
 _KINDS = (_bodies, _hoop, _bottle, _plate, _bodies, _pot, _bow, _hoop)
-
-
-def _ring(corners: int, radii: Float64 | float = 1.0) -> Float64:
-    """(S, 3) a polygon about the z axis."""
-    angle = 2.0 * np.pi * (np.arange(corners) + 0.5) / corners
-    return np.stack([radii * np.cos(angle), radii * np.sin(angle), np.zeros(corners)], axis=1)
-
-
-def _straight(ring: Float64, widths: list[float], heights: list[float]) -> Rings:
-    """A ring moved along z to each height and scaled to the width there."""
-    return np.stack(
-        [
-            ring * (width, width, 1.0) + (0.0, 0.0, height)
-            for width, height in zip(widths, heights, strict=True)
-        ]
-    )
-
-
-def _bent(ring: Float64, turn: Float64, thick: Float64) -> Rings:
-    """A ring swept about the z axis at a distance of one unit, scaled by `thick` along the way."""
-    radius = 1.0 + thick[:, None] * ring[:, 0]
-    across = np.cos(turn)[:, None] * radius, np.sin(turn)[:, None] * radius
-    return np.stack([*across, thick[:, None] * ring[:, 1]], axis=2)
-
-
-DRAWN_NAMES = tuple(f"made-drawn-{index:03d}" for index in range(NUM_DRAWN))

@@ -6,18 +6,12 @@ from benchmarks import ur5_objects
 
 from edgegrasp_model.networks.config import HAND
 from edgegrasp_sim.engine import ENGINES, choose_engine, installed, make_world
-from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
+from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import load_object
 from edgegrasp_training.examples import tried_grasps
 from edgegrasp_training.generation import generate, missing_scenes
 from edgegrasp_training.options import GenerationOptions
-from edgegrasp_training.shapes import (
-    DRAWN_NAMES,
-    NUM_DRAWN,
-    drawn_shape,
-    household_objects,
-    made_object,
-)
+from edgegrasp_training.shapes import NUM_DRAWN, drawn_shape, household_objects
 from edgegrasp_training.views import find_views, load_view
 
 
@@ -109,11 +103,6 @@ def test_drawn_shapes_are_closed(index: int) -> None:
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
     a, b, c = points[faces].transpose(1, 0, 2)
     assert (np.cross(a, b) * c).sum() / 6 > 0
-
-
-@pytest.fixture
-def shapes(tmp_path: Path) -> tuple[ObjectModel, ...]:
-    return tuple(made_object(name, tmp_path / "shapes") for name in DRAWN_NAMES[:6])
 
 
 def test_household_objects_are_hollow_in_the_engine_and_read_again_from_their_folder(tmp_path):
