@@ -8,7 +8,6 @@ One command makes the whole data set again: `edgegrasp generate-scenes FOLDER --
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -75,10 +74,7 @@ def generate(
         rng = np.random.default_rng([seed, number])
         images: list[SceneImage] = []
         while len(images) < SCENES_PER_FILE * VIEWS_PER_SCENE:
-            scene = draw_scene(rng, pool, arms)
-            for _ in range(VIEWS_PER_SCENE):
-                image = make_image(rng, scene, draw_pose(rng, scene))
-                images += [] if image is None else [image]
+            images += make_images(rng, draw_scene(rng, pool, arms))
         partial = path.with_suffix(".partial.npz")
         arrays = {
             name: np.stack(each)
@@ -88,11 +84,20 @@ def generate(
         partial.replace(path)
 
 
-def make_image(rng: np.random.Generator, scene: SceneMeshes, pose: Float64) -> SceneImage | None:
-    """The image of a depth camera at `pose` (T_world_camera); None if too near or empty."""
+def make_images(rng: np.random.Generator, scene: SceneMeshes) -> list[SceneImage]:
+    """VIEWS_PER_SCENE images of a scene, without those that are too near or empty."""
+    casting = _casting(scene.parts)
+    drawn = [_make_image(rng, scene, casting) for _ in range(VIEWS_PER_SCENE)]
+    return [image for image in drawn if image is not None]
+
+
+def _make_image(
+    rng: np.random.Generator, scene: SceneMeshes, casting: o3d.t.geometry.RaycastingScene
+) -> SceneImage | None:
+    pose = _draw_pose(rng, scene)
     focal = WIDTH / 2 / np.tan(np.radians(rng.uniform(35, 80)) / 2)
     camera = Intrinsics(WIDTH, HEIGHT, focal, WIDTH / 2, HEIGHT / 2, 0.1, 13.0)
-    depth, label, steep = _cast(_casting_of(scene), scene.parts, camera, pose)
+    depth, label, steep = _cast(casting, scene.parts, camera, pose)
     close = (depth < 0.22).mean()
     seen = np.bincount(label.ravel(), minlength=OBJECT + MAX_OBJECTS)[OBJECT:]
     if close > 0.15 or (scene.centres and (seen > 25).sum() < 1):
@@ -108,15 +113,15 @@ def make_image(rng: np.random.Generator, scene: SceneMeshes, pose: Float64) -> S
     if scene.centres:
         centre[: len(scene.centres)] = (np.array(scene.centres) - place) @ turn
     up = turn[2]
-    plane = np.append(up, scene.level - place[2])
+    plane = np.append(up, -place[2])
     intrinsics = np.array([focal, focal, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5])
     as_float = (intrinsics.astype(np.float32), up.astype(np.float32), plane.astype(np.float32))
     return SceneImage(stored, label, centre, *as_float)
 
 
-def draw_pose(rng: np.random.Generator, scene: SceneMeshes) -> Float64:
+def _draw_pose(rng: np.random.Generator, scene: SceneMeshes) -> Float64:
     """A camera pose T_world_camera (4, 4) that looks at the scene's objects."""
-    target = np.array([*rng.normal(0.0, scene.spread, 2), scene.level + rng.uniform(-0.05, 0.15)])
+    target = np.array([*rng.normal(0.0, scene.spread, 2), rng.uniform(-0.05, 0.15)])
     if scene.centres and rng.random() < 0.7:
         target = scene.centres[int(rng.integers(len(scene.centres)))].copy()
         target += rng.normal(0.0, scene.spread, 3) * (1, 1, 0.3)
@@ -131,19 +136,10 @@ def draw_pose(rng: np.random.Generator, scene: SceneMeshes) -> Float64:
     return pose
 
 
-@lru_cache(maxsize=1)
-def _casting_of(scene: SceneMeshes) -> o3d.t.geometry.RaycastingScene:
-    """The ray-casting scene, cached for the next view of the same scene."""
-    return _casting(scene.parts)
-
-
 def _casting(parts: Sequence[tuple[Mesh, int]]) -> o3d.t.geometry.RaycastingScene:
     casting = o3d.t.geometry.RaycastingScene(nthreads=1)
-    for (points, triangles), _ in parts:
-        casting.add_triangles(
-            _tensor(points.astype(np.float32)),
-            _tensor(triangles.astype(np.uint32)),
-        )
+    for (points, faces), _ in parts:
+        casting.add_triangles(_tensor(points.astype(np.float32)), _tensor(faces.astype(np.uint32)))
     return casting
 
 
@@ -159,9 +155,8 @@ def _cast(
 ) -> tuple[Float64, NDArray[np.uint8], Bools]:
     """Depth (H, W) in metres, `far` where nothing is hit, labels (H, W), and where it is steep."""
     y, x = np.indices((camera.height, camera.width)) + 0.5
-    rays = np.stack(
-        [(x - camera.centre_x), (y - camera.centre_y), np.full(x.shape, camera.focal_length)], -1
-    )
+    ahead = np.full(x.shape, camera.focal_length)
+    rays = np.stack([x - camera.centre_x, y - camera.centre_y, ahead], axis=-1)
     direction = rays / camera.focal_length @ pose[:3, :3].T
     both = np.concatenate([np.broadcast_to(pose[:3, 3], direction.shape), direction], axis=-1)
     hit = casting.cast_rays(_tensor(both.astype(np.float32)), nthreads=1)

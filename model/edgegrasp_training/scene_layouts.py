@@ -38,7 +38,6 @@ class SceneMeshes:
     azimuth: tuple[float, float] = (-np.pi, np.pi)  # radians, 0 along x
     distance: tuple[float, float] = (0.3, 1.9)  # metres
     spread: float = 0.1  # metres around the target
-    level: float = 0.0  # metres, of the main support
 
     def add(self, mesh: Mesh, label: int = OTHER) -> None:
         """Add background or a support."""
@@ -63,11 +62,15 @@ def draw_scene(
     rng: np.random.Generator, pool: Sequence[PoolMesh], arms: Sequence[Mesh]
 ) -> SceneMeshes:
     """Draw a scene of a random kind."""
-    kinds = {_table: 0.34, _bin: 0.33, _shelf: 0.17, _tray: 0.09, _floor: 0.07}
-    shares = np.array(list(kinds.values()))
-    make = list(kinds)[int(rng.choice(len(kinds), p=shares / shares.sum()))]
+    shares = np.array([0.34, 0.33, 0.17, 0.09, 0.07])
+    kind = int(rng.choice(len(shares), p=shares / shares.sum()))
     scene = SceneMeshes(rng, pool, arms)
-    make(scene)
+    (_table, _bin, _shelf, _tray, _floor)[kind](scene)
+    if arms and rng.random() < (0.25, 0.15, 0.1, 0.25, 0.25)[kind]:
+        points, triangles = arms[int(rng.integers(len(arms)))]
+        turn = _turn(rng.uniform(0, 2 * np.pi))
+        place = (*rng.normal(0.0, 0.25, 2), rng.uniform(0.02, 0.5))
+        scene.add((points @ turn.T + place, triangles))
     return scene
 
 
@@ -92,7 +95,6 @@ def _table(scene: SceneMeshes) -> None:
     heights = HeightMap(half)
     _distractors(scene, heights)
     _fill(scene, heights)
-    _add_arm(scene)
 
 
 def _floor(scene: SceneMeshes) -> None:
@@ -101,7 +103,6 @@ def _floor(scene: SceneMeshes) -> None:
     heights = HeightMap((0.7, 0.7))
     _distractors(scene, heights)
     _fill(scene, heights)
-    _add_arm(scene)
 
 
 def _bin(scene: SceneMeshes) -> None:
@@ -145,7 +146,6 @@ def _bin(scene: SceneMeshes) -> None:
     elif not flush and rng.random() < 0.5:
         below -= rng.uniform(0.0, 0.8)
     _room(scene, below - 0.001)
-    _add_arm(scene, 0.15)
 
 
 def _tray(scene: SceneMeshes) -> None:
@@ -163,7 +163,6 @@ def _tray(scene: SceneMeshes) -> None:
     if rng.random() < 0.6:
         _lay_objects(scene, near, int(rng.integers(1, 7)), "spread", (0, 0, -0.011))
     _room(scene, -0.05 - rng.uniform(0.3, 0.8))
-    _add_arm(scene)
 
 
 def _shelf(scene: SceneMeshes) -> None:
@@ -200,7 +199,6 @@ def _shelf(scene: SceneMeshes) -> None:
     scene.add_box((0.1, 8, 4), (-x - rng.uniform(0.05, 1.5), 0, 0))
     _room(scene, low - rng.uniform(0.02, 1.2))
     scene.elevation = (0.2, 1.0) if rng.random() < 0.3 else (-0.05, 0.75)
-    _add_arm(scene, 0.1)
 
 
 def _fill(scene: SceneMeshes, heights: "HeightMap") -> None:
@@ -239,12 +237,14 @@ def _room(scene: SceneMeshes, floor: float, label: int = OTHER) -> None:
         scene.add(_frame(rng, (*_aside(rng.uniform(0, 2 * np.pi), away), floor + 0.03)))
     if rng.random() < 0.2:  # a rail, a hose, or a cable that hangs into the view
         away = rng.uniform(0.1, 0.5)
-        start = *_aside(rng.uniform(0, 2 * np.pi), away), scene.level + rng.uniform(0.1, 0.6)
+        start = *_aside(rng.uniform(0, 2 * np.pi), away), rng.uniform(0.1, 0.6)
         scene.add(_frame(rng, start) if rng.random() < 0.6 else _cable(rng, start))
 
 
 def _frame(rng: np.random.Generator, start: ArrayLike) -> Mesh:
     """Bars that meet: the foot of a chair, a stand, a camera's rig, a rack."""
+    import trimesh
+
     origin = np.asarray(start, dtype=np.float64)
     ends, bars = [origin], list[Mesh]()
     longest, width = rng.uniform(0.15, 1.2), rng.uniform(0.008, 0.08)
@@ -254,19 +254,15 @@ def _frame(rng: np.random.Generator, start: ArrayLike) -> Mesh:
         way[2] = abs(way[2]) * (0.1 if spokes else 1.0)
         way *= longest * rng.uniform(0.4, 1.0) / np.linalg.norm(way)
         first = ends[0 if spokes else int(rng.integers(len(ends)))]
-        bars.append(_bar(first, way, width * rng.uniform(0.6, 1.0), int(rng.choice([4, 8]))))
+        bar = trimesh.creation.cylinder(
+            width * rng.uniform(0.6, 1.0) / 2,
+            sections=int(rng.choice([4, 8])),
+            segment=np.stack([first, first + way]),
+        )
+        bars.append((np.asarray(bar.vertices), np.asarray(bar.faces)))
         ends += [first + way, first + way * rng.random()]
     points, triangles = merged(bars)
     return (points - origin) @ _turn(rng.uniform(0, 2 * np.pi)).T + origin, triangles
-
-
-def _bar(start: Float64, way: Float64, width: float, sides: int) -> Mesh:
-    """A prism along `way` (3,)."""
-    import trimesh
-
-    ends = np.stack([start, start + way])
-    surface = trimesh.creation.cylinder(width / 2, sections=sides, segment=ends)
-    return np.asarray(surface.vertices), np.asarray(surface.faces)
 
 
 def _aside(yaw: float, away: float) -> Float64:
@@ -342,15 +338,6 @@ def _cable(rng: np.random.Generator, place: ArrayLike) -> Mesh:
     return points.reshape(-1, 3), np.concatenate(
         [np.stack([this, beside, beside + 6], 1), np.stack([this, beside + 6, this + 6], 1)]
     )
-
-
-def _add_arm(scene: SceneMeshes, share: float = 0.25) -> None:
-    rng = scene.rng
-    if scene.arms and rng.random() < share:
-        points, triangles = scene.arms[int(rng.integers(len(scene.arms)))]
-        turn = _turn(rng.uniform(0, 2 * np.pi))
-        place = (*rng.normal(0.0, 0.25, 2), scene.level + rng.uniform(0.02, 0.5))
-        scene.add((points @ turn.T + place, triangles))
 
 
 def _disc(half: tuple[float, float]) -> Mesh:
@@ -485,45 +472,29 @@ def _lay_objects(
     for _ in range(count):
         drawn = scene.any_of_pool()
         (points, triangles), samples = _turned(rng, drawn, pose[int(rng.random() < lying)])
-        half = np.ptp(points, axis=0)[:2] / 2
-        room = np.array(heights.half) - half
+        room = np.array(heights.half) - np.ptp(points, axis=0)[:2] / 2
         if (room <= 0).any():
             continue
-        offset = _lowest_place(rng, samples, heights, how, room, around, ceiling)
-        if offset is None:
-            continue
-        heights.put(samples + offset)
-        scene.add_object((points + offset + origin, triangles))
-        put += 1
+        best, offset = np.inf, None  # how low the object comes, and how it is shifted there
+        for _ in range(1 if how == "heap" else 10):
+            place = rng.uniform(-room, room)
+            if how != "spread":
+                place = np.clip(rng.normal(0.0, around, 2), -room, room)
+            moved = samples + np.array([*place, 0.0])
+            apart = [moved, moved + APART, moved - APART] if how == "spread" else [moved]
+            rise = heights.rest(np.concatenate(apart))
+            lowest = rise + samples[:, 2].min()
+            if how != "heap" and lowest > 0.004:
+                continue
+            if rise + samples[:, 2].max() < ceiling and lowest < best:
+                best, offset = lowest, np.array([*place, rise])
+            if offset is not None and how == "spread":
+                break
+        if offset is not None:
+            heights.put(samples + offset)
+            scene.add_object((points + offset + origin, triangles))
+            put += 1
     return put
-
-
-def _lowest_place(
-    rng: np.random.Generator,
-    samples: Float64,
-    heights: HeightMap,
-    how: str,
-    room: Float64,
-    around: float,
-    ceiling: float,
-) -> Float64 | None:
-    """The shift (3,), of some tried, that puts an object's points lowest; None if none fits."""
-    best: tuple[float, Float64] | None = None
-    for _ in range(1 if how == "heap" else 10):
-        place = rng.uniform(-room, room)
-        if how != "spread":
-            place = np.clip(rng.normal(0.0, around, 2), -room, room)
-        moved = samples + np.array([*place, 0.0])
-        apart = [moved, moved + APART, moved - APART] if how == "spread" else [moved]
-        rise = heights.rest(np.concatenate(apart))
-        lowest = rise + samples[:, 2].min()
-        if how != "heap" and lowest > 0.004:
-            continue
-        if rise + samples[:, 2].max() < ceiling and (best is None or lowest < best[0]):
-            best = (lowest, np.array([*place, rise]))
-        if best is not None and how == "spread":
-            break
-    return None if best is None else best[1]
 
 
 def _turned(rng: np.random.Generator, drawn: PoolMesh, how: str) -> PoolMesh:
@@ -546,8 +517,7 @@ def _turned(rng: np.random.Generator, drawn: PoolMesh, how: str) -> PoolMesh:
             turn = turn @ to_down.as_matrix()
         except QhullError:
             pass
-    scaled = factor * np.ones(3)
-    return PoolMesh(((points * scaled) @ turn.T, triangles), (samples * scaled) @ turn.T)
+    return PoolMesh(((points * factor) @ turn.T, triangles), (samples * factor) @ turn.T)
 
 
 def _turn(yaw: float) -> Float64:

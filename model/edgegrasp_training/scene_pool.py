@@ -8,12 +8,10 @@ import numpy as np
 import open3d as o3d
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_camera.arrays import Float64, Int64
+from edgegrasp_camera.arrays import Float64
 from edgegrasp_sim.engine.urdf import parse_obj
-from edgegrasp_training.household import household_mesh
+from edgegrasp_training.household import Mesh, household_mesh
 from edgegrasp_training.shapes import NUM_DRAWN, drawn_shape
-
-Mesh = tuple[Float64, Int64]  # (V, 3) metres, (F, 3)
 
 NUM_POOL, NUM_ARMS = 900, 60
 ARMS = "franka_panda/panda.urdf", "xarm/xarm6_robot.urdf", "kuka_iiwa/model.urdf"
@@ -29,9 +27,9 @@ class PoolMesh(NamedTuple):
 
 def make_pool(rng: np.random.Generator, objects: Sequence[Path]) -> list[PoolMesh]:
     """Objects to draw from: of a set, drawn at random, hollow, and of a household."""
-    chosen = rng.permutation(len(objects))[: NUM_POOL // 3]
-    meshes = [_mesh(objects[k].read_text()) for k in chosen]
-    meshes += [_mesh(drawn_shape(int(k))) for k in rng.permutation(NUM_DRAWN)[: NUM_POOL // 5]]
+    texts = [objects[k].read_text() for k in rng.permutation(len(objects))[: NUM_POOL // 3]]
+    texts += [drawn_shape(int(k)) for k in rng.permutation(NUM_DRAWN)[: NUM_POOL // 5]]
+    meshes = [merged([surface for _, surface in parse_obj(text)]) for text in texts]
     while len(meshes) < NUM_POOL:
         meshes.append(merged(household_mesh(rng)[1]))
     return [
@@ -46,8 +44,6 @@ def make_arms(rng: np.random.Generator) -> list[Mesh]:
     import pybullet_data
     import trimesh
 
-    if NUM_ARMS == 0:
-        return []
     folder, arms = Path(pybullet_data.getDataPath()), []
     client = pybullet.connect(pybullet.DIRECT)
     for name in ARMS:
@@ -84,10 +80,6 @@ def merged(parts: Sequence[Mesh]) -> Mesh:
     start = np.cumsum([0] + [len(points) for points, _ in parts[:-1]])
     triangles = [each + first for (_, each), first in zip(parts, start, strict=True)]
     return np.concatenate([points for points, _ in parts]), np.concatenate(triangles)
-
-
-def _mesh(obj: str) -> Mesh:
-    return merged([surface for _, surface in parse_obj(obj)])
 
 
 def simplified(mesh: Mesh, triangles: int) -> Mesh:

@@ -3,7 +3,7 @@
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -30,6 +30,7 @@ SIZES, SIZE_SHARES = ((352, 480), (256, 384), (192, 288)), (0.5, 0.3, 0.2)  # pi
 CLOSER_SHARE = 0.5  # of the smaller images, a part of a stored image rather than all of it
 CROPPED_SHARE = 0.12  # share of the images cropped to the objects' surroundings
 HELD_OUT = 2  # files, the first ones, that the network never learns from
+EVALUATED = 200  # of their images, about
 LEARNING_RATE = 3e-3
 WARM_UP = 200  # steps
 SAVE_EVERY = 300  # seconds
@@ -49,30 +50,14 @@ class SceneBatch(NamedTuple):
     up: Tensor  # (B, 3) unit
 
 
-class SceneImages:
-    """Stored images, in memory."""
-
-    def __init__(self, files: Sequence[Path]) -> None:
-        """Read files of `generate`."""
-        self.arrays: dict[Path, dict[str, NDArray[np.generic]]] = {}
-        self.where: list[tuple[Path, int]] = []
-        self.add(files)
-
-    def add(self, files: Sequence[Path]) -> None:
-        """Read the files that have not been read yet."""
-        for path in files:
-            if path in self.arrays:
-                continue
-            with np.load(path) as stored:
-                self.arrays[path] = {name: stored[name] for name in SceneImage._fields}
-            self.where += [(path, k) for k in range(len(self.arrays[path]["depth"]))]
-
-    def __len__(self) -> int:
-        return len(self.where)
-
-    def __getitem__(self, index: int) -> SceneImage:
-        file, row = self.where[index]
-        return SceneImage(*(self.arrays[file][name][row] for name in SceneImage._fields))
+def read_images(files: Iterable[Path]) -> list[SceneImage]:
+    """All images in files of `generate`."""
+    images = []
+    for path in files:
+        with np.load(path) as stored:
+            columns = [stored[name] for name in SceneImage._fields]
+        images += [SceneImage(*row) for row in zip(*columns, strict=True)]
+    return images
 
 
 def image_points(image: SceneImage) -> Float32:
@@ -137,12 +122,7 @@ def _example(
 _MIRROR, _HALF_TURN = np.array([[-1, 1, 1], [-1, -1, 1]], dtype=np.float32)
 
 
-def _cropped(
-    points: Float32,
-    label: Int64,
-    plane: Float32,
-    rng: np.random.Generator,
-) -> Float32:
+def _cropped(points: Float32, label: Int64, plane: Float32, rng: np.random.Generator) -> Float32:
     """Keep only points above the support and near objects, as callers crop clouds."""
     objects = points[(label >= OBJECT) & ~np.isnan(points[..., 2])]
     if len(objects) < 50:
@@ -180,18 +160,18 @@ def scene_loss(output: SceneOutput, batch: SceneBatch) -> dict[str, Tensor]:
     }
 
 
-def evaluate(network: SceneNet, images: SceneImages, limit: int = 200) -> dict[str, float]:
+def evaluate(network: SceneNet, images: Sequence[SceneImage]) -> dict[str, float]:
     """Losses and the intersection over union of each class, half of the images with `up`."""
     network.eval()
     rng, totals = np.random.default_rng(0), np.zeros((3, 3))
     losses: dict[str, float] = {}
-    rows = range(0, len(images), max(len(images) // limit, 1))
+    some = images[:: max(len(images) // EVALUATED, 1)]
     with torch.inference_mode():
-        for number, start in enumerate(rows):
-            batch = make_batch([images[start]], rng, up_known=number % 2 == 0)
+        for number, image in enumerate(some):
+            batch = make_batch([image], rng, up_known=number % 2 == 0)
             output = network(batch.features)
             for name, value in scene_loss(output, batch).items():
-                losses[name] = losses.get(name, 0.0) + float(value) / len(rows)
+                losses[name] = losses.get(name, 0.0) + float(value) / len(some)
             said, true = output.classes.argmax(1).numpy(), batch.classes.numpy()
             np.add.at(totals, (true[true >= 0], said[true >= 0]), 1)
     both = np.diag(totals)
@@ -201,13 +181,12 @@ def evaluate(network: SceneNet, images: SceneImages, limit: int = 200) -> dict[s
     }
 
 
-def fit_confidence(network: SceneNet, images: SceneImages) -> list[float]:
+def fit_confidence(network: SceneNet, images: Sequence[SceneImage]) -> list[float]:
     """Logistic regression from `mean_probability` to whether most of an instance is an object."""
     means, right = [], []
-    for row in range(len(images)):
-        image, points = images[row], image_points(images[row])
+    for row, image in enumerate(images):
         known = image.up.astype(np.float64) if row % 2 else None
-        pixels, _ = look(network, points, known, 1.0 / float(image.camera[0]))
+        pixels, _ = look(network, image_points(image), known, 1.0 / float(image.camera[0]))
         number = group(pixels)
         size = np.bincount(number[number >= 0])
         on_object = (number >= 0) & (image.label[::2, ::2] >= OBJECT)
@@ -224,8 +203,12 @@ def fit_confidence(network: SceneNet, images: SceneImages) -> list[float]:
     return fitted
 
 
-def batches(data: Path, images: SceneImages, rng: np.random.Generator) -> Iterator[SceneBatch]:
-    """Endless batches of the folder's files, prepared ahead; files added meanwhile are read too."""
+def batches(data: Path, images: list[SceneImage], rng: np.random.Generator) -> Iterator[SceneBatch]:
+    """Endless batches of the folder's files, prepared ahead; files added meanwhile are read too.
+
+    All that are read are appended to `images`.
+    """
+    read: set[Path] = set()
 
     def one(rows: Int64) -> SceneBatch:
         return make_batch([images[int(k)] for k in rows], rng)
@@ -233,7 +216,9 @@ def batches(data: Path, images: SceneImages, rng: np.random.Generator) -> Iterat
     with ThreadPoolExecutor(1) as pool:
         waiting = None
         while True:
-            images.add(_files(data)[HELD_OUT:])
+            new = [path for path in _files(data)[HELD_OUT:] if path not in read]
+            read.update(new)
+            images += read_images(new)
             order = rng.permutation(len(images))
             for start in range(0, len(order) - BATCH + 1, BATCH):
                 following = pool.submit(one, order[start : start + BATCH])
@@ -262,7 +247,7 @@ def train(
     averaging = swa_utils.get_ema_multi_avg_fn(AVERAGED)  # type: ignore[no-untyped-call]
     mean = swa_utils.AveragedModel(network, multi_avg_fn=averaging, use_buffers=True)
     optimiser = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=0.01)
-    held, images = SceneImages(_files(data)[:HELD_OUT]), SceneImages([])
+    held, images = read_images(_files(data)[:HELD_OUT]), list[SceneImage]()
     source = batches(data, images, np.random.default_rng(seed))
     begin = saved = time.monotonic()
     step, running = 0, dict[str, float]()

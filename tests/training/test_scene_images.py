@@ -12,13 +12,13 @@ from tests.cloud_files import block_obj
 
 from edgegrasp_model.scene.network import SceneNet
 from edgegrasp_training import scene_images, scene_pool, scene_training
-from edgegrasp_training.scene_images import DEPTH_UNIT, draw_pose, generate, make_image
+from edgegrasp_training.scene_images import DEPTH_UNIT, generate, make_images
 from edgegrasp_training.scene_layouts import OBJECT, SUPPORT, box, draw_scene
 from edgegrasp_training.scene_pool import PoolMesh, pool_mesh
 from edgegrasp_training.scene_training import (
-    SceneImages,
     image_points,
     make_batch,
+    read_images,
     scene_loss,
     train,
 )
@@ -35,9 +35,7 @@ def test_labels_agree_with_the_depths(pool: list[PoolMesh], seed: int) -> None:
     rng = np.random.default_rng(seed)
     images = []
     while len(images) < 3:
-        scene = draw_scene(rng, pool, [])
-        image = make_image(rng, scene, draw_pose(rng, scene))
-        images += [] if image is None else [image]
+        images += make_images(rng, draw_scene(rng, pool, []))
     for image in images:
         points = image_points(image)
         on = points[(image.label == SUPPORT) & (image.depth > 0)]
@@ -62,7 +60,7 @@ def test_the_same_scene_is_made_again_from_its_seed(pool: list[PoolMesh]) -> Non
 def test_a_file_is_made_and_learned_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scene_images, "SCENES_PER_FILE", 2)
     monkeypatch.setattr(scene_pool, "NUM_POOL", 12)
-    monkeypatch.setattr(scene_pool, "NUM_ARMS", 0)
+    monkeypatch.setattr(scene_pool, "ARMS", ())
     monkeypatch.setattr(scene_training, "HELD_OUT", 1)
     monkeypatch.setattr(scene_training, "BATCH", 2)
     mesh = tmp_path / "block.obj"
@@ -70,7 +68,7 @@ def test_a_file_is_made_and_learned_from(tmp_path: Path, monkeypatch: pytest.Mon
     generate(tmp_path / "data", [mesh], files=2, seed=1, part=0, parts=1)
     files = sorted((tmp_path / "data").glob("scenes-????.npz"))
     assert len(files) == 2
-    batch = make_batch([SceneImages(files)[0]], np.random.default_rng(0), up_known=True)
+    batch = make_batch([read_images(files)[0]], np.random.default_rng(0), up_known=True)
     train(tmp_path / "data", tmp_path / "run", seconds=0.2)
     assert (tmp_path / "run" / "scene.safetensors").is_file()
     assert "iou_object" in (tmp_path / "run" / "log.txt").read_text()
