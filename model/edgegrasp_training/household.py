@@ -314,6 +314,17 @@ def swept(section: Float64, angles: Float64) -> Float64:
     return rings
 
 
+def strips(rings: int, corners: int, *, closed: bool = True) -> tuple[Int64, Int64]:
+    """Triangles that join neighbouring rings, or open rows, of corners: two to each side."""
+    number = np.arange(rings * corners).reshape(rings, corners)
+    if closed:
+        number = np.hstack([number, number[:, :1]])
+    low, high = number[:-1], number[1:]
+    sides = low[:, :-1], low[:, 1:], high[:, 1:], high[:, :-1]
+    a, b, c, d = (each.ravel() for each in sides)
+    return np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)
+
+
 def _loft(outline: Float64, widths: Numbers, heights: Numbers) -> Mesh:
     """A solid with a convex outline (S, 2), counter-clockwise; heights ascend."""
     rings = lofted(outline, widths, heights)
@@ -390,12 +401,9 @@ def _placed(parts: list[Mesh], *moves: Float64 | tuple[float, ...]) -> list[Mesh
 @lru_cache(maxsize=64)
 def _faces(rings: int, corners: int) -> Int64:
     """Triangles that join neighbouring rings of corners and close both ends."""
-    low = (np.arange(rings - 1)[:, None] * corners + np.arange(corners)).ravel()
-    beside = (np.arange(rings - 1)[:, None] * corners + np.roll(np.arange(corners), -1)).ravel()
-    fan = np.stack([np.zeros(corners - 2), np.arange(1, corners - 1), np.arange(2, corners)], 1)
-    faces = [np.stack([low, beside, beside + corners], 1), fan.astype(np.int64)[:, ::-1]]
-    faces += [np.stack([low, beside + corners, low + corners], 1)]
-    faces += [fan.astype(np.int64) + (rings - 1) * corners]
-    triangles = np.concatenate(faces)
+    first, second = strips(rings, corners)
+    start, end = np.arange(1, corners - 1), np.arange(2, corners)
+    fan = np.stack([np.zeros_like(start), start, end], axis=1)
+    triangles = np.concatenate([first, fan[:, ::-1], second, fan + (rings - 1) * corners])
     triangles.setflags(write=False)
     return triangles

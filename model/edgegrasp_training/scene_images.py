@@ -21,6 +21,7 @@ from edgegrasp_camera.arrays import Array, Bools, Float32, Float64
 from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.engine import Intrinsics
 from edgegrasp_sim.sensor import DepthSensor, random_sensor
+from edgegrasp_training.household import Mesh
 from edgegrasp_training.scene_layouts import (
     MAX_OBJECTS,
     OBJECT,
@@ -29,7 +30,7 @@ from edgegrasp_training.scene_layouts import (
     SceneMeshes,
     draw_scene,
 )
-from edgegrasp_training.scene_pool import Mesh, make_arms, make_pool
+from edgegrasp_training.scene_pool import make_arms, make_pool
 
 WIDTH, HEIGHT = 480, 352  # pixels
 DEPTH_UNIT = 0.0002  # metres of a stored depth; 16 bits reach 13 m

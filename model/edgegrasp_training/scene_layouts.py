@@ -14,7 +14,8 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float64, Int64
-from edgegrasp_training.scene_pool import Mesh, PoolMesh, merged, pool_mesh
+from edgegrasp_training.household import Mesh, strips
+from edgegrasp_training.scene_pool import PoolMesh, merged, pool_mesh
 
 OTHER, SUPPORT, OBJECT = 0, 1, 2  # labels; objects are numbered from OBJECT
 MAX_OBJECTS = 96
@@ -31,7 +32,6 @@ class SceneMeshes:
 
     rng: np.random.Generator  # of all that is drawn
     pool: Sequence[PoolMesh]  # objects to draw from
-    arms: Sequence[Mesh]  # robot arms to draw from
     parts: list[tuple[Mesh, int]] = field(default_factory=list)  # and the label of each
     centres: list[Float64] = field(default_factory=list)  # of the objects
     elevation: tuple[float, float] = (0.25, 1.5)  # radians above level, of the camera
@@ -64,7 +64,7 @@ def draw_scene(
     """Draw a scene of a random kind."""
     shares = np.array([0.34, 0.33, 0.17, 0.09, 0.07])
     kind = int(rng.choice(len(shares), p=shares / shares.sum()))
-    scene = SceneMeshes(rng, pool, arms)
+    scene = SceneMeshes(rng, pool)
     (_table, _bin, _shelf, _tray, _floor)[kind](scene)
     if arms and rng.random() < (0.25, 0.15, 0.1, 0.25, 0.25)[kind]:
         points, triangles = arms[int(rng.integers(len(arms)))]
@@ -326,18 +326,10 @@ def _cable(rng: np.random.Generator, place: ArrayLike) -> Mesh:
     radius = rng.uniform(0.002, 0.008)
     angle = 2 * np.pi * np.arange(6) / 6
     side = np.stack([-np.sin(heading), np.cos(heading)], 1)
-    points = np.concatenate(
-        [
-            (way[:, None] + radius * np.cos(angle)[None, :, None] * side[:, None]),
-            rise[:, None, None] + radius + radius * np.sin(angle)[None, :, None],
-        ],
-        axis=2,
-    )
-    this = (np.arange(49)[:, None] * 6 + np.arange(6)).ravel()
-    beside = (np.arange(49)[:, None] * 6 + (np.arange(6) + 1) % 6).ravel()
-    return points.reshape(-1, 3), np.concatenate(
-        [np.stack([this, beside, beside + 6], 1), np.stack([this, beside + 6, this + 6], 1)]
-    )
+    level = way[:, None] + radius * np.cos(angle)[None, :, None] * side[:, None]
+    height = rise[:, None, None] + radius + radius * np.sin(angle)[None, :, None]
+    points = np.concatenate([level, height], axis=2)
+    return points.reshape(-1, 3), np.concatenate(strips(50, 6))
 
 
 def _disc(half: tuple[float, float]) -> Mesh:
@@ -407,10 +399,7 @@ def _surface(rng: np.random.Generator, half: tuple[float, float], bow: float) ->
         z += rng.normal(0.0, 0.5) * np.sin(wave[0] * x + wave[1] * y + rng.uniform(0, 6.3))
     z = bow * z / max(np.abs(z).max(), 1e-9) * (rng.random() if bow else 0.0)
     points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
-    return points, np.concatenate(
-        [np.stack([a, a + 1, a + n + 1], 1), np.stack([a, a + n + 1, a + n], 1)]
-    )
+    return points, np.concatenate(strips(n, n, closed=False))
 
 
 def box(size: ArrayLike, centre: ArrayLike, yaw: float = 0.0) -> Mesh:
@@ -447,10 +436,6 @@ class HeightMap:
         index = np.clip(index, 0, len(self.height) - 1)
         return index[:, 0], index[:, 1]
 
-    def rest(self, points: Float64) -> float:
-        """How far an object with surface points (N, 3) must be raised to rest there."""
-        return float((self.height[self.cells(points)] - points[:, 2]).max())
-
     def put(self, points: Float64) -> None:
         """Add an object's surface to the heights."""
         np.maximum.at(self.height, self.cells(points), points[:, 2])
@@ -482,7 +467,8 @@ def _lay_objects(
                 place = np.clip(rng.normal(0.0, around, 2), -room, room)
             moved = samples + np.array([*place, 0.0])
             apart = [moved, moved + APART, moved - APART] if how == "spread" else [moved]
-            rise = heights.rest(np.concatenate(apart))
+            below = np.concatenate(apart)
+            rise = float((heights.height[heights.cells(below)] - below[:, 2]).max())
             lowest = rise + samples[:, 2].min()
             if how != "heap" and lowest > 0.004:
                 continue

@@ -35,7 +35,7 @@ LEARNING_RATE = 3e-3
 WARM_UP = 200  # steps
 SAVE_EVERY = 300  # seconds
 AVERAGED = 0.998  # of the mean weights that stay at each step
-CLASS_WEIGHT, VOTE_WEIGHT, LINK_WEIGHT, UP_WEIGHT = 1.0, 1.0, 0.5, 0.5
+LINK_WEIGHT, UP_WEIGHT = 0.5, 0.5  # in the loss
 APART = 4.0  # weight of a link between different objects
 
 
@@ -153,8 +153,8 @@ def scene_loss(output: SceneOutput, batch: SceneBatch) -> dict[str, Tensor]:
     seen = batch.classes >= 0
     up = ((1.0 - agree) * seen).sum() / seen.sum().clamp(min=1)
     return {
-        "classes": CLASS_WEIGHT * classes,
-        "votes": VOTE_WEIGHT * votes,
+        "classes": classes,
+        "votes": votes,
         "links": LINK_WEIGHT * links,
         "up": UP_WEIGHT * up,
     }

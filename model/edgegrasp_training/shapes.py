@@ -13,7 +13,7 @@ import numpy as np
 from edgegrasp_camera.arrays import Float64, Int64
 from edgegrasp_sim.engine import OBJECT_MASS
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, as_obj, blob, write_object, write_parts
-from edgegrasp_training.household import household_mesh, lofted, oval, swept
+from edgegrasp_training.household import household_mesh, lofted, oval, strips, swept
 
 STRETCH = 1.35  # greatest factor along an axis; its inverse is the least
 MADE_SHARE = 0.5  # of a scene's objects that are computed
@@ -113,18 +113,13 @@ def _surface(rings: Rings) -> tuple[Float64, Int64]:
     count, corners, _ = rings.shape
     ends = np.array([rings[0].mean(axis=0), rings[-1].mean(axis=0)])
     points = np.concatenate([rings.reshape(-1, 3), ends])
-    this = np.arange(corners)
+    sides = [each.reshape(count - 1, corners, 3) for each in strips(count, corners)]
+    this, last = np.arange(corners), (count - 1) * corners
     beside = (this + 1) % corners
-    faces = []
-    for low in range(0, (count - 1) * corners, corners):
-        high = low + corners
-        faces += [np.stack([low + this, low + beside, high + beside], axis=1)]
-        faces += [np.stack([low + this, high + beside, high + this], axis=1)]
-    bottom, top = np.full(corners, count * corners), np.full(corners, count * corners + 1)
-    last = (count - 1) * corners
-    faces += [np.stack([bottom, beside, this], axis=1)]
-    faces += [np.stack([top, last + this, last + beside], axis=1)]
-    triangles = np.concatenate(faces)
+    middle = np.full(corners, count * corners)
+    bottom = np.stack([middle, beside, this], axis=1)
+    top = np.stack([middle + 1, last + this, last + beside], axis=1)
+    triangles = np.concatenate([*np.stack(sides, axis=1).reshape(-1, corners, 3), bottom, top])
     a, b, c = points[triangles].transpose(1, 0, 2)
     outwards = (np.cross(a, b) * c).sum() > 0.0
     return points, triangles if outwards else triangles[:, ::-1]
