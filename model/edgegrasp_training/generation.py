@@ -15,7 +15,7 @@ from edgegrasp_camera.arrays import Floats, Int64
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import Sample, Sampler
 from edgegrasp_model.detector import GraspDetector
-from edgegrasp_model.gripper import choose_gripper, load_gripper
+from edgegrasp_model.gripper import choose_gripper, gripper_fields, load_gripper
 from edgegrasp_model.options import (
     AutoPlane,
     Box,
@@ -29,7 +29,7 @@ from edgegrasp_model.options import (
 )
 from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_model.scene.scene import Scene, SelectedPoints, build_scene, select_points
-from edgegrasp_sim.camera import Observation, ViewRange
+from edgegrasp_sim.camera import Observation, TableView, ViewRange
 from edgegrasp_sim.engine import choose_engine
 from edgegrasp_sim.objects import CLUTTER, ObjectSet, SceneKind
 from edgegrasp_sim.poses import about_z
@@ -38,11 +38,10 @@ from edgegrasp_sim.sensor import random_sensor
 from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
 from edgegrasp_sim.workers import run_tasks
-from edgegrasp_training.hands import hand_of_scene
 from edgegrasp_training.options import GenerationOptions
 from edgegrasp_training.recipes import CROP_RADIUS, VOXEL_SIZE
 from edgegrasp_training.shapes import household_objects, varied_objects
-from edgegrasp_training.views import LabelledView, different, support_as_array
+from edgegrasp_training.views import LabelledView, different
 
 SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM, HAND_STREAM = range(6)
 HOUSEHOLD_STREAM = 6
@@ -51,12 +50,8 @@ BIN_APPROACH_POINTS = 24  # walls block most hands there
 PACKED, PILE, BIN, TABLE = SceneKind.PACKED, SceneKind.PILE, SceneKind.BIN, SceneKind.TABLE
 # Four in ten scenes are those of the benchmark of the paper.
 MIXTURE = (PACKED, PILE, BIN, TABLE, BIN, PACKED, TABLE, PILE, BIN, TABLE)
-FURTHER_OBJECTS = {
-    PACKED: 4,
-    PILE: 4,
-    BIN: 7,
-    TABLE: 5,
-}  # a scene holds one object and Poisson(this) more
+# A scene holds one object and Poisson(this) more.
+FURTHER_OBJECTS = {PACKED: 4, PILE: 4, BIN: 7, TABLE: 5}
 _ABOVE, _STEEP = (0.0, np.radians(40)), (np.radians(20), np.radians(75))
 _ANY_SIDE = 0.0, 2 * np.pi
 _LOW_TARGET = (MIDDLE, MIDDLE, 0.1)  # metres
@@ -94,6 +89,23 @@ EASY_SHARE = 0.4  # of the grasps, tried in a view whose best grasp is sure
 FREE_SHARE = 0.75  # of the grasps chosen at random, those that are collision-free
 GUIDED_SHARE = 0.5  # of the tried grasps, the network's best and unsure ones
 
+# Of a random hand.
+OPENING = 0.04, 0.14  # metres, as the other ranges
+LENGTH = 0.035, 0.12  # of the fingers, from the palm to their tips
+HALF_WIDTH = 0.005, 0.015  # of a finger
+THICKNESS = 0.006, 0.022  # of a finger at its tip
+ROOT = 0.0, 0.016  # further outward where it is thickest
+PALM_Z = 0.06, 0.09
+BODY = 0.02, 0.035  # half depth of the hand
+INSIDE = 0.007  # from a contact to the fingertips, as in every gripper file
+SWING_SHARE = 0.4  # of the hands, whose fingers swing
+RADIUS = 0.05, 0.11  # of the link that carries such a finger
+REACH = 0.6, 1.0  # outward part of that link in the open hand, in halves of the opening
+STEEPEST = 0.75  # most of it, in radii
+
+
+detector = lru_cache(maxsize=1)(GraspDetector.load)  # loads weights once in a process
+
 
 class Query(NamedTuple):
     """A view of a scene and a request for grasps in it."""
@@ -111,11 +123,10 @@ def generate(
 ) -> Iterator[tuple[int, int, int]]:
     """Generate the missing scenes; yields each one's index, grasps tried, and grasps that held."""
     folder.mkdir(parents=True, exist_ok=True)
-    found: dict[str, Any] = {"engine": choose_engine(options.engine)}
-    if options.weights is not None:  # other machines find it there too
-        found["weights"] = options.weights.resolve()
-    options = options.model_copy(update=found)
-    objects = objects and objects.resolve()
+    found = {"engine": choose_engine(options.engine)}
+    # Other machines find files at whole paths too.
+    weights, objects = (path and path.resolve() for path in (options.weights, objects))
+    options = options.model_copy(update=found | {"weights": weights})
     if other := different(folder.glob("*.npz"), "engine") - {options.engine}:
         raise ValueError(
             f"{folder} holds labels of {', '.join(other)}, not of {options.engine}; "
@@ -138,13 +149,11 @@ def generate(
 
 def missing_scenes(folder: Path, options: GenerationOptions) -> list[int]:
     """Indices of the scenes that lack a view."""
+    views = range(options.views_per_scene)
     return [
         index
         for index in range(options.scenes)
-        if not all(
-            view_path(folder, index, view, options).is_file()
-            for view in range(options.views_per_scene)
-        )
+        if not all(view_path(folder, index, view, options).is_file() for view in views)
     ]
 
 
@@ -187,7 +196,11 @@ def generate_scene(
             count = NUM_HOUSEHOLD
             drawn = household_objects(Path(shapes) / "household", count, streams[HOUSEHOLD_STREAM])
         made_of = None if drawn is None else {kind: drawn}
-        gripper = hand_of_scene(options.gripper, streams[HAND_STREAM])
+        gripper = None  # the Panda's
+        if options.gripper == "random":
+            gripper = random_gripper(streams[HAND_STREAM])
+        elif options.gripper != "panda":
+            gripper = gripper_fields(options.gripper)
         hand = "" if gripper is None else json.dumps(gripper)
         with ClutterSimulation(made_of, engine=options.engine, gripper=gripper) as simulation:
             low, high = PACKED_SCALE if kind.objects is PACKED else PILE_SCALE
@@ -195,14 +208,14 @@ def generate_scene(
             sizes = HOUSEHOLD_SCALE if household else sizes
             aside = household and kind is not BIN
             seen_from = SIDE_VIEWS if aside else VIEWS[kind]
-            hard = _make_scene(simulation, kind, seen_from, sizes, options, streams)
+            look = partial(ask, simulation, kind, seen_from, streams)
+            hard = _make_scene(simulation, kind, sizes, options, streams[SCENE_STREAM], look)
             models = [model.origin or model for model in simulation.object_models]
             names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
             made: dict[str, Any] = {"engine": simulation.world.name, "gripper": hand}
             made |= {"objects": names, "object_digests": digests}
             for number in range(options.views_per_scene):
-                query = hard if number == 0 else None
-                query = query or ask(simulation, kind, seen_from, streams)
+                query = hard if hard is not None and number == 0 else look()
                 choice = streams[CHOICE_STREAM]
                 view = label(simulation, query, options, choice, hard=hard is not None)
                 views.append(replace(view, **made))
@@ -212,40 +225,34 @@ def generate_scene(
 def _make_scene(
     simulation: ClutterSimulation,
     kind: SceneKind,
-    seen_from: ViewRange,
     scales: tuple[float, float],
     options: GenerationOptions,
-    streams: list[np.random.Generator],
+    rng: np.random.Generator,
+    look: Callable[[], Query],
 ) -> Query | None:
     """Make a scene, with weights mostly one they find hard; returns that hard view, if any."""
-    rng = streams[SCENE_STREAM]
     guide = None
     if options.weights is not None and rng.random() < HARD_SHARE:
         guide = detector(options.weights)
     for _ in range(1 if guide is None else HARD_TRIES):
         simulation.reset(kind, rng, 1 + int(rng.poisson(FURTHER_OBJECTS[kind])), scales)
-        hard = None if guide is None else _hard_view(simulation, kind, seen_from, guide, streams)
+        hard = None if guide is None else _hard_view(simulation, guide, look)
         if hard is not None:
             return hard
     return None
 
 
 def _hard_view(
-    simulation: ClutterSimulation,
-    kind: SceneKind,
-    seen_from: ViewRange,
-    guide: GraspDetector,
-    streams: list[np.random.Generator],
+    simulation: ClutterSimulation, guide: GraspDetector, look: Callable[[], Query]
 ) -> Query | None:
     """The first view in which the network is unsure or wrong; easy objects are removed first."""
     for _ in range(min(simulation.num_objects, HARD_LOOKS)):
-        query = ask(simulation, kind, seen_from, streams)
+        query = look()
         if len(query.observation.cloud) == 0:
             return None
         grasps = guide.detect(query.observation.cloud, query.request).grasps
-        if not grasps or grasps[0].score < SURE:
-            return query
-        if not simulation.try_grasp(grasps[0].T_cloud_hand).success:
+        unsure = not grasps or grasps[0].score < SURE
+        if unsure or not simulation.try_grasp(grasps[0].T_cloud_hand).success:
             return query
         if simulation.num_objects == 1:
             return None
@@ -268,12 +275,9 @@ def ask(
     open_table = kind in (PACKED, PILE)
     around = not open_table or noise.random() < AROUND_SHARE
     seen = _noise(noise)
-    observation = simulation.observe_from(
-        seen_from.sample(streams[CAMERA_STREAM]),
-        noise,
-        table="around" if around else "known",
-        **seen,
-    )
+    cameras = seen_from.sample(streams[CAMERA_STREAM])
+    table: TableView = "around" if around else "known"
+    observation = simulation.observe_from(cameras, noise, table=table, **seen)
     support: SupportPlane | AutoPlane = _plane(noise) if around else EXACT_PLANE
     low, high = map(tuple, observation.workspace.tolist())
     workspace: Workspace | None = Workspace(min=low, max=high)
@@ -352,6 +356,7 @@ def label(
     places = T_world_hand[:, :3, 3] + np.float32(behind) * T_world_hand[:, :3, 2]
     if len(places) == 0:  # a teacher's grasps are on the objects
         places = scene.points_in_cloud[scene.approach_allowed]
+    plane = None if selected.support is None else selected.support.plane
     far = cKDTree(places).query(scene.points_in_cloud)[0] > KEPT_DISTANCE
     kept = np.flatnonzero(~far)
     return LabelledView(
@@ -363,7 +368,7 @@ def label(
         T_world_hand=T_world_hand,
         success=np.asarray([result.success for result in results], dtype=np.int8),
         firm=np.asarray([bool(result.held_after_shaking) for result in results], dtype=np.int8),
-        support=support_as_array(selected.support),
+        support=np.array([0.0] * 4 if plane is None else [*plane.normal, plane.offset], np.float32),
         at_side=None if scene.at_side is None else scene.at_side[kept],
         object_of_point=scene.object_of_point[kept].astype(np.int16),
     )
@@ -396,18 +401,8 @@ def choose_grasps(
     return selected, scene, candidates
 
 
-@lru_cache(maxsize=1)
-def detector(weights: Path) -> GraspDetector:
-    """The detector with these weights, loaded once in a process."""
-    return GraspDetector.load(weights)
-
-
 def _chosen(
-    sample: Sample,
-    logit: Floats | None,
-    total: int,
-    rng: np.random.Generator,
-    hard: bool,
+    sample: Sample, logit: Floats | None, total: int, rng: np.random.Generator, hard: bool
 ) -> Int64:
     """Ascending rows of the candidates to try, `total` at most, fewer if the best one is sure.
 
@@ -435,3 +430,36 @@ def _chosen(
     left[free] = False
     left[hit[: round((1.0 - FREE_SHARE) * count)]] = False
     return np.flatnonzero(~left)
+
+
+def random_gripper(rng: np.random.Generator) -> dict[str, Any]:
+    """The fields of a gripper whose opening, and fingers' length, width and thickness are drawn.
+
+    A finger is a pad, and behind it a root that is no thinner.
+    """
+    opening, length, half, thick = (
+        round(rng.uniform(*span), 4) for span in (OPENING, LENGTH, HALF_WIDTH, THICKNESS)
+    )
+    palm, body, root = (round(rng.uniform(*span), 4) for span in (PALM_Z, BODY, ROOT))
+    tip, pad = palm + length, palm + length * rng.uniform(0.2, 0.6)
+    side = max(opening / 2 + thick + rng.uniform(-0.03, 0.02), 0.03)
+    swing = None
+    if rng.random() < SWING_SHARE:
+        radius = rng.uniform(*RADIUS)
+        reach = min(rng.uniform(*REACH) * opening / 2, STEEPEST * radius)
+        swing = {"radius": radius, "reach": reach}
+    return {
+        "name": "random",
+        "max_opening": opening,
+        "tip_z": tip,
+        "contact_z": tip - INSIDE,
+        "tcp_z": tip - INSIDE,
+        "hand": {"boxes": [[[-body, -side, 0.0], [body, side, palm]]]},
+        "finger": {
+            "boxes": [
+                [[-half, 0.0, pad], [half, thick, tip]],
+                [[-half, 0.002, palm - 0.005], [half, thick + root, pad]],
+            ]
+        },
+        "swing": swing,
+    }

@@ -19,11 +19,9 @@ from edgegrasp_camera.arrays import Array, Bools, Float32, Int64
 from edgegrasp_model.gripper import Gripper, gripper_from_fields, load_gripper
 from edgegrasp_model.options import SupportPlane, Workspace
 from edgegrasp_model.scene.scene import near_workspace_side
-from edgegrasp_model.scene.support import Support
 
 UNTRIED = -1  # label of a candidate that was not tried
 TOGETHER = 0.009  # metres between points of one object: twice the edge of a voxel
-CARD_FILE = "card.md"
 OPTIONAL = ("T_world_hand", "firm", "support", "at_side", "object_of_point")
 # The table and the limits of the simulated scenes, for views whose file does not have them.
 TABLE = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.05)
@@ -120,13 +118,6 @@ def _hand(fields: str) -> Gripper:
     return gripper_from_fields(json.loads(fields)) if fields else load_gripper()
 
 
-def support_as_array(support: Support | None) -> Float32:
-    """A support plane as `LabelledView.support` has it."""
-    if support is None:
-        return np.zeros(4, dtype=np.float32)
-    return np.array([*support.plane.normal, support.plane.offset], dtype=np.float32)
-
-
 def load_view(path: Path) -> LabelledView:
     """Read a view."""
     with np.load(path, allow_pickle=False) as arrays:
@@ -182,14 +173,12 @@ def split_by_scene(
     )
 
 
-def write_data_card(folder: Path, paths: list[Path], command: str) -> Path:
+def write_data_card(folder: Path, paths: list[Path], command: str) -> None:
     """Count views, scenes, labels and objects of each kind of scene in `card.md`."""
     views = {path: load_view(path) for path in paths}
     kind = {path: path.stem.split("_")[0] for path in paths}
     kinds = [*sorted(set(kind.values())), "all"]
-    columns = [
-        _facts({p: v for p, v in views.items() if each in (kind[p], "all")}) for each in kinds
-    ]
+    columns = [_facts({p: v for p, v in views.items() if k in (kind[p], "all")}) for k in kinds]
     rows = [(fact, *(column[fact] for column in columns)) for fact in columns[0]]
     objects = Counter(
         known
@@ -200,9 +189,7 @@ def write_data_card(folder: Path, paths: list[Path], command: str) -> Path:
     lines += ["", "Made by:", "", "```", command, "```", ""]
     lines += ["Objects, the SHA-256 of their files, and in how many views they are:", ""]
     lines += [f"- {name} `{digest}`: {count}" for (name, digest), count in sorted(objects.items())]
-    path = folder / CARD_FILE
-    path.write_text("\n".join(lines) + "\n")
-    return path
+    (folder / "card.md").write_text("\n".join(lines) + "\n")
 
 
 def table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> list[str]:
@@ -213,23 +200,16 @@ def table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> list[str]
 
 def _facts(views: dict[Path, LabelledView]) -> dict[str, object]:
     success = np.concatenate([view.success for view in views.values()])
-    firm = np.concatenate(
-        [view.firm[view.success == 1] for view in views.values() if view.firm is not None]
-        or [np.empty(0)]
-    )
-    shares = {
-        "held after the lift": success[success != UNTRIED] == 1,
-        "of those, held after shaking too": firm == 1,
-    }
+    firm = [view.firm[view.success == 1] for view in views.values() if view.firm is not None]
+    tried, held = success[success != UNTRIED], np.concatenate([np.empty(0), *firm])
+    shares = (f"{100 * (part == 1).mean():.1f} %" if len(part) else "-" for part in (tried, held))
     return {
         "scenes": len({scene_of(path) for path in views}),
         "views": len(views),
         "engine": ", ".join(sorted({view.engine for view in views.values()})),
         "hands": len({view.gripper for view in views.values()}),
-        "grasps tried": int((success != UNTRIED).sum()),
-        **{
-            name: f"{100 * part.mean():.1f} %" if len(part) else "-"
-            for name, part in shares.items()
-        },
+        "grasps tried": len(tried),
+        "held after the lift": next(shares),
+        "of those, held after shaking too": next(shares),
         "objects": len({name for view in views.values() for name in view.objects}),
     }

@@ -6,6 +6,7 @@ from benchmarks import ur5_objects
 
 from edgegrasp_model.networks.config import HAND
 from edgegrasp_sim.engine import ENGINES, choose_engine, installed, make_world
+from edgegrasp_sim.engine.urdf import parse_obj
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import load_object
 from edgegrasp_training.examples import tried_grasps
@@ -83,22 +84,11 @@ def test_random_hands_differ_between_scenes_and_are_what_the_network_is_told(tmp
             assert seen.description[:, 71:74] == pytest.approx(
                 np.tile(measures, (len(seen.points), 1)), rel=1e-3
             )
-    before = paths[2].read_bytes()
-    paths[2].unlink()
-    list(generate(tmp_path, None, options))
-    assert paths[2].read_bytes() == before
-
-
-def _surface(obj: str) -> tuple[np.ndarray, np.ndarray]:
-    rows = [line.split() for line in obj.splitlines()]
-    points = np.array([row[1:] for row in rows if row[0] == "v"], dtype=float)
-    faces = np.array([row[1:] for row in rows if row[0] == "f"], dtype=int) - 1
-    return points, faces
 
 
 @pytest.mark.parametrize("index", range(0, NUM_DRAWN, 13))
 def test_drawn_shapes_are_closed(index: int) -> None:
-    points, faces = _surface(drawn_shape(index))
+    ((_, (points, faces)),) = parse_obj(drawn_shape(index))
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
     a, b, c = points[faces].transpose(1, 0, 2)
