@@ -93,9 +93,9 @@ def train(
     """
     from rich.progress import Progress
 
-    from edgegrasp_training.outcomes import recalibrate
+    from edgegrasp_training.evaluation import recalibrate
+    from edgegrasp_training.examples import Teacher
     from edgegrasp_training.recipes import recipe
-    from edgegrasp_training.teacher import Teacher
     from edgegrasp_training.training import Trainer
     from edgegrasp_training.views import find_views, split_by_scene
 

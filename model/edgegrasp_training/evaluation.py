@@ -1,4 +1,4 @@
-"""Evaluation of scores against outcomes, and the model card.
+"""Scores against outcomes: their evaluation, the model card, and recalibration on a robot's.
 
 `python -m edgegrasp_training.evaluation data/held-out --weights A.safetensors B.safetensors`
 compares weights of hand networks on labelled views that none of them has learned from: by kind of
@@ -7,21 +7,23 @@ scene, and by whether the camera saw the far side.
 
 import argparse
 import csv
+import json
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 from scipy.special import expit
+from scipy.special import logit as logit_of
 from scipy.stats import rankdata
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
 from edgegrasp_model.hand_description import BEYOND
-from edgegrasp_model.networks.checkpoint import load_checkpoint
+from edgegrasp_model.networks.checkpoint import load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.ranking import HIDDEN
@@ -31,6 +33,10 @@ from edgegrasp_training.views import find_views, load_view, scene_of, table
 TENTHS = tuple(round(0.1 * number, 1) for number in range(11))
 EDGES = (0.0, 0.1, 0.3, 0.5, 0.8, 0.9, 0.95, 1.0)  # edges of the score ranges in a comparison
 CURVE_ROWS = 20  # approximate number of rows of the learning curve in the card
+SCORES = (1e-4, 1.0 - 1e-4)  # scores are taken to lie between
+# Spread of log(scale) and of shift before there is any outcome: few outcomes change little.
+PRIOR_SCALE, PRIOR_SHIFT = 0.5, 1.5
+FEW = 25
 
 
 @dataclass(frozen=True)
@@ -134,6 +140,77 @@ def write_model_card(
     lines += [*table(("score", "held", "grasps"), bins), "", "During training:", ""]
     lines += table([name.replace("_", " ") for name in head], some)
     path.write_text("\n".join(lines) + "\n")
+
+
+# Learning from the robot. Two numbers are fitted, p = sigmoid(scale * logit + shift) (Platt
+# scaling), which is as much as some hundred outcomes can determine. The order of grasps stays.
+
+
+def read_outcomes(path: Path, digest: str) -> tuple[Float64, Float64]:
+    """Logits (N,) of executed grasps, and 1 or 0 (N,) whether they held, in a file of JSON lines.
+
+    Of the weights with this digest.
+
+    Raises:
+        ValueError: The file has none, or a line that is no outcome.
+    """
+    scores, held = [], []
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        try:
+            outcome = json.loads(line)
+            if outcome["digest"] == digest:
+                scores.append(float(outcome["score"]))
+                held.append(float(outcome["held"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path}, line {number}: {error!r}. It is no outcome.") from None
+    if not scores:
+        weights = digest[:12]
+        raise ValueError(f"{path}: no outcome of the weights {weights}. Name those that scored.")
+    return logit_of(np.clip(scores, *SCORES)), np.array(held)
+
+
+def fit(logit: Float64, held: Float64) -> tuple[float, float]:
+    """Scale and shift of the logits that are most probable after the outcomes."""
+
+    def cost(parameters: Float64) -> float:
+        log_scale, shift = parameters
+        prior = (log_scale / PRIOR_SCALE) ** 2 / 2 + (shift / PRIOR_SHIFT) ** 2 / 2
+        fitted = np.exp(log_scale) * logit + shift
+        return len(logit) * cross_entropy(fitted, held) + float(prior)
+
+    log_scale, shift = minimize(cost, np.zeros(2)).x
+    return float(np.exp(log_scale)), float(shift)
+
+
+def recalibrate(weights: Path, outcomes_file: Path, folder: Path) -> str:
+    """Write NAME-robot.safetensors, calibrated on outcomes; returns what was done."""
+    network, metadata = load_checkpoint(weights)
+    logit, held = read_outcomes(outcomes_file, metadata.digest)
+    scale, shift = fit(logit, held)
+    temperature = metadata.temperature / scale
+    # sigmoid((logit + shift * temperature) / temperature): the shift goes into the last bias.
+    last = [layer for layer in network.modules() if isinstance(layer, torch.nn.Linear)][-1]
+    with torch.no_grad():
+        last.bias.add_(shift * temperature)
+    share = float(held.mean())
+    old_scale, old_shift = metadata.training.get("outcomes_scale_shift", (1.0, 0.0))
+    training = metadata.training | {
+        "outcomes": len(held),
+        "outcomes_held": round(share, 3),
+        "outcomes_scale_shift": [scale * old_scale, scale * old_shift + shift],
+        "recalibrated_from_digest": metadata.digest,
+    }
+    name = f"{metadata.name}-robot"
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}.safetensors"
+    new = replace(metadata, name=name, temperature=temperature, training=training)
+    save_checkpoint(path, network, new)
+    before, after = cross_entropy(logit, held), cross_entropy(scale * logit + shift, held)
+    few = f" Warning: fewer than {FEW} outcomes say little." if len(held) < FEW else ""
+    return (
+        f"{len(held)} outcomes, {share:.2f} held: scores' cross entropy {before:.3f} -> "
+        f"{after:.3f} (scale {scale:.2f}, shift {shift:+.2f}): {path}.{few}"
+    )
 
 
 # Comparing weights

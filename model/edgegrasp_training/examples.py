@@ -1,6 +1,11 @@
-"""Training examples: the balls or hands of a view, with labels, packed as networks take them."""
+"""Training examples: the balls or hands of a view, with labels, packed as networks take them.
 
+Labels are the outcomes of grasps that were tried, and the scores of a teacher.
+"""
+
+import zlib
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -10,29 +15,25 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from edgegrasp_camera.arrays import Float32, Int64
-from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls, edge_grasps
+from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls, edge_grasps, retract
+from edgegrasp_model.candidates.outline import outline_grasps, outlines
 from edgegrasp_model.hand_description import Surroundings, without_support
 from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
 from edgegrasp_training.recipes import LENGTH_UNIT
-from edgegrasp_training.views import UNTRIED, UP, LabelledView
+from edgegrasp_training.views import UNTRIED, UP, LabelledView, load_view
 
 Rotations = Literal["any", "upright", "none"]
 SPARE_POINTS = 2  # factor of points kept per hand, from which each step picks
 TRIED_WEIGHT = 4.0  # weight of a simulated label in the loss; a teacher's score has weight 1
 SHAKEN_SHARE = 0.2  # part of a successful grasp's label that depends on surviving shaking
 FIRM_SHARE = 0.78  # share of successful grasps that survive shaking; used if shaking was not tried
-
-
-@dataclass(frozen=True)
-class HandInputs:
-    """Inputs of the hand network for E grasps; half precision to keep many views in memory."""
-
-    description: NDArray[np.float16]  # (E, F)
-    points: NDArray[np.float16]  # (E, P, 6)
-    point_count: Int64  # (E,)
+TAUGHT_BALLS = 24  # of a view, in which a teacher scores candidates,
+OWN_BALLS = 16  # of them at most around approach points of its tried grasps
+GRASPS_PER_BALL = 64  # scored at most; about a third of a ball's candidates
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,8 @@ class TriedGrasps:
 
     cloud: Cloud
     candidates: Candidates  # E of them
-    seen: HandInputs | None  # of the hand network; None for networks of balls
+    # Of the hand network; float16, to keep many views in memory. None for networks of balls.
+    seen: HandBatch | None
     label: Float32  # (E,) 0: not held; 1: held, less if it did not survive shaking
     turn: Float32  # (3, 3) rotation of the cloud's axes to the detector's frame
 
@@ -49,7 +51,7 @@ class TriedGrasps:
         """The same grasps, described as for a request without a support plane."""
         if self.seen is None:
             return self
-        unknown = without_support(self.seen.description).astype(np.float16)
+        unknown = torch.from_numpy(without_support(self.seen.description.numpy())).half()
         return replace(self, seen=replace(self.seen, description=unknown))
 
     def balls(self) -> Int64:
@@ -88,10 +90,7 @@ def tried_grasps(
     if config.architecture == "hand":
         viewpoints = view.camera_position[None] if viewpoint_known else None
         batch = hand_batch(view, candidates, viewpoints, SPARE_POINTS * config.hand_points)
-        description, points = batch.description.numpy(), batch.points.numpy()
-        seen = HandInputs(
-            description.astype(np.float16), points.astype(np.float16), batch.point_count.numpy()
-        )
+        seen = replace(batch, description=batch.description.half(), points=batch.points.half())
     return TriedGrasps(cloud, candidates, seen, label, _turn_of(view))
 
 
@@ -102,11 +101,64 @@ def hand_batch(
     max_points: int,  # points of each hand at most
 ) -> HandBatch:
     """The hand network's inputs for candidates in a simulated scene."""
-    cloud = Cloud(view.points, view.normals)
     known = view.support_plane, viewpoints, view.cut_off(), view.numbered_objects()
-    return HandBatch.of_hands(
-        Surroundings(cloud, view.up, *known), candidates, view.hand, max_points
-    )
+    around = Surroundings(Cloud(view.points, view.normals), view.up, *known)
+    return HandBatch.of_hands(around, candidates, view.hand, max_points)
+
+
+class Teacher:
+    """A hand network that scores the candidates of views."""
+
+    def __init__(self, weights: Path, crop_radius: float) -> None:
+        """Load a `hand` checkpoint; candidates are drawn from balls of `crop_radius` metres."""
+        self.network, self.metadata = load_checkpoint(weights)
+        if self.metadata.network.architecture != "hand":
+            found = self.metadata.network.architecture
+            raise ValueError(f"teacher: got a network of architecture {found!r}. Use a `hand` one.")
+        self.crop_radius = crop_radius
+
+    def soft_labels(self, path: Path) -> SoftLabels:
+        """Score candidates around some of a view's points, the same for the same file."""
+        view, rng = load_view(path), np.random.default_rng(zlib.crc32(path.read_bytes()))
+        own = np.unique(view.approach_index[view.tried()])
+        others = np.setdiff1d(np.flatnonzero(view.numbered_objects() >= 0), own)
+        own = rng.permutation(own)[:OWN_BALLS]
+        balls = np.sort(np.concatenate([own, rng.permutation(others)[: TAUGHT_BALLS - len(own)]]))
+        candidates = self._candidates(view, balls, rng) if len(balls) else Candidates.none()
+        chance = np.empty(0)
+        if len(candidates):
+            max_points = self.metadata.network.hand_points
+            hands = hand_batch(view, candidates, view.camera_position[None], max_points)
+            with torch.inference_mode():
+                chance = torch.sigmoid(self.network(hands) / self.metadata.temperature).numpy()
+        return SoftLabels(
+            candidates.approach_index.astype(np.uint16),
+            candidates.contact_index.astype(np.uint16),
+            candidates.approach.astype(np.float16),
+            candidates.depth.astype(np.float16),
+            chance.astype(np.float16),
+        )
+
+    def _candidates(self, view: LabelledView, balls: Int64, rng: np.random.Generator) -> Candidates:
+        """At most GRASPS_PER_BALL candidates in each ball (A,), made as the detector makes them."""
+        cloud, support = Cloud(view.points, view.normals), view.support_plane
+        crop = crop_balls(cloud.points, balls, self.crop_radius)
+        pairs = balls[crop.ball_of_point], crop.ball_rows
+        every = np.arange(len(crop.ball_rows))
+        sides = outlines(cloud.points, view.camera_position[None], np.unique(crop.ball_rows))
+        across = [
+            outline_grasps(cloud.points, crop, balls, every, seen, support, view.hand)
+            for seen in sides
+        ]
+        both = Candidates.concatenate([edge_grasps(cloud, *pairs, view.hand), *across])
+        if support is not None:
+            both, clear = retract(both, support, view.hand)
+            both = both.take(np.flatnonzero(clear))
+        both = both.take(rng.permutation(len(both)))
+        both = both.take(np.argsort(both.approach_index, kind="stable"))
+        _, first = np.unique(both.approach_index, return_index=True)
+        place = np.arange(len(both)) - np.repeat(first, np.diff([*first, len(both)]))
+        return both.take(place < GRASPS_PER_BALL)
 
 
 def pack_balls(
@@ -160,7 +212,7 @@ def pack_hands(
     seen = grasps.seen
     assert seen is not None
     rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, balls))
-    points, count = seen.points[rows], seen.point_count[rows]
+    points, count = seen.points.numpy()[rows], seen.point_count.numpy()[rows]
     limit, slot = config.hand_points, np.arange(seen.points.shape[1])
     if rng is None:
         order = slot * np.maximum(count[:, None], limit) // limit  # (E, P)
@@ -169,7 +221,7 @@ def pack_hands(
         order = np.argsort(np.where(there, rng.random(there.shape, dtype=np.float32), 2.0), axis=1)
     chosen = np.take_along_axis(points, order[:, :limit, None], axis=1)
     batch = HandBatch(
-        torch.from_numpy(seen.description[rows].astype(np.float32)),
+        seen.description[torch.from_numpy(rows)].float(),
         torch.from_numpy(chosen.astype(np.float32)),
         torch.from_numpy(np.minimum(count, limit)),
     )

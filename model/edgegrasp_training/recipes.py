@@ -20,7 +20,6 @@ from edgegrasp_model.networks.vn_edgegrasp import VNEdgeGraspNet
 
 CROP_RADIUS = 0.04  # metres; half the gripper's opening, as in the paper
 VOXEL_SIZE = 0.0045  # metres; that of the training views
-GRIPPER = "panda"
 # Metres. In metres the positions in a ball are far smaller than its normals, and learned late. A
 # power of two, so that converting weights back to metres is exact.
 LENGTH_UNIT = 1 / 64
@@ -37,7 +36,7 @@ def recipe(name: str) -> CheckpointMetadata:
     """The metadata of a new network of that name; raises ValueError for an unknown one."""
     if name not in RECIPES:
         raise ValueError(f"model: got {name!r}. Use one of: {', '.join(RECIPES)}.")
-    return CheckpointMetadata(name, RECIPES[name], VOXEL_SIZE, GRIPPER)
+    return CheckpointMetadata(name, RECIPES[name], VOXEL_SIZE, gripper="panda")
 
 
 def prepare_to_train(network: nn.Module) -> None:
@@ -55,17 +54,15 @@ def start_from(network: nn.Module, start: nn.Module) -> int:
     Additional numbers start with weight 0. Returns how many `start`, which takes lengths in metres,
     reads; 0 for networks of balls. ValueError: the networks differ in more than that.
     """
-    weights, known = in_units(start).state_dict(), 0
+    weights, known = rescaled(start, LENGTH_UNIT).state_dict(), 0
     if isinstance(network, HandNet) and isinstance(start, HandNet):
         known = start.config.description_size
-        further = network.config.description_size - known
         for name in ("mean", "std"):
             weights[name] = torch.cat((weights[name], network.get_buffer(name)[known:].cpu()))
         first = weights["classifier.0.weight"]
-        nothing = first.new_zeros(len(first), max(further, 0))
-        weights["classifier.0.weight"] = torch.cat(
-            (first[:, :known], nothing, first[:, known:]), dim=1
-        )
+        further = first.new_zeros(len(first), max(network.config.description_size - known, 0))
+        parts = first[:, :known], further, first[:, known:]
+        weights["classifier.0.weight"] = torch.cat(parts, dim=1)
     try:
         network.load_state_dict(weights)
     except RuntimeError as error:
@@ -76,17 +73,8 @@ def start_from(network: nn.Module, start: nn.Module) -> int:
     return known
 
 
-def in_metres(network: nn.Module) -> nn.Module:
-    """Convert a network trained on multiples of LENGTH_UNIT to one that takes metres; a copy."""
-    return _scaled(network, 1.0 / LENGTH_UNIT)
-
-
-def in_units(network: nn.Module) -> nn.Module:
-    """Convert a network that takes metres to one for multiples of LENGTH_UNIT; a copy."""
-    return _scaled(network, LENGTH_UNIT)
-
-
-def _scaled(network: nn.Module, factor: float) -> nn.Module:
+def rescaled(network: nn.Module, factor: float) -> nn.Module:
+    """A copy with the weights of lengths scaled: by LENGTH_UNIT, it takes multiples of that."""
     copy = deepcopy(network)
     with torch.no_grad():
         for weight in _length_weights(copy):

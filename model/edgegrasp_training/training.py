@@ -25,6 +25,7 @@ from edgegrasp_training.examples import (
     Packed,
     Rotations,
     SoftLabels,
+    Teacher,
     TriedGrasps,
     pack_balls,
     pack_hands,
@@ -33,8 +34,7 @@ from edgegrasp_training.examples import (
     turned,
 )
 from edgegrasp_training.options import TrainingOptions
-from edgegrasp_training.recipes import in_metres, in_units, prepare_to_train, start_from
-from edgegrasp_training.teacher import Teacher
+from edgegrasp_training.recipes import LENGTH_UNIT, prepare_to_train, rescaled, start_from
 from edgegrasp_training.views import different, load_view
 
 VIEWS_IN_MEMORY = 8000
@@ -72,7 +72,11 @@ class Trainer:
         self.teacher = teacher
         self.metadata, self.folder, self.options, self.device = metadata, folder, options, device
         self.train_paths, self.validation_paths = train_paths, validation_paths
-        self._tried = lru_cache(maxsize=VIEWS_IN_MEMORY)(self._read)
+
+        def read(path: Path, viewpoint_known: bool) -> TriedGrasps:
+            return tried_grasps(load_view(path), metadata.network, viewpoint_known)
+
+        self._tried = lru_cache(maxsize=VIEWS_IN_MEMORY)(read)
         if teacher is not None:
             self._soft_labels = lru_cache(maxsize=VIEWS_IN_MEMORY)(teacher.soft_labels)
         generator = torch.Generator().manual_seed(options.seed)
@@ -92,9 +96,7 @@ class Trainer:
         self.seconds = 0.0  # spent in training steps
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).is_file():
-            state: dict[str, Any] = torch.load(
-                self.folder / STATE_FILE, weights_only=True, map_location=self.device
-            )
+            state = torch.load(folder / STATE_FILE, weights_only=True, map_location=device)
             for name in STATEFUL:
                 getattr(self, name).load_state_dict(state[name])
             for name in COUNTERS:
@@ -149,9 +151,13 @@ class Trainer:
         """Calibrate the best network on all validation views; write it and its card."""
         path = self.folder / f"{self.metadata.name}.safetensors"
         best, _ = load_checkpoint(path, self.device)
-        self.average.load_state_dict(in_units(best).state_dict())
-        if self.start is not None and self.options.keep > 0.0:
-            self._mix_in(self.start)
+        self.average.load_state_dict(rescaled(best, LENGTH_UNIT).state_dict())
+        if self.start is not None:  # mixed with where it started (Wortsman et al., CVPR 2022)
+            first = deepcopy(self.average)
+            start_from(first, load_checkpoint(self.start, self.device)[0])
+            with torch.no_grad():
+                for new, old in zip(self.average.parameters(), first.parameters(), strict=True):
+                    new.lerp_(old, self.options.keep)
         evaluation = self.evaluate()
         training = provenance | {
             "training_views": len(self.train_paths),
@@ -175,14 +181,6 @@ class Trainer:
         card = self.folder / f"{self.metadata.name}.md"
         write_model_card(card, metadata, evaluation, self.folder / LOG_FILE, command)
         return evaluation
-
-    def _mix_in(self, start: Path) -> None:
-        """Move the result toward the weights it started from (Wortsman et al., CVPR 2022)."""
-        first = deepcopy(self.average)
-        start_from(first, load_checkpoint(start, self.device)[0])
-        with torch.no_grad():
-            for new, old in zip(self.average.parameters(), first.parameters(), strict=True):
-                new.lerp_(old, self.options.keep)
 
     def _train_step(self) -> float:
         self.network.train()
@@ -217,9 +215,9 @@ class Trainer:
         count = min(self.options.views_per_step, len(self.train_paths))
         parts: list[Packed] = []
         for index in rng.choice(len(self.train_paths), count, replace=False):
-            camera_known, support_known = rng.random(2) >= UNKNOWN
+            camera_known, support_known = (rng.random(2) >= UNKNOWN).tolist()
             camera_matters = self.metadata.network.architecture == "hand"
-            grasps = self._tried(self.train_paths[index], bool(camera_known) or not camera_matters)
+            grasps = self._tried(self.train_paths[index], camera_known or not camera_matters)
             if not support_known:
                 grasps = grasps.without_support()
             balls, soft_labels = self._labelled_balls(self.train_paths[index], grasps)
@@ -261,15 +259,12 @@ class Trainer:
             return pack_hands(grasps, balls, network, rng)
         return pack_balls(grasps, balls, network, soft_labels)
 
-    def _read(self, path: Path, viewpoint_known: bool) -> TriedGrasps:
-        return tried_grasps(load_view(path), self.metadata.network, viewpoint_known)
-
     def _standardise(self, known: int) -> None:
         """Fit mean and spread of the hand descriptions to the training views, but the first few."""
         if not isinstance(self.network, HandNet):
             return
         seen = [self._tried(path, True).seen for path in self.train_paths]
-        values = np.concatenate([hands.description for hands in seen if hands is not None])
+        values = np.concatenate([hands.description.numpy() for hands in seen if hands is not None])
         mean, std = values.mean(axis=0, dtype=np.float64), values.std(axis=0, dtype=np.float64)
         # Weights that were trained with other statistics keep them.
         mean[:known], std[:known] = self.network.mean[:known].cpu(), self.network.std[:known].cpu()
@@ -279,7 +274,7 @@ class Trainer:
     def _save_average(self, metadata: CheckpointMetadata) -> None:
         """Write the running mean of the weights, for lengths in metres."""
         path = self.folder / f"{metadata.name}.safetensors"
-        save_checkpoint(path, in_metres(self.average), metadata)
+        save_checkpoint(path, rescaled(self.average, 1.0 / LENGTH_UNIT), metadata)
 
     def _log(self, evaluation: Evaluation, train_loss: float) -> None:
         row = {

@@ -22,7 +22,7 @@ from edgegrasp_service.recording import Recorder, append_line, check_outcomes
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import answer
 from edgegrasp_service.worker.process import Answer, Facts, Job
-from edgegrasp_training.outcomes import read_outcomes
+from edgegrasp_training.evaluation import read_outcomes
 
 
 async def test_recorded_requests_are_replayed(serve, transport, cloud, tmp_path, monkeypatch):
@@ -124,7 +124,7 @@ def test_outcomes_are_appended_until_the_file_is_full(start_dummy, tmp_path: Pat
         digest = http.get("/v1/models").json()["models"][0]["digest"]
         assert TRIED.items() <= first.items()
         assert (first["digest"], second["held"]) == (digest, False)
-        assert read_outcomes(file, digest).held.tolist() == [1.0, 0.0]
+        assert read_outcomes(file, digest)[1].tolist() == [1.0, 0.0]
 
         for changes, field in (
             ({"score": 1.5}, "body.score"),

@@ -8,8 +8,8 @@ from edgegrasp_model.candidates.edge_grasps import edge_grasps
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_training.examples import Teacher
 from edgegrasp_training.options import TrainingOptions
-from edgegrasp_training.teacher import Teacher
 from edgegrasp_training.training import Trainer
 from edgegrasp_training.views import LabelledView, find_views, split_by_scene
 
