@@ -20,23 +20,32 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_camera.arrays import Array, Bools, Float32, Float64
 from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.engine import Intrinsics
+from edgegrasp_sim.engine.urdf import parse_obj
 from edgegrasp_sim.sensor import DepthSensor, random_sensor
-from edgegrasp_training.household import Mesh
+from edgegrasp_training.household import Mesh, household_mesh
 from edgegrasp_training.scene_layouts import (
     MAX_OBJECTS,
     OBJECT,
     OTHER,
     SUPPORT,
+    PoolMesh,
     SceneMeshes,
     draw_scene,
+    merged,
+    open3d_mesh,
+    pool_mesh,
+    simplified,
 )
-from edgegrasp_training.scene_pool import make_arms, make_pool
+from edgegrasp_training.shapes import NUM_DRAWN, drawn_shape
 
 WIDTH, HEIGHT = 480, 352  # pixels
 DEPTH_UNIT = 0.0002  # metres of a stored depth; 16 bits reach 13 m
 VIEWS_PER_SCENE = 4
 SCENES_PER_FILE = 50
 FILES_PER_POOL = 20  # that draw from the same objects
+NUM_POOL, NUM_ARMS = 900, 60
+ARMS = "franka_panda/panda.urdf", "xarm/xarm6_robot.urdf", "kuka_iiwa/model.urdf"
+SOFT_SHARE = 0.25  # of the objects, bent and crumpled as bags, clothes and blister packs are
 LEVEL = 0.85  # least z of a support's normal: its edges are labelled other
 WRONG = 0.02, 0.01  # metres, and share of the depth, by which a reading shows nothing real
 UNSEEN_WALLS = 0.25  # of the images, in which steep background has no readings, or few
@@ -77,11 +86,8 @@ def generate(
         while len(images) < SCENES_PER_FILE * VIEWS_PER_SCENE:
             images += make_images(rng, draw_scene(rng, pool, arms))
         partial = path.with_suffix(".partial.npz")
-        arrays = {
-            name: np.stack(each)
-            for name, each in zip(SceneImage._fields, zip(*images, strict=True), strict=True)
-        }
-        np.savez(partial, allow_pickle=False, **arrays)
+        arrays = SceneImage(*map(np.stack, zip(*images, strict=True)))
+        np.savez(partial, allow_pickle=False, **arrays._asdict())
         partial.replace(path)
 
 
@@ -105,9 +111,8 @@ def _make_image(
         return None
     noisy, label = _faults(rng, depth, label, camera, pose, scene)
     if rng.random() < UNSEEN_WALLS:  # which leaves their rims floating
-        noisy[steep & (label == OTHER) & (_blobs(rng, depth.shape) < rng.uniform(0.3, 1.0))] = (
-            np.nan
-        )
+        unseen = _blobs(rng, depth.shape) < rng.uniform(0.3, 1.0)
+        noisy[steep & (label == OTHER) & unseen] = np.nan
     stored = np.nan_to_num(np.clip(noisy / DEPTH_UNIT, 0, 65535)).astype(np.uint16)
     turn, place = pose[:3, :3], pose[:3, 3]
     centre = np.zeros((MAX_OBJECTS, 3), dtype=np.float32)
@@ -221,3 +226,75 @@ def _blobs(rng: np.random.Generator, shape: tuple[int, ...], size: int = 10) -> 
     zoomed = ndimage.zoom(coarse, size, order=1)[: shape[0], : shape[1]]
     spread = np.sort(zoomed[::6, ::6].ravel())
     return np.asarray(np.searchsorted(spread, zoomed) / len(spread))
+
+
+def make_pool(rng: np.random.Generator, objects: Sequence[Path]) -> list[PoolMesh]:
+    """Objects to draw from: of a set, drawn at random, hollow, and of a household."""
+    texts = [objects[k].read_text() for k in rng.permutation(len(objects))[: NUM_POOL // 3]]
+    texts += [drawn_shape(int(k)) for k in rng.permutation(NUM_DRAWN)[: NUM_POOL // 5]]
+    meshes = [merged([surface for _, surface in parse_obj(text)]) for text in texts]
+    while len(meshes) < NUM_POOL:
+        meshes.append(merged(household_mesh(rng)[1]))
+    return [
+        pool_mesh(rng, softened(rng, mesh) if rng.random() < SOFT_SHARE else mesh)
+        for mesh in meshes
+    ]
+
+
+def softened(rng: np.random.Generator, mesh: Mesh) -> Mesh:
+    """A mesh bent by waves in random directions, most of them longer than half of the object."""
+    surface = open3d_mesh(mesh)
+    while len(surface.triangles) < 1000:
+        surface = surface.subdivide_midpoint()
+    points = np.asarray(surface.vertices).copy()
+    longest = np.ptp(points, axis=0).max()
+    for _ in range(8):
+        length = longest * np.exp(rng.uniform(-1.8, 0.4))
+        direction, shift = rng.normal(size=(2, 3))
+        direction *= 2 * np.pi / length / np.linalg.norm(direction)
+        shift *= rng.uniform(0.0, 0.06) * length
+        points += shift * np.sin(points @ direction + rng.uniform(0, 2 * np.pi))[:, None]
+    return points, np.asarray(surface.triangles).astype(np.int64)
+
+
+def make_arms(rng: np.random.Generator) -> list[Mesh]:
+    """Robot arms in random poses, their last link at the origin: PyBullet's own models."""
+    import pybullet
+    import pybullet_data
+    import trimesh
+
+    folder, arms = Path(pybullet_data.getDataPath()), []
+    client = pybullet.connect(pybullet.DIRECT)
+    for name in ARMS:
+        body = pybullet.loadURDF(str(folder / name), physicsClientId=client)
+        links: list[tuple[int, Mesh]] = []
+        for shape in pybullet.getVisualShapeData(body, physicsClientId=client):
+            path = Path(shape[4].decode())
+            if shape[2] == pybullet.GEOM_MESH and path.is_file():
+                surface = trimesh.load_mesh(path, process=False)
+                points = np.asarray(surface.vertices) * np.asarray(shape[3])
+                points = points @ Rotation.from_quat(shape[6]).as_matrix().T + shape[5]
+                links.append((shape[1], simplified((points, np.asarray(surface.faces)), 800)))
+        arms += [_posed(rng, body, links, client) for _ in range(NUM_ARMS // len(ARMS))]
+    pybullet.disconnect(client)
+    return arms
+
+
+def _posed(
+    rng: np.random.Generator, body: int, links: Sequence[tuple[int, Mesh]], client: int
+) -> Mesh:
+    import pybullet
+
+    for joint in range(pybullet.getNumJoints(body, physicsClientId=client)):
+        low, high = pybullet.getJointInfo(body, joint, physicsClientId=client)[8:10]
+        low, high = (low, high) if low < high else (-1.0, 1.0)
+        pybullet.resetJointState(body, joint, rng.uniform(low, high), physicsClientId=client)
+    placed = []
+    for link, (points, faces) in links:
+        place, turn = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
+        if link >= 0:
+            state = pybullet.getLinkState(body, link, 0, 1, physicsClientId=client)
+            place, turn = state[4:6]
+        placed.append((points @ Rotation.from_quat(turn).as_matrix().T + place, faces))
+    points, faces = merged(placed)
+    return points - placed[-1][0].mean(axis=0), faces

@@ -7,15 +7,16 @@ below let it: no physics engine could make as many scenes in the time.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
+import open3d as o3d
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float64, Int64
 from edgegrasp_training.household import Mesh, strips
-from edgegrasp_training.scene_pool import PoolMesh, merged, pool_mesh
 
 OTHER, SUPPORT, OBJECT = 0, 1, 2  # labels; objects are numbered from OBJECT
 MAX_OBJECTS = 96
@@ -24,6 +25,13 @@ REACH = 0.9  # metres that it extends to either side
 APART = np.array([0.015, 0.015, 0.0])  # metres between objects that do not touch
 LONGEST_OBJECT = 0.36  # metres; a longer one is background
 EMPTY_SHARE = 0.03  # of the scenes that have no object
+
+
+class PoolMesh(NamedTuple):
+    """An object's surface, and points spread over it."""
+
+    mesh: Mesh
+    samples: Float64  # (S, 3) metres
 
 
 @dataclass(eq=False)
@@ -412,6 +420,42 @@ _BOX_FACES = np.array(
     [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
      (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
 )  # fmt: skip
+
+
+def pool_mesh(rng: np.random.Generator, mesh: Mesh) -> PoolMesh:
+    """A mesh about its box's centre, with points spread over its surface."""
+    points, triangles = simplified(mesh, 1500)
+    points = points - (points.min(axis=0) + points.max(axis=0)) / 2
+    a, b, c = points[triangles].transpose(1, 0, 2)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) + 1e-12
+    pick = rng.choice(len(triangles), 700, p=area / area.sum())
+    u, v = rng.random((2, 700, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    samples = a[pick] + u * (b - a)[pick] + v * (c - a)[pick]
+    corners = points[:: max(len(points) // 300, 1)]
+    return PoolMesh((points, triangles), np.concatenate([samples, corners]))
+
+
+def merged(parts: Sequence[Mesh]) -> Mesh:
+    """Several meshes as one."""
+    start = np.cumsum([0] + [len(points) for points, _ in parts[:-1]])
+    triangles = [each + first for (_, each), first in zip(parts, start, strict=True)]
+    return np.concatenate([points for points, _ in parts]), np.concatenate(triangles)
+
+
+def simplified(mesh: Mesh, triangles: int) -> Mesh:
+    """A mesh of at most so many triangles: many times faster to cast rays at."""
+    if len(mesh[1]) <= triangles:
+        return mesh
+    surface = open3d_mesh(mesh).simplify_quadric_decimation(triangles)
+    return np.asarray(surface.vertices).copy(), np.asarray(surface.triangles).astype(np.int64)
+
+
+def open3d_mesh(mesh: Mesh) -> o3d.geometry.TriangleMesh:
+    """A mesh as Open3D's."""
+    return o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh[0]), o3d.utility.Vector3iVector(mesh[1].astype(np.int32))
+    )
 
 
 class HeightMap:

@@ -210,9 +210,6 @@ def batches(data: Path, images: list[SceneImage], rng: np.random.Generator) -> I
     """
     read: set[Path] = set()
 
-    def one(rows: Int64) -> SceneBatch:
-        return make_batch([images[int(k)] for k in rows], rng)
-
     with ThreadPoolExecutor(1) as pool:
         waiting = None
         while True:
@@ -221,7 +218,8 @@ def batches(data: Path, images: list[SceneImage], rng: np.random.Generator) -> I
             images += read_images(new)
             order = rng.permutation(len(images))
             for start in range(0, len(order) - BATCH + 1, BATCH):
-                following = pool.submit(one, order[start : start + BATCH])
+                chosen = [images[k] for k in order[start : start + BATCH].tolist()]
+                following = pool.submit(make_batch, chosen, rng)
                 if waiting is not None:
                     yield waiting.result()
                 waiting = following

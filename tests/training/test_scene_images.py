@@ -10,16 +10,11 @@ pytest.importorskip("trimesh", reason="some background is made by trimesh")
 
 from tests.cloud_files import block_obj
 
-from edgegrasp_model.scene.network import SceneNet
-from edgegrasp_training import scene_images, scene_pool, scene_training
+from edgegrasp_training import scene_images, scene_training
 from edgegrasp_training.scene_images import DEPTH_UNIT, generate, make_images
-from edgegrasp_training.scene_layouts import OBJECT, SUPPORT, box, draw_scene
-from edgegrasp_training.scene_pool import PoolMesh, pool_mesh
+from edgegrasp_training.scene_layouts import OBJECT, SUPPORT, PoolMesh, box, draw_scene, pool_mesh
 from edgegrasp_training.scene_training import (
     image_points,
-    make_batch,
-    read_images,
-    scene_loss,
     train,
 )
 
@@ -59,19 +54,14 @@ def test_the_same_scene_is_made_again_from_its_seed(pool: list[PoolMesh]) -> Non
 
 def test_a_file_is_made_and_learned_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scene_images, "SCENES_PER_FILE", 2)
-    monkeypatch.setattr(scene_pool, "NUM_POOL", 12)
-    monkeypatch.setattr(scene_pool, "ARMS", ())
+    monkeypatch.setattr(scene_images, "NUM_POOL", 12)
+    monkeypatch.setattr(scene_images, "ARMS", ())
     monkeypatch.setattr(scene_training, "HELD_OUT", 1)
     monkeypatch.setattr(scene_training, "BATCH", 2)
     mesh = tmp_path / "block.obj"
     mesh.write_text(block_obj(0.05, 0.04, 0.06))
     generate(tmp_path / "data", [mesh], files=2, seed=1, part=0, parts=1)
-    files = sorted((tmp_path / "data").glob("scenes-????.npz"))
-    assert len(files) == 2
-    batch = make_batch([read_images(files)[0]], np.random.default_rng(0), up_known=True)
+    assert len(list((tmp_path / "data").glob("scenes-????.npz"))) == 2
     train(tmp_path / "data", tmp_path / "run", seconds=0.2)
     assert (tmp_path / "run" / "scene.safetensors").is_file()
     assert "iou_object" in (tmp_path / "run" / "log.txt").read_text()
-    output = SceneNet().eval()(batch.features)
-    assert output.classes.shape[2:] == batch.classes.shape[1:]
-    assert all(np.isfinite(each.item()) for each in scene_loss(output, batch).values())
