@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -104,14 +104,8 @@ REACH = 0.6, 1.0  # outward part of that link in the open hand, in halves of the
 STEEPEST = 0.75  # most of it, in radii
 
 
+Query = tuple[Observation, DetectOptions]  # a view of a scene, and a request for grasps in it
 detector = lru_cache(maxsize=1)(GraspDetector.load)  # loads weights once in a process
-
-
-class Query(NamedTuple):
-    """A view of a scene and a request for grasps in it."""
-
-    observation: Observation
-    request: DetectOptions
 
 
 def generate(
@@ -195,19 +189,18 @@ def generate_scene(
         if household:
             count = NUM_HOUSEHOLD
             drawn = household_objects(Path(shapes) / "household", count, streams[HOUSEHOLD_STREAM])
-        made_of = None if drawn is None else {kind: drawn}
         gripper = None  # the Panda's
         if options.gripper == "random":
             gripper = random_gripper(streams[HAND_STREAM])
         elif options.gripper != "panda":
             gripper = gripper_fields(options.gripper)
         hand = "" if gripper is None else json.dumps(gripper)
+        made_of = None if drawn is None else {kind: drawn}
         with ClutterSimulation(made_of, engine=options.engine, gripper=gripper) as simulation:
             low, high = PACKED_SCALE if kind.objects is PACKED else PILE_SCALE
             sizes = low * WIDER_SCALES[0], high * WIDER_SCALES[1]
             sizes = HOUSEHOLD_SCALE if household else sizes
-            aside = household and kind is not BIN
-            seen_from = SIDE_VIEWS if aside else VIEWS[kind]
+            seen_from = SIDE_VIEWS if household and kind is not BIN else VIEWS[kind]
             look = partial(ask, simulation, kind, seen_from, streams)
             hard = _make_scene(simulation, kind, sizes, options, streams[SCENE_STREAM], look)
             models = [model.origin or model for model in simulation.object_models]
@@ -247,10 +240,10 @@ def _hard_view(
 ) -> Query | None:
     """The first view in which the network is unsure or wrong; easy objects are removed first."""
     for _ in range(min(simulation.num_objects, HARD_LOOKS)):
-        query = look()
-        if len(query.observation.cloud) == 0:
+        observation, request = query = look()
+        if len(observation.cloud) == 0:
             return None
-        grasps = guide.detect(query.observation.cloud, query.request).grasps
+        grasps = guide.detect(observation.cloud, request).grasps
         unsure = not grasps or grasps[0].score < SURE
         if unsure or not simulation.try_grasp(grasps[0].T_cloud_hand).success:
             return query
@@ -274,7 +267,11 @@ def ask(
     noise, choice = streams[NOISE_STREAM], streams[CHOICE_STREAM]
     open_table = kind in (PACKED, PILE)
     around = not open_table or noise.random() < AROUND_SHARE
-    seen = _noise(noise)
+    draw, seen = noise.random(), dict[str, Any](noise_std=NOISE_STD)
+    if draw < SENSOR_SHARE:  # a camera's faults
+        seen = {"noise_std": 0.0, "sensor": random_sensor(noise)}
+    elif draw < SENSOR_SHARE + OTHER_NOISE:
+        seen = {"noise_std": noise.uniform(0.0, MAX_NOISE)}
     cameras = seen_from.sample(streams[CAMERA_STREAM])
     table: TableView = "around" if around else "known"
     observation = simulation.observe_from(cameras, noise, table=table, **seen)
@@ -297,17 +294,7 @@ def ask(
         collision=Collision(mode="penalise"),
         gripper=None if fields is None else GripperGeometry.model_validate(fields),
     )
-    return Query(observation, request)
-
-
-def _noise(rng: np.random.Generator) -> dict[str, Any]:
-    """The benchmark's noise, more or less of it, or a camera's faults."""
-    draw = rng.random()
-    if draw < SENSOR_SHARE:
-        return {"noise_std": 0.0, "sensor": random_sensor(rng)}
-    if draw < SENSOR_SHARE + OTHER_NOISE:
-        return {"noise_std": rng.uniform(0.0, MAX_NOISE)}
-    return {"noise_std": NOISE_STD}
+    return observation, request
 
 
 def _plane(rng: np.random.Generator) -> SupportPlane:
@@ -342,7 +329,7 @@ def label(
     hard: bool,  # whether the scene is known to be hard, even where the best grasp is sure
 ) -> LabelledView:
     """Sample candidates as the detector does and try some of them."""
-    observation = query.observation
+    observation, request = query
     found = choose_grasps(query, options, rng, hard=hard)
     if found is None:
         nothing, rows = np.empty((0, 3), dtype=np.float32), np.empty(0, dtype=np.int64)
@@ -352,7 +339,7 @@ def label(
     T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
     # Points far from every grasp carry no information.
-    behind = choose_gripper(query.request, load_gripper(), {}).tip_z - BEHIND_TIPS
+    behind = choose_gripper(request, load_gripper(), {}).tip_z - BEHIND_TIPS
     places = T_world_hand[:, :3, 3] + np.float32(behind) * T_world_hand[:, :3, 2]
     if len(places) == 0:  # a teacher's grasps are on the objects
         places = scene.points_in_cloud[scene.approach_allowed]

@@ -15,7 +15,6 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import nn
 
-from edgegrasp_camera.arrays import Int64
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
@@ -24,7 +23,6 @@ from edgegrasp_training.evaluation import Evaluation, evaluate_scores, write_mod
 from edgegrasp_training.examples import (
     Packed,
     Rotations,
-    SoftLabels,
     Teacher,
     TriedGrasps,
     pack_balls,
@@ -134,17 +132,13 @@ class Trainer:
         logits, labels = [], []
         with torch.inference_mode():
             for number, path in enumerate(self.validation_paths):
-                grasps = self._tried(path, True)
-                balls, soft_labels = self._labelled_balls(path, grasps)
-                if len(balls) == 0:
+                rng = np.random.default_rng([self.options.seed, number])
+                packed = self._packed(path, self._tried(path, True), balls_per_view, rng)
+                if packed is None:
                     continue
-                if balls_per_view is not None and len(balls) > balls_per_view:
-                    rng = np.random.default_rng([self.options.seed, number])
-                    balls = np.sort(rng.choice(balls, balls_per_view, replace=False))
-                packed = self._pack(grasps, balls, soft_labels=soft_labels)
                 logits.append(self.average(packed.batch.to(self.device)).float().cpu())
                 label = packed.label
-                labels.append((label > 0.5).float() if soft_labels is None else label)
+                labels.append((label > 0.5).float() if self.teacher is None else label)
         return evaluate_scores(torch.cat(logits).numpy(), torch.cat(labels).numpy())
 
     def finish(self, provenance: dict[str, Any], command: str) -> Evaluation:
@@ -217,14 +211,13 @@ class Trainer:
         for index in rng.choice(len(self.train_paths), count, replace=False):
             camera_known, support_known = (rng.random(2) >= UNKNOWN).tolist()
             camera_matters = self.metadata.network.architecture == "hand"
-            grasps = self._tried(self.train_paths[index], camera_known or not camera_matters)
+            path = self.train_paths[index]
+            grasps = self._tried(path, camera_known or not camera_matters)
             if not support_known:
                 grasps = grasps.without_support()
-            balls, soft_labels = self._labelled_balls(self.train_paths[index], grasps)
-            if len(balls) == 0:
+            packed = self._packed(path, grasps, self.options.balls_per_view, rng, vary=True)
+            if packed is None:
                 continue
-            chosen = rng.choice(balls, min(self.options.balls_per_view, len(balls)), replace=False)
-            packed = self._pack(grasps, np.sort(chosen), rng, soft_labels)
             if self.metadata.network.architecture == "edgegrasp":
                 # This network, unlike Vector Neurons, is not equivariant. Without a camera the
                 # detector's frame is upright, but may be turned any way about up.
@@ -239,25 +232,26 @@ class Trainer:
         join: Any = type(batches[0]).concatenate
         return Packed(join(batches), torch.cat(labels), torch.cat(weights))
 
-    def _labelled_balls(self, path: Path, grasps: TriedGrasps) -> tuple[Int64, SoftLabels | None]:
-        """Approach points (A,) of a view whose grasps were tried, or scored by the teacher."""
-        if self.teacher is None:
-            return grasps.balls(), None
-        taught = self._soft_labels(path)
-        return np.union1d(grasps.balls(), taught.approach_index).astype(np.int64), taught
-
-    def _pack(
+    def _packed(
         self,
+        path: Path,  # of the view
         grasps: TriedGrasps,
-        balls: Int64,
-        rng: np.random.Generator | None = None,
-        soft_labels: SoftLabels | None = None,
-    ) -> Packed:
-        """Some balls of a view; `rng` picks the points of hands at random."""
-        network = self.metadata.network
+        count: int | None,  # balls at most; None: all
+        rng: np.random.Generator,  # chooses them
+        *,
+        vary: bool = False,  # choose the points of hands at random too
+    ) -> Packed | None:
+        """Balls of a view whose grasps were tried, or scored by the teacher; None without any."""
+        network, balls, taught = self.metadata.network, grasps.balls(), None
+        if self.teacher is not None:
+            taught = self._soft_labels(path)
+            balls = np.union1d(balls, taught.approach_index).astype(np.int64)
+        if len(balls) == 0:
+            return None
+        balls = np.sort(rng.choice(balls, min(count or len(balls), len(balls)), replace=False))
         if network.architecture == "hand":
-            return pack_hands(grasps, balls, network, rng)
-        return pack_balls(grasps, balls, network, soft_labels)
+            return pack_hands(grasps, balls, network, rng if vary else None)
+        return pack_balls(grasps, balls, network, taught)
 
     def _standardise(self, known: int) -> None:
         """Fit mean and spread of the hand descriptions to the training views, but the first few."""
