@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
 from scipy.special import expit
 from scipy.special import logit as logit_of
-from scipy.stats import rankdata
+from scipy.stats import mannwhitneyu
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
 from edgegrasp_model.hand_description import BEYOND
@@ -65,13 +65,11 @@ def cross_entropy(logit: Floats, label: Floats) -> float:
 
 def auroc(logit: Floats, label: Floats) -> float:
     """Chance that a success outscores a failure, ties counting half; nan with one class."""
-    positive = label > 0.5
-    successes, failures = int(positive.sum()), int((~positive).sum())
-    if successes == 0 or failures == 0:
+    held = label > 0.5
+    if held.all() or not held.any():
         return float("nan")
-    ranks = rankdata(logit)
-    excess = ranks[positive].sum() - successes * (successes + 1) / 2
-    return float(excess / (successes * failures))
+    pairs = mannwhitneyu(logit[held], logit[~held], method="asymptotic").statistic
+    return float(pairs / (held.sum() * (~held).sum()))
 
 
 def fit_temperature(logit: Floats, label: Floats) -> float:

@@ -9,7 +9,7 @@ One command makes the whole data set again: `edgegrasp generate-scenes FOLDER --
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import open3d as o3d
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_camera.arrays import Array, Bools, Float32, Float64
+from edgegrasp_camera.arrays import Bools, Float32, Float64
 from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.engine import Intrinsics
 from edgegrasp_sim.engine.urdf import parse_obj
@@ -145,12 +145,9 @@ def _draw_pose(rng: np.random.Generator, scene: SceneMeshes) -> Float64:
 def _casting(parts: Sequence[tuple[Mesh, int]]) -> o3d.t.geometry.RaycastingScene:
     casting = o3d.t.geometry.RaycastingScene(nthreads=1)
     for (points, faces), _ in parts:
-        casting.add_triangles(_tensor(points.astype(np.float32)), _tensor(faces.astype(np.uint32)))
+        arrays = points.astype(np.float32), faces.astype(np.uint32)
+        casting.add_triangles(*map(o3d.core.Tensor.from_numpy, arrays))
     return casting
-
-
-def _tensor(array: Array) -> Any:
-    return o3d.core.Tensor(array)  # type: ignore[call-overload]
 
 
 def _cast(
@@ -165,7 +162,7 @@ def _cast(
     rays = np.stack([x - camera.centre_x, y - camera.centre_y, ahead], axis=-1)
     direction = rays / camera.focal_length @ pose[:3, :3].T
     both = np.concatenate([np.broadcast_to(pose[:3, 3], direction.shape), direction], axis=-1)
-    hit = casting.cast_rays(_tensor(both.astype(np.float32)), nthreads=1)
+    hit = casting.cast_rays(o3d.core.Tensor.from_numpy(both.astype(np.float32)), nthreads=1)
     depth = np.minimum(hit["t_hit"].numpy().astype(np.float64), camera.far)
     labels = np.array([label for _, label in parts] + [OTHER])
     which = np.minimum(hit["geometry_ids"].numpy().astype(np.int64), len(parts))

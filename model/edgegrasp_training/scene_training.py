@@ -209,7 +209,6 @@ def batches(data: Path, images: list[SceneImage], rng: np.random.Generator) -> I
     All that are read are appended to `images`.
     """
     read: set[Path] = set()
-
     with ThreadPoolExecutor(1) as pool:
         waiting = None
         while True:
