@@ -233,12 +233,12 @@ def make_pool(rng: np.random.Generator, objects: Sequence[Path]) -> list[PoolMes
     while len(meshes) < NUM_POOL:
         meshes.append(merged(household_mesh(rng)[1]))
     return [
-        pool_mesh(rng, softened(rng, mesh) if rng.random() < SOFT_SHARE else mesh)
+        pool_mesh(rng, _softened(rng, mesh) if rng.random() < SOFT_SHARE else mesh)
         for mesh in meshes
     ]
 
 
-def softened(rng: np.random.Generator, mesh: Mesh) -> Mesh:
+def _softened(rng: np.random.Generator, mesh: Mesh) -> Mesh:
     """A mesh bent by waves in random directions, most of them longer than half of the object."""
     surface = open3d_mesh(mesh)
     while len(surface.triangles) < 1000:
