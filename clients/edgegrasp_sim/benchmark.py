@@ -9,27 +9,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from edgegrasp_sim.engine import (
-    OBJECT_FRICTION,
-    OBJECT_MASS,
-    ArmModel,
-    choose_engine,
-    world_type,
-)
-from edgegrasp_sim.hand import (
-    CLOSE_SECONDS,
-    PREGRASP_DISTANCE,
-    RETREAT_DISTANCE,
-    SIDE_GRASP_ANGLE,
-    STEP_LENGTH,
-    panda,
-)
+from edgegrasp_sim import engine as engines
+from edgegrasp_sim import hand, scene, surroundings
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.results import ResultFolder
-from edgegrasp_sim.scene import PACKED, PILE, REST
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.surroundings import TABLE_FRICTION
 from edgegrasp_sim.trial import MIN_SEEN, Planner, Round, RoundDriver
 from edgegrasp_sim.workers import run_tasks
 
@@ -51,7 +36,7 @@ class BenchmarkConfig:
     split: str = "test"  # of that folder
     engine: str = ""  # to simulate with; by default see `choose_engine`, with the protocol's
     gripper: dict[str, Any] | None = None  # of a file; None: the Panda's hand
-    arm: ArmModel | None = None  # what carries the hand; None: it floats
+    arm: engines.ArmModel | None = None  # what carries the hand; None: it floats
 
     def __post_init__(self) -> None:
         if self.rounds < 1:
@@ -60,7 +45,7 @@ class BenchmarkConfig:
             raise ValueError(f"seeds is {self.seeds}; pass numbers of 0 or more")
         if len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds is {self.seeds}; pass each seed once")
-        chosen = choose_engine(self.engine, self.protocol.engine)
+        chosen = engines.choose_engine(self.engine, self.protocol.engine)
         object.__setattr__(self, "engine", chosen)
 
     def object_set(self) -> ObjectSet:
@@ -103,9 +88,9 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
     """All that is needed to reproduce the figures; `planner` has name, weights, digest, options."""
     drawn = config.object_set()
     # Named where it is not the Panda's, so that earlier results can be resumed.
-    hand: dict[str, Any] = {} if config.gripper is None else {"gripper": config.gripper}
+    carried: dict[str, Any] = {} if config.gripper is None else {"gripper": config.gripper}
     if config.arm is not None:
-        hand["arm"] = config.arm.joint_names
+        carried["arm"] = config.arm.joint_names
     return {
         "run": {
             "scene": config.scene.value,
@@ -114,7 +99,7 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
             "planner": planner,
             "engine": config.engine,
             "constants": constants(config.engine),
-            **hand,
+            **carried,
         },
         "rounds": config.rounds,
         "seeds": list(config.seeds),
@@ -132,24 +117,24 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
 
 def constants(engine: str) -> dict[str, float]:
     """The simulator's own constants, the same under every protocol."""
-    hand = panda()
-    return world_type(engine).constants | {
-        "table_friction": TABLE_FRICTION,
-        "packed_attempts": PACKED.attempts,
-        "pile_drop_height": PILE.drop_height,
-        "rest_speed": REST.speed,
-        "object_mass": OBJECT_MASS,
-        "object_friction": OBJECT_FRICTION,
-        "max_opening": hand.max_opening,
-        "hand_mass": hand.mass,
-        "finger_friction": hand.finger_friction,
-        "finger_force": hand.finger_force,
-        "tool_force": hand.tool_force,
-        "close_seconds": CLOSE_SECONDS,
-        "pregrasp_distance": PREGRASP_DISTANCE,
-        "retreat_distance": RETREAT_DISTANCE,
-        "side_grasp_angle": SIDE_GRASP_ANGLE,
-        "step_length": STEP_LENGTH,
+    panda = hand.panda()
+    return engines.world_type(engine).constants | {
+        "table_friction": surroundings.TABLE_FRICTION,
+        "packed_attempts": scene.PACKED_ATTEMPTS,
+        "pile_drop_height": scene.PILE_DROP_HEIGHT,
+        "rest_speed": scene.REST_SPEED,
+        "object_mass": engines.OBJECT_MASS,
+        "object_friction": engines.OBJECT_FRICTION,
+        "max_opening": panda.max_opening,
+        "hand_mass": panda.mass,
+        "finger_friction": panda.finger_friction,
+        "finger_force": panda.finger_force,
+        "tool_force": panda.tool_force,
+        "close_seconds": hand.CLOSE_SECONDS,
+        "pregrasp_distance": hand.PREGRASP_DISTANCE,
+        "retreat_distance": hand.RETREAT_DISTANCE,
+        "side_grasp_angle": hand.SIDE_GRASP_ANGLE,
+        "step_length": hand.STEP_LENGTH,
         "min_points": MIN_SEEN,
     }
 

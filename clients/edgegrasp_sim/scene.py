@@ -16,57 +16,33 @@ PACKED_SCALE = (0.7, 0.8)
 PILE_SCALE = (0.8, 1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Packed:
-    """How objects are stood upright on a table."""
+PACKED_ATTEMPTS = 12  # objects drawn to be stood upright on a table
+PACKED_RANGE = (0.08, 0.22)  # metres, of x and y
+CLEARANCE = 0.002  # metres above the table at which objects are put down
 
-    attempts: int = 12  # objects drawn
-    range: tuple[float, float] = (0.08, 0.22)  # metres, of x and y
-    clearance: float = 0.002  # metres above the table
+# The open box that a pile is dropped into, which is taken away afterwards.
+PILE_DROP_HEIGHT = 0.2  # metres above the table
+PILE_CORNER = 0.02  # metres, x and y
+PILE_EXTENT = (0.26, 0.26, 0.13)  # metres
+PILE_WALL = 0.0039  # metres
+PILE_SECONDS = 1.0  # given to each object to come to rest
 
+# How objects are poured into a bin.
+POUR_HEIGHT = 0.08  # metres above the walls
+POUR_MARGIN = 0.25  # of its length and width, along each side, where nothing is dropped
+FULL_MARGIN = 0.12  # that of a bin that gets full
+POUR_SECONDS = 0.5  # given to each object to come to rest
+AT_ONCE = 4  # objects poured into a bin that gets full before it is looked at
+COVERED = 0.85  # share of its floor that objects hide from above when it is full
+RAYS = 24  # along each side of the floor, which measure that
 
-@dataclass(frozen=True, slots=True)
-class Pile:
-    """The open box that a pile is dropped into, which is taken away afterwards."""
+# How objects are put on a table or a shelf.
+CROWD_ATTEMPTS = 4  # for each object
+LYING_SHARE = 0.4  # of the objects, which are dropped in any pose
 
-    drop_height: float = 0.2  # metres above the table
-    corner: float = 0.02  # metres, x and y
-    extent: tuple[float, float, float] = (0.26, 0.26, 0.13)  # metres
-    wall: float = 0.0039  # metres
-    seconds: float = 1.0  # given to each object to come to rest
-
-
-@dataclass(frozen=True, slots=True)
-class Pour:
-    """How objects are poured into a bin."""
-
-    drop_height: float = 0.08  # metres above the walls
-    margin: float = 0.25  # of a bin's length and width, along each side, where nothing is dropped
-    full_margin: float = 0.12  # that of a bin that gets full
-    seconds: float = 0.5  # given to each object to come to rest
-    at_once: int = 4  # objects poured into a bin that gets full before it is looked at
-    covered: float = 0.85  # share of its floor that objects hide from above when it is full
-    rays: int = 24  # along each side of the floor, which measure that
-
-
-@dataclass(frozen=True, slots=True)
-class Crowd:
-    """How objects are put on a table or a shelf."""
-
-    attempts: int = 4  # for each object
-    lying_share: float = 0.4  # of the objects, which are dropped in any pose
-
-
-@dataclass(frozen=True, slots=True)
-class Rest:
-    """When objects are at rest."""
-
-    speed: float = 0.01  # m/s and rad/s together
-    check_steps: int = 60  # time steps between two looks
-    seconds: float = 2.0  # waited at most
-
-
-PACKED, PILE, POUR, CROWD, REST = Packed(), Pile(), Pour(), Crowd(), Rest()
+REST_SPEED = 0.01  # m/s and rad/s together, at which objects are at rest
+REST_STEPS = 60  # time steps between two looks
+REST_SECONDS = 2.0  # waited at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,14 +78,14 @@ class Layout(NamedTuple):
 
 
 def make_packed(layout: Layout) -> list[SceneObject]:
-    """Stand `PACKED.attempts` objects or fewer upright, each where it touches no other."""
+    """Stand `PACKED_ATTEMPTS` objects or fewer upright, each where it touches no other."""
     rng = layout.rng
     placed: list[SceneObject] = []
-    for _ in range(PACKED.attempts):
+    for _ in range(PACKED_ATTEMPTS):
         if len(placed) >= layout.num_objects:
             break
         model = layout.objects.sample(rng)
-        x, y = rng.uniform(*PACKED.range, size=2)
+        x, y = rng.uniform(*PACKED_RANGE, size=2)
         upright = about_z(rng.uniform(0.0, 2.0 * np.pi))
         placed = _place(layout, placed, model, (x, y), upright)
     return placed
@@ -119,12 +95,12 @@ def make_table(layout: Layout) -> list[SceneObject]:
     """Put objects on a table or a shelf beside its fixed parts: most upright, some dropped."""
     rng, reach = layout.rng, np.array(layout.surroundings.reach)
     placed: list[SceneObject] = []
-    for _ in range(CROWD.attempts * layout.num_objects):
+    for _ in range(CROWD_ATTEMPTS * layout.num_objects):
         if len(placed) >= layout.num_objects:
             break
         model = layout.objects.sample(rng)
         x, y = MIDDLE + rng.uniform(-reach, reach, size=2)
-        lying = rng.random() < CROWD.lying_share
+        lying = rng.random() < LYING_SHARE
         upright = None if lying else about_z(rng.uniform(0.0, 2.0 * np.pi))
         turn = upright or Rotation.random(rng=rng).as_quat().tolist()
         placed = _place(layout, placed, model, (x, y), turn)
@@ -133,25 +109,33 @@ def make_table(layout: Layout) -> list[SceneObject]:
 
 def make_bin(layout: Layout) -> list[SceneObject]:
     """Drop objects into a bin one by one; those that do not fit are removed."""
-    dropped = _pour(layout, layout.num_objects, POUR.margin)
+    dropped = _pour(layout, layout.num_objects, POUR_MARGIN)
     return settle(layout.world, dropped, layout.surroundings)
 
 
 def make_full_bin(layout: Layout) -> list[SceneObject]:
     """Pour objects all over a bin until they hide its floor or reach the requested number."""
     placed: list[SceneObject] = []
-    while len(placed) < layout.num_objects and _covered(layout, placed) < POUR.covered:
-        new = _pour(layout, min(POUR.at_once, layout.num_objects - len(placed)), POUR.full_margin)
+    while len(placed) < layout.num_objects and _covered(layout, placed) < COVERED:
+        new = _pour(layout, min(AT_ONCE, layout.num_objects - len(placed)), FULL_MARGIN)
         placed = settle(layout.world, [*placed, *new], layout.surroundings)
     return placed
 
 
 def make_pile(layout: Layout) -> list[SceneObject]:
     """Drop objects into an open box one by one, then remove the box."""
-    walls = [box.add_to(layout.world) for box in _pile_box()]
+    length, width, height = PILE_EXTENT
+    half, z, middle = PILE_WALL / 2, TABLE_HEIGHT + height / 2, PILE_CORNER + length / 2
+    box = [
+        Box((PILE_WALL, width, height), (PILE_CORNER + half, middle, z)),
+        Box((PILE_WALL, width, height), (PILE_CORNER + length - half, middle, z)),
+        Box((length, PILE_WALL, height), (middle, PILE_CORNER + half, z)),
+        Box((length, PILE_WALL, height), (middle, PILE_CORNER + width - half, z)),
+    ]
+    walls = [side.add_to(layout.world) for side in box]
     where = np.full(2, SIZE / 3), np.full(2, 2 * SIZE / 3)
-    height = TABLE_HEIGHT + PILE.drop_height
-    dropped = _drop(layout, layout.num_objects, where, height, PILE.seconds)
+    top = TABLE_HEIGHT + PILE_DROP_HEIGHT
+    dropped = _drop(layout, layout.num_objects, where, top, PILE_SECONDS)
     for wall in walls:
         wall.remove()
     return settle(layout.world, dropped, layout.surroundings)
@@ -161,9 +145,9 @@ def wait_for_rest(world: World, objects: Sequence[SceneObject], seconds: float) 
     """Simulate until all objects rest, for at most `seconds`."""
     elapsed = 0.0
     while elapsed < seconds:
-        world.step(REST.check_steps)
-        elapsed += REST.check_steps * TIME_STEP
-        if all(item.body.speed <= REST.speed for item in objects):
+        world.step(REST_STEPS)
+        elapsed += REST_STEPS * TIME_STEP
+        if all(item.body.speed <= REST_SPEED for item in objects):
             return
 
 
@@ -173,7 +157,7 @@ def settle(
     """Wait for rest and remove objects outside the workspace, until none leaves it."""
     remaining = list(objects)
     while True:
-        wait_for_rest(world, remaining, REST.seconds)
+        wait_for_rest(world, remaining, REST_SECONDS)
         outside = [item for item in remaining if not surroundings.contain(item.body)]
         if not outside:
             return remaining
@@ -188,13 +172,13 @@ def _pour(layout: Layout, number: int, share: float) -> list[SceneObject]:
     margin = share * (high - low)
     walls = max(box.centre[2] + box.size[2] / 2 for box in layout.surroundings.boxes)
     where = low + margin, high - margin
-    return _drop(layout, number, where, walls + POUR.drop_height, POUR.seconds)
+    return _drop(layout, number, where, walls + POUR_HEIGHT, POUR_SECONDS)
 
 
 def _covered(layout: Layout, placed: Sequence[SceneObject]) -> float:
     """The share of a bin's floor that objects hide from above."""
     low, high = np.asarray(layout.surroundings.bounds)[:, :2]
-    steps = (np.arange(POUR.rays) + 0.5) / POUR.rays
+    steps = (np.arange(RAYS) + 0.5) / RAYS
     place = low + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * (high - low)
     starts, ends = (np.insert(place, 2, z, axis=1) for z in (1.0, TABLE_HEIGHT - 0.01))
     hits = layout.world.first_hits(starts, ends)
@@ -230,7 +214,7 @@ def _place(
     new = load_object(world, model, (*place, 1.0), quaternion_xyzw, scale)
     x, y, z = new.body.position
     lowest = new.body.bounds[0, 2]
-    new.body.set_pose((x, y, z - lowest + TABLE_HEIGHT + PACKED.clearance), quaternion_xyzw)
+    new.body.set_pose((x, y, z - lowest + TABLE_HEIGHT + CLEARANCE), quaternion_xyzw)
     world.step()
     if new.body.contacts():
         new.body.remove()
@@ -239,18 +223,3 @@ def _place(
         placed = settle(world, [*placed, new], layout.surroundings)
     world.remove_state(state)
     return placed
-
-
-def _pile_box() -> list[Box]:
-    """The walls that a pile is dropped into."""
-    length, width, height = PILE.extent
-    low = PILE.corner
-    half = PILE.wall / 2
-    z = TABLE_HEIGHT + height / 2
-    middle = low + length / 2
-    return [
-        Box((PILE.wall, width, height), (low + half, middle, z)),
-        Box((PILE.wall, width, height), (low + length - half, middle, z)),
-        Box((length, PILE.wall, height), (middle, low + half, z)),
-        Box((length, PILE.wall, height), (middle, low + width - half, z)),
-    ]

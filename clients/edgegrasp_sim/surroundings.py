@@ -28,48 +28,32 @@ Span = tuple[float, float]  # least and greatest, metres
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]  # lowest, highest; metres
 
 
-@dataclass(frozen=True, slots=True)
-class Bins:
-    """Ranges of random bins; lengths in metres."""
+# Random bins. Length, width and height inside: the palm of the Panda's hand is 20 cm wide and 5 cm
+# above its fingertips, so that along a higher wall it holds little.
+BIN_INSIDE: tuple[Span, Span, Span] = ((0.40, 0.60), (0.30, 0.42), (0.03, 0.08))
+SMALL_BIN_INSIDE: tuple[Span, Span, Span] = ((0.30, 0.40), (0.24, 0.30), (0.03, 0.08))
+BIN_WALL: Span = (0.008, 0.015)  # its floor is as thick; objects are pressed through thinner ones
+GROUND = 0.2  # metres, depth of a floor into what it stands on, for the same reason
+STAND_SHARE = 0.3  # of the bins, which stand off the table: on a stand, a conveyor
+STAND: Span = (0.1, 0.4)
+HEAP = 0.10  # metres that a heap may rise over the walls
 
-    # Length, width and height inside. The palm of the Panda's hand is 20 cm wide and 5 cm above
-    # its fingertips: along a higher wall it holds little.
-    inside: tuple[Span, Span, Span] = ((0.40, 0.60), (0.30, 0.42), (0.03, 0.08))
-    small: tuple[Span, Span, Span] = ((0.30, 0.40), (0.24, 0.30), (0.03, 0.08))
-    wall: Span = (0.008, 0.015)  # its floor is as thick; objects are pressed through thinner ones
-    ground: float = 0.2  # depth of the floor into what it stands on, for the same reason
-    stand_share: float = 0.3  # of the bins, which stand off the table: on a stand, a conveyor
-    stand: Span = (0.1, 0.4)
-    heap: float = 0.10  # that a heap may rise over the walls
+# Random crowded tables.
+REACH = 0.16  # metres from the middle, along x and y, where objects are put
+TABLE_LENGTH: Span = (0.5, 1.2)
+TABLE_OVER_FLOOR: Span = (0.4, 0.8)
+LARGE_OBJECTS = (1, 3)  # least and most objects too large to grasp
+LARGE_DISTANCE: Span = (0.05, 0.30)  # from the middle to the nearest side of a large object
+# Length, width and height of large objects. No hand would grasp a longer object.
+CARTON: tuple[Span, Span, Span] = ((0.42, 0.60), (0.10, 0.35), (0.05, 0.40))
+PANEL: tuple[Span, Span, Span] = ((0.42, 0.60), (0.02, 0.05), (0.42, 0.55))  # monitors, walls
+KERB: tuple[Span, Span, Span] = ((0.42, 0.60), (0.04, 0.12), (0.02, 0.06))  # books, keyboards
 
-
-@dataclass(frozen=True, slots=True)
-class Tables:
-    """Ranges of random crowded tables; lengths in metres."""
-
-    reach: float = 0.16  # from the middle, along x and y, where objects are put
-    length: Span = (0.5, 1.2)
-    over_floor: Span = (0.4, 0.8)
-    large: tuple[int, int] = (1, 3)  # objects too large to grasp
-    distance: Span = (0.05, 0.30)  # from the middle to the nearest side of a large object
-    # Length, width and height. No hand would grasp a longer object.
-    carton: tuple[Span, Span, Span] = ((0.42, 0.60), (0.10, 0.35), (0.05, 0.40))
-    panel: tuple[Span, Span, Span] = ((0.42, 0.60), (0.02, 0.05), (0.42, 0.55))  # monitors, walls
-    kerb: tuple[Span, Span, Span] = ((0.42, 0.60), (0.04, 0.12), (0.02, 0.06))  # books, keyboards
-
-
-@dataclass(frozen=True, slots=True)
-class Shelves:
-    """Ranges of random shelves; lengths in metres."""
-
-    # Width, depth and height inside a compartment, in which a hand has room.
-    inside: tuple[Span, Span, Span] = ((0.45, 0.90), (0.26, 0.40), (0.34, 0.48))
-    board: Span = (0.015, 0.030)
-    margin: float = 0.06  # from its sides and edges where no object is put
-    over_floor: Span = (0.4, 1.2)
-
-
-BINS, TABLES, SHELVES = Bins(), Tables(), Shelves()
+# Random shelves. Width, depth and height inside a compartment, in which a hand has room.
+SHELF_INSIDE: tuple[Span, Span, Span] = ((0.45, 0.90), (0.26, 0.40), (0.34, 0.48))
+SHELF_BOARD: Span = (0.015, 0.030)
+SHELF_MARGIN = 0.06  # metres from its sides and edges where no object is put
+SHELF_OVER_FLOOR: Span = (0.4, 1.2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +79,7 @@ class Surroundings:
     workspace: Corners  # of where grasps are looked for
     bounds: Corners  # of where an object's centre may be; one that leaves it is taken away
     # Metres from the middle, along x and y, where objects are put down.
-    reach: tuple[float, float] = (TABLES.reach, TABLES.reach)
+    reach: tuple[float, float] = (REACH, REACH)
 
     def add_to(self, world: World) -> frozenset[int]:
         """Add everything to a world; returns the ids of the obstacles' bodies."""
@@ -127,13 +111,13 @@ OPEN_TABLE = open_table()
 
 def random_bin(rng: np.random.Generator, *, small: bool = False) -> Surroundings:
     """An open box on a table or over it, its floor at `TABLE_HEIGHT`; a small one gets full."""
-    extents = BINS.small if small else BINS.inside
+    extents = SMALL_BIN_INSIDE if small else BIN_INSIDE
     length, width, height = (rng.uniform(*extent) for extent in extents)
-    wall = rng.uniform(*BINS.wall)
-    stand = rng.uniform(*BINS.stand) if rng.random() < BINS.stand_share else 0.0
+    wall = rng.uniform(*BIN_WALL)
+    stand = rng.uniform(*STAND) if rng.random() < STAND_SHARE else 0.0
     half = np.array([length, width]) / 2
     outer = half + wall
-    depth = wall + stand + BINS.ground
+    depth = wall + stand + GROUND
     floor = _slab(np.array([*(2 * outer), depth]), TABLE_HEIGHT)
     size = np.array([OPEN_EXTENT, OPEN_EXTENT, OPEN_THICKNESS])
     boxes = [_slab(size, TABLE_HEIGHT - wall - stand), floor]
@@ -143,7 +127,7 @@ def random_bin(rng: np.random.Generator, *, small: bool = False) -> Surroundings
         boxes.append(Box((wall, 2 * float(outer[1]), height), (float(x), MIDDLE, z)))
         boxes.append(Box((length, wall, height), (MIDDLE, float(y), z)))
     low, high = MIDDLE - half, MIDDLE + half
-    top = TABLE_HEIGHT + height + BINS.heap
+    top = TABLE_HEIGHT + height + HEAP
     return Surroundings(
         tuple(boxes),
         _corners(low, high, TABLE_HEIGHT + SUPPORT_CLEARANCE, top),
@@ -153,16 +137,16 @@ def random_bin(rng: np.random.Generator, *, small: bool = False) -> Surroundings
 
 def random_table(rng: np.random.Generator) -> Surroundings:
     """A table with an edge near the objects, a floor below, and one to three large objects."""
-    reach = np.full(2, TABLES.reach)
+    reach = np.full(2, REACH)
     low, high = MIDDLE - reach, MIDDLE + reach
-    over = float(rng.uniform(*TABLES.over_floor))
-    size = np.array([*rng.uniform(*TABLES.length, size=2), over])
+    over = float(rng.uniform(*TABLE_OVER_FLOOR))
+    size = np.array([*rng.uniform(*TABLE_LENGTH, size=2), over])
     # All the objects' places are on it; an edge may be close to them.
     aside = rng.uniform(-1.0, 1.0, size=2) * (size[:2] / 2 - reach - 0.02)
     table = _slab(size, TABLE_HEIGHT, *(MIDDLE + aside))
     floor = _slab(np.array([6.0, 6.0, 0.2]), TABLE_HEIGHT - over)
     boxes = [floor, table]
-    large = int(rng.integers(TABLES.large[0], TABLES.large[1] + 1))
+    large = int(rng.integers(*LARGE_OBJECTS, endpoint=True))
     boxes += [_large_object(rng) for _ in range(large)]
     bottom = TABLE_HEIGHT + SUPPORT_CLEARANCE
     return Surroundings(
@@ -174,12 +158,12 @@ def random_table(rng: np.random.Generator) -> Surroundings:
 
 def random_shelf(rng: np.random.Generator) -> Surroundings:
     """A compartment of a shelf, open toward -y, its floor at `TABLE_HEIGHT`, another one above."""
-    width, depth, height = (float(rng.uniform(*extent)) for extent in SHELVES.inside)
-    board, over = float(rng.uniform(*SHELVES.board)), float(rng.uniform(*SHELVES.over_floor))
+    width, depth, height = (float(rng.uniform(*extent)) for extent in SHELF_INSIDE)
+    board, over = float(rng.uniform(*SHELF_BOARD)), float(rng.uniform(*SHELF_OVER_FLOOR))
     floor = _slab(np.array([6.0, 6.0, 0.2]), TABLE_HEIGHT - over)
-    bottom = _slab(np.array([width, depth, BINS.ground]), TABLE_HEIGHT)
-    tall = BINS.ground + 2 * height
-    middle = TABLE_HEIGHT - BINS.ground + tall / 2
+    bottom = _slab(np.array([width, depth, GROUND]), TABLE_HEIGHT)
+    tall = GROUND + 2 * height
+    middle = TABLE_HEIGHT - GROUND + tall / 2
     boxes = [floor, bottom]
     for side in (-1.0, 1.0):
         x = MIDDLE + side * (width + board) / 2
@@ -192,20 +176,20 @@ def random_shelf(rng: np.random.Generator) -> Surroundings:
         (*boxes, back, ceiling),
         _corners(low, high, TABLE_HEIGHT + SUPPORT_CLEARANCE, top),
         _corners(low, high, TABLE_HEIGHT, top),
-        (width / 2 - SHELVES.margin, depth / 2 - SHELVES.margin),
+        (width / 2 - SHELF_MARGIN, depth / 2 - SHELF_MARGIN),
     )
 
 
 def _large_object(rng: np.random.Generator) -> Box:
     """An object too large to grasp that stands beside the others, turned any way."""
-    kind = (TABLES.carton, TABLES.carton, TABLES.panel, TABLES.kerb)[int(rng.integers(4))]
+    kind = (CARTON, CARTON, PANEL, KERB)[int(rng.integers(4))]
     length, width, height = (float(rng.uniform(*extent)) for extent in kind)
     yaw, around = rng.uniform(0.0, 2 * np.pi), rng.uniform(0.0, np.pi)
     away = np.array([np.cos(around), np.sin(around)])
     along = np.array([np.cos(yaw), np.sin(yaw)])
     across = np.array([-along[1], along[0]])
     reach = abs(away @ along) * length / 2 + abs(away @ across) * width / 2
-    x, y = MIDDLE + (reach + rng.uniform(*TABLES.distance)) * away
+    x, y = MIDDLE + (reach + rng.uniform(*LARGE_DISTANCE)) * away
     centre = (float(x), float(y), TABLE_HEIGHT + height / 2)
     return Box((length, width, height), centre, yaw=float(yaw))
 

@@ -6,7 +6,7 @@ A planner is any callable; what runs behind it is up to the caller.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from enum import IntEnum, StrEnum
+from enum import StrEnum
 from typing import TypeAlias
 
 import numpy as np
@@ -111,12 +111,12 @@ class RoundDriver:
         index: int,
     ) -> None:
         self.simulation, self.protocol = simulation, protocol
-        self._camera = random_stream(seed, index, Stream.CAMERA)
-        self._noise = random_stream(seed, index, Stream.NOISE)
-        self._policy = random_stream(seed, index, Stream.POLICY)
+        # None depends on what another was used for.
+        streams = (np.random.default_rng([seed, index, stream]) for stream in range(4))
+        layout, self._camera, self._noise, self._policy = streams
         simulation.reset(
             scene,
-            random_stream(seed, index, Stream.SCENE),
+            layout,
             protocol.num_objects(index),
             protocol.scene.scale(scene),
             protocol.scene.table_thickness,
@@ -210,17 +210,3 @@ def _shows_objects(seen: Observation) -> bool:
     """Whether enough is seen above the table; something in front may hide all of it."""
     above = crop(seen.cloud, seen.workspace)[:, 2] > seen.table_height + 0.005
     return int(np.count_nonzero(above)) >= MIN_SEEN
-
-
-class Stream(IntEnum):
-    """The random streams of a round; none depends on what another was used for."""
-
-    SCENE = 0
-    CAMERA = 1
-    NOISE = 2
-    POLICY = 3
-
-
-def random_stream(seed: int, round_index: int, stream: Stream) -> np.random.Generator:
-    """The generator of one stream of one round."""
-    return np.random.default_rng([seed, round_index, stream])
