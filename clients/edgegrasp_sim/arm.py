@@ -1,10 +1,10 @@
 """A hand on an arm, which follows a planned motion."""
 
 from collections.abc import Iterator
-from typing import Any, Protocol
 
 import numpy as np
 
+from edgegrasp_results import ArmTrajectory
 from edgegrasp_sim.engine import TIME_STEP, ArmModel, HandModel, World
 from edgegrasp_sim.hand import CLOSE_SECONDS, MIN_OPENING, Gripper
 from edgegrasp_sim.poses import Matrix
@@ -12,17 +12,7 @@ from edgegrasp_sim.poses import Matrix
 SETTLE_SECONDS = 0.25  # at the grasp and at the end, in which the joints arrive
 
 
-class ArmMotion(Protocol):
-    """A timed motion of J joints: to the pregrasp, on to the grasp, and away with what is held."""
-
-    times: Any  # (T,) seconds
-    positions: Any  # (T, J) radians or metres
-    velocities: Any  # (T, J)
-    pregrasp_row: int  # where the straight way in begins
-    grasp_row: int  # where the fingers close
-
-
-def seconds_of(motion: ArmMotion) -> float:
+def seconds_of(motion: ArmTrajectory) -> float:
     """Seconds of the motion from home to the grasp, away, and back home the same way."""
     return float(motion.times[-1] + motion.times[motion.pregrasp_row]) + CLOSE_SECONDS
 
@@ -30,7 +20,7 @@ def seconds_of(motion: ArmMotion) -> float:
 class ArmGripper(Gripper):
     """The hand on an arm; `motion` is that of the next grasp."""
 
-    motion: ArmMotion | None = None
+    motion: ArmTrajectory | None = None
 
     def __init__(
         self, world: World, hand: HandModel, arm: ArmModel, min_opening: float = MIN_OPENING
@@ -61,7 +51,7 @@ class ArmGripper(Gripper):
             yield
 
     @property
-    def _planned(self) -> ArmMotion:
+    def _planned(self) -> ArmTrajectory:
         if self.motion is None:
             raise ValueError("the grasp has no motion of the arm; plan it with a robot")
         return self.motion

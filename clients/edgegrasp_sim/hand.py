@@ -15,9 +15,7 @@ from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
 from edgegrasp_sim.scene import SceneObject
 
 SHAPES = Path(__file__).parent / "panda_hand.obj"
-MAX_OPENING = 0.08  # metres between the Panda's fingers
-FINGERTIP = 0.1122  # metres ahead of the panda_hand link
-FINGER_BASE = 0.0584
+FINGERTIP = 0.1122  # metres ahead of the panda_hand link, of the Panda
 CENTRE = 0.04  # of mass
 
 CLOSE_SECONDS = 0.5
@@ -193,11 +191,6 @@ class Gripper:
             self.world.step()
             yield
 
-    def move_to(self, T_world_hand: Matrix, *, step_length: float) -> None:
-        """Drag the hand all the way there, see `steps_to`."""
-        for _ in self.steps_to(T_world_hand, step_length=step_length):
-            pass
-
 
 @cache
 def panda() -> HandModel:
@@ -207,11 +200,11 @@ def panda() -> HandModel:
     return HandModel(
         palm=(shapes["palm"].points,),
         fingers=((finger,), (finger * (-1.0, -1.0, 1.0),)),
-        finger_base=FINGER_BASE,
+        finger_base=0.0584,
         finger_centre=(0.0, 0.01, 0.02),
         tip=FINGERTIP,
         centre=(0.0, 0.0, CENTRE),
-        max_opening=MAX_OPENING,
+        max_opening=0.08,
         meshes=("hand.obj", "finger.obj"),
     )
 
@@ -224,8 +217,13 @@ def hand_of(gripper: Mapping[str, Any]) -> HandModel:
     centre, finger_centre = (
         ((boxes.min(axis=(0, 1)) + boxes.max(axis=(0, 1))) / 2).tolist() for boxes in (palm, finger)
     )
-    advance = swing_of(gripper)
-    held = 0.0 if advance is None else float(np.polynomial.Polynomial(advance)(opening / 4))
+    advance, held = None, 0.0
+    if (swing := gripper.get("swing")) is not None:  # on a circle, to a hundredth of its reach
+        radius, reach, half = swing["radius"], swing["reach"], np.linspace(0.0, opening / 2, 50)
+        ahead = np.sqrt(radius**2 - (reach - opening / 2 + half) ** 2)
+        ahead -= np.sqrt(radius**2 - reach**2)
+        fit = np.polynomial.Polynomial.fit(half, ahead, 4).convert()
+        advance, held = tuple(fit.coef.tolist()), float(fit(opening / 4))
     return HandModel(
         palm=_corners(palm),
         fingers=(_corners(finger), _corners(finger * (1.0, -1.0, 1.0))),
@@ -236,18 +234,6 @@ def hand_of(gripper: Mapping[str, Any]) -> HandModel:
         max_opening=opening,
         advance=advance,
     )
-
-
-def swing_of(gripper: Mapping[str, Any]) -> tuple[float, ...] | None:
-    """`HandModel.advance` of a gripper file: its linkage's circle, to a hundredth of its reach."""
-    swing = gripper.get("swing")
-    if swing is None:
-        return None
-    radius, reach, shut = swing["radius"], swing["reach"], gripper["max_opening"] / 2
-    half = np.linspace(0.0, shut, 50)
-    ahead = np.sqrt(radius**2 - (reach - shut + half) ** 2) - np.sqrt(radius**2 - reach**2)
-    fit = np.polynomial.Polynomial.fit(half, ahead, 4).convert()
-    return tuple(fit.coef.tolist())
 
 
 def _corners(boxes: Matrix) -> Parts:
@@ -307,11 +293,13 @@ def _holds_when_shaken(
     """Shake the lifted hand; returns whether it still holds the object."""
     shake = gripper.world.shake
     T_world_lifted = retreat_pose(T_world_hand)
-    gripper.move_to(T_world_lifted, step_length=LIFT_STEP)
+    moves = [(T_world_lifted, LIFT_STEP)]
     for along in np.eye(3)[:2]:
         for way in (shake.distance, -shake.distance, 0.0):
-            aside = T_world_lifted @ translation(*(way * along))
-            gripper.move_to(aside, step_length=shake.step_length)
+            moves.append((T_world_lifted @ translation(*(way * along)), shake.step_length))
+    for T_world_next, step_length in moves:
+        for _ in gripper.steps_to(T_world_next, step_length=step_length):
+            pass
     return not gripper.is_shut and held in _touched(gripper, objects)
 
 

@@ -32,7 +32,6 @@ LONGEST_SIDE = 0.15  # metres; five such objects fit into the workspace
 CONCAVITY = 0.05
 # A short search for cuts: a second or two for a closed mesh, a minute for a torn one.
 SEARCH = {"mcts_iterations": 20, "mcts_nodes": 8, "mcts_max_depth": 2, "resolution": 1000}
-CACHE_FOLDER = "edgegrasp"
 Size = tuple[float, float, float]
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]  # points (P, 3), triangles (F, 3)
 logger = logging.getLogger(__name__)
@@ -151,7 +150,8 @@ class ObjectSet:
     def builtin(cls, scene: SceneKind) -> "ObjectSet":
         """Graspable objects that need no files: boxes and cans, and for piles random shapes too."""
         folder = _kept_in(f"builtin-{LAYOUT}", _write_builtin)
-        names = [f"{family}-{k}" for family, all_ in STANDING.items() for k in range(len(all_))]
+        counts = {family: sum(map(len, shapes)) for family, shapes in STANDING.items()}
+        names = [f"{family}-{k}" for family, count in counts.items() for k in range(count)]
         if scene.objects is SceneKind.PILE:
             names += [f"blob_{number:03d}" for number in range(_BLOBS)]
         models = tuple(ObjectModel(name, folder / f"{name}.urdf") for name in names)
@@ -178,21 +178,26 @@ def prepare_mesh(mesh: Path) -> Path:
     ValueError: it is no solid mesh; ModuleNotFoundError: coacd or trimesh is not installed.
     """
     try:
-        import coacd  # noqa: F401
-        import trimesh  # noqa: F401
+        import coacd
+        import trimesh
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
             f"{error.name} is not installed, and meshes need it: pip install 'edgegrasp[meshes]'"
         ) from None
 
     def write(folder: Path) -> None:
-        import trimesh
-
         surface = _read(mesh)
         sides = np.sort(surface.bounding_box_oriented.primitive.extents)
         surface.apply_scale(min(SHORTEST_SIDE / sides[0], LONGEST_SIDE / sides[2]))
         surface.apply_translation(-surface.bounds.mean(axis=0))
-        parts = _convex_parts(surface)
+        coacd.set_log_level("error")
+        solids = coacd.run_coacd(
+            coacd.Mesh(np.asarray(surface.vertices), np.asarray(surface.faces)),
+            threshold=CONCAVITY,
+            seed=0,
+            **SEARCH,
+        )
+        parts = [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in solids]
         solid: Any = trimesh.util.concatenate(parts)
         solid.density = OBJECT_MASS / solid.volume
         visible, hulls = ([(m.vertices, m.faces) for m in meshes] for meshes in ([surface], parts))
@@ -205,7 +210,7 @@ def prepare_mesh(mesh: Path) -> Path:
 def cache_folder() -> Path:
     """Where prepared objects are kept: below `$XDG_CACHE_HOME`, else below `~/.cache`."""
     root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(root) / CACHE_FOLDER / "meshes"
+    return Path(root) / "edgegrasp" / "meshes"
 
 
 def write_object(name: str, surface: str, folder: Path) -> Path:
@@ -258,53 +263,43 @@ def as_obj(
     return "\n".join(lines) + "\n"
 
 
-@dataclass(frozen=True, slots=True)
-class Prism:
-    """A prism with a regular base, which unlike a cylinder does not roll."""
+def _prism(sides: int, size: Size) -> str:
+    """An upright prism as an OBJ file: its base is regular, and unlike a cylinder it does not roll.
 
-    sides: int  # of the base, 4 or more
-    size: Size  # full extents along x, y and z, metres
-    axis: int = 2  # 0, 1 or 2, along which the prism extends
-
-    def obj(self) -> str:
-        """Its surface as an OBJ file, metres."""
-        angles = np.pi / self.sides * (2 * np.arange(self.sides) + 1)
-        base = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        base /= np.ptp(base, axis=0)  # extents of one
-        corners = np.concatenate([np.insert(base, 2, end, axis=1) for end in (-0.5, 0.5)])
-        corners = np.roll(corners, self.axis - 2, axis=1) * self.size
-        n = self.sides
-        faces = [(k, (k + 1) % n, (k + 1) % n + n) for k in range(n)]
-        faces += [(k, (k + 1) % n + n, k + n) for k in range(n)]
-        faces += [(0, k + 1, k) for k in range(1, n - 1)]
-        faces += [(n, n + k, n + k + 1) for k in range(1, n - 1)]
-        return as_obj([(corners, np.array(faces))])
+    `sides` are those of the base, 4 or more; `size` is the full extents along x, y and z, metres.
+    """
+    angles = np.pi / sides * (2 * np.arange(sides) + 1)
+    base = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    base /= np.ptp(base, axis=0)  # extents of one
+    corners = np.concatenate([np.insert(base, 2, end, axis=1) for end in (-0.5, 0.5)]) * size
+    faces = [(k, (k + 1) % sides, (k + 1) % sides + sides) for k in range(sides)]
+    faces += [(k, (k + 1) % sides + sides, k + sides) for k in range(sides)]
+    faces += [(0, k + 1, k) for k in range(1, sides - 1)]
+    faces += [(sides, sides + k, sides + k + 1) for k in range(1, sides - 1)]
+    return as_obj([(corners, np.array(faces))])
 
 
-def _boxes(*sizes: Size) -> tuple[Prism, ...]:
-    return tuple(Prism(4, size) for size in sizes)
-
-
-def _cans(*sizes: tuple[float, float]) -> tuple[Prism, ...]:
-    """Upright prisms of a diameter and a height."""
-    return tuple(Prism(10, (diameter, diameter, height)) for diameter, height in sizes)
-
-
-# The built-in objects that stand upright, by family; sizes in metres as they come into a scene.
-# Large: 60 to 70 mm in a hand that opens 80 mm.
-STANDING: dict[str, tuple[Prism, ...]] = {
-    "regular": _boxes((0.03, 0.03, 0.08), (0.04, 0.04, 0.04), (0.03, 0.05, 0.07))
-    + _cans((0.03, 0.08), (0.04, 0.06), (0.05, 0.05)),
-    "large": _boxes((0.065, 0.065, 0.10), (0.06, 0.09, 0.12), (0.07, 0.07, 0.07))
-    + _cans((0.06, 0.12), (0.065, 0.10), (0.07, 0.08)),
+# The built-in objects that stand upright, by family: full extents of boxes, diameters and heights
+# of cans, metres, as they come into a scene. Large: 60 to 70 mm in a hand that opens 80 mm.
+STANDING: dict[str, tuple[tuple[Size, ...], tuple[tuple[float, float], ...]]] = {
+    "regular": (
+        ((0.03, 0.03, 0.08), (0.04, 0.04, 0.04), (0.03, 0.05, 0.07)),
+        ((0.03, 0.08), (0.04, 0.06), (0.05, 0.05)),
+    ),
+    "large": (
+        ((0.065, 0.065, 0.10), (0.06, 0.09, 0.12), (0.07, 0.07, 0.07)),
+        ((0.06, 0.12), (0.065, 0.10), (0.07, 0.08)),
+    ),
 }
 _BLOBS = 12  # random shapes that the sets of piles hold besides
 
 
 def _write_builtin(folder: Path) -> None:
-    for family, shapes in STANDING.items():
+    for family, (boxes, cans) in STANDING.items():
+        shapes = [_prism(4, size) for size in boxes]
+        shapes += [_prism(10, (diameter, diameter, height)) for diameter, height in cans]
         for number, shape in enumerate(shapes):
-            write_object(f"{family}-{number}", shape.obj(), folder)
+            write_object(f"{family}-{number}", shape, folder)
     for number in range(_BLOBS):
         blob(number, folder)
 
@@ -357,16 +352,6 @@ def _read(mesh: Path) -> Any:
             f"{mesh} is not a solid object (its extents are {surface.extents.tolist()})"
         )
     return surface
-
-
-def _convex_parts(surface: Any) -> list[Any]:
-    import coacd
-    import trimesh
-
-    coacd.set_log_level("error")
-    mesh = coacd.Mesh(np.asarray(surface.vertices), np.asarray(surface.faces))
-    parts = coacd.run_coacd(mesh, threshold=CONCAVITY, seed=0, **SEARCH)
-    return [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in parts]
 
 
 def _write_urdf(

@@ -1,16 +1,26 @@
 """Making packed and pile scenes, bins, crowded tables and shelves, and bringing them to rest."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import partial
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_sim.engine import TIME_STEP, Body, World
-from edgegrasp_sim.objects import ObjectModel, ObjectSet
+from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import Matrix, about_z
-from edgegrasp_sim.surroundings import MIDDLE, SIZE, TABLE_HEIGHT, Box, Surroundings
+from edgegrasp_sim.surroundings import (
+    MIDDLE,
+    SIZE,
+    TABLE_HEIGHT,
+    Box,
+    Surroundings,
+    random_bin,
+    random_shelf,
+    random_table,
+)
 
 PACKED_SCALE = (0.7, 0.8)
 PILE_SCALE = (0.8, 1.0)
@@ -75,6 +85,10 @@ class Layout(NamedTuple):
     rng: np.random.Generator  # source of the draws
     num_objects: int  # how many to try to place
     scales: tuple[float, float]  # range of the factor on their size
+
+
+MakeSurroundings: TypeAlias = Callable[[np.random.Generator], Surroundings]
+MakeObjects: TypeAlias = Callable[[Layout], list[SceneObject]]
 
 
 def make_packed(layout: Layout) -> list[SceneObject]:
@@ -223,3 +237,14 @@ def _place(
         placed = settle(world, [*placed, new], layout.surroundings)
     world.remove_state(state)
     return placed
+
+
+# What objects stand in (None: an open table), the usual range of their scales, how they are placed.
+STANDING_IN: dict[SceneKind, tuple[MakeSurroundings | None, tuple[float, float], MakeObjects]] = {
+    SceneKind.PACKED: (None, PACKED_SCALE, make_packed),
+    SceneKind.PILE: (None, PILE_SCALE, make_pile),
+    SceneKind.BIN: (random_bin, PILE_SCALE, make_bin),
+    SceneKind.FULL_BIN: (partial(random_bin, small=True), PILE_SCALE, make_full_bin),
+    SceneKind.TABLE: (random_table, PACKED_SCALE, make_table),
+    SceneKind.SHELF: (random_shelf, PACKED_SCALE, make_table),
+}

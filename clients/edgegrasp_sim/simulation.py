@@ -1,8 +1,7 @@
 """Clutter removal in simulation: make a scene, look at it, grasp in it."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -10,26 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_camera.picture import lit
-from edgegrasp_sim.arm import ArmGripper, ArmMotion
+from edgegrasp_results import ArmTrajectory
+from edgegrasp_sim.arm import ArmGripper
 from edgegrasp_sim.camera import CAMERA, FARTHEST, Observation, TableView, crop, points_of, seen_box
 from edgegrasp_sim.engine import ArmModel, make_world
-from edgegrasp_sim.engine.urdf import least_width, read_urdf
+from edgegrasp_sim.engine.urdf import least_width
 from edgegrasp_sim.hand import MIN_OPENING, GraspResult, Gripper, hand_of, panda, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import Matrix, require_pose
-from edgegrasp_sim.scene import (
-    PACKED_SCALE,
-    PILE_SCALE,
-    Layout,
-    SceneObject,
-    load_object,
-    make_bin,
-    make_full_bin,
-    make_packed,
-    make_pile,
-    make_table,
-    settle,
-)
+from edgegrasp_sim.scene import STANDING_IN, Layout, SceneObject, load_object, settle
 from edgegrasp_sim.sensor import DepthNoise, DepthSensor
 from edgegrasp_sim.surroundings import (
     OPEN_TABLE,
@@ -37,28 +25,9 @@ from edgegrasp_sim.surroundings import (
     TABLE_HEIGHT,
     Surroundings,
     open_table,
-    random_bin,
-    random_shelf,
-    random_table,
 )
 
 NOISE_STD = 0.001  # metres
-# What objects stand in (None: an open table), the usual range of their scales, how they are placed.
-STANDING_IN: dict[
-    SceneKind,
-    tuple[
-        Callable[..., Surroundings] | None,
-        tuple[float, float],
-        Callable[[Layout], list[SceneObject]],
-    ],
-] = {
-    SceneKind.PACKED: (None, PACKED_SCALE, make_packed),
-    SceneKind.PILE: (None, PILE_SCALE, make_pile),
-    SceneKind.BIN: (random_bin, PILE_SCALE, make_bin),
-    SceneKind.FULL_BIN: (partial(random_bin, small=True), PILE_SCALE, make_full_bin),
-    SceneKind.TABLE: (random_table, PACKED_SCALE, make_table),
-    SceneKind.SHELF: (random_shelf, PACKED_SCALE, make_table),
-}
 WOOD = np.array([168.0, 140.0, 110.0])  # colour of what never moves
 PAINTS = np.array(
     [
@@ -138,7 +107,7 @@ class ClutterSimulation:
         return [
             item.model
             for item in self._objects
-            if _least_width(item.model.urdf) * item.scale * item.model.scale > widest
+            if least_width(item.model.urdf) * item.scale * item.model.scale > widest
         ]
 
     @property
@@ -283,7 +252,7 @@ class ClutterSimulation:
         return result
 
     def execute_grasp(
-        self, T_world_hand: ArrayLike, motion: ArmMotion | None = None
+        self, T_world_hand: ArrayLike, motion: ArmTrajectory | None = None
     ) -> GraspResult:
         """Grasp to the end: a held object leaves the scene, and the others come to rest.
 
@@ -347,8 +316,3 @@ class ClutterSimulation:
         self.surroundings = surroundings
         self._obstacles = surroundings.add_to(self.world)
         return surroundings
-
-
-@cache
-def _least_width(urdf: Path) -> float:
-    return least_width(read_urdf(urdf, 1.0))

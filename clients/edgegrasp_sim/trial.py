@@ -12,7 +12,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edgegrasp_sim.arm import ArmMotion, seconds_of
+from edgegrasp_results import ArmTrajectory
+from edgegrasp_sim.arm import seconds_of
 from edgegrasp_sim.camera import Observation, crop
 from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.objects import SceneKind
@@ -29,7 +30,7 @@ class PlannedGrasp:
     T_world_hand: ArrayLike  # (4, 4) pose of the `panda_hand` link in the world, metres
     score: float  # how good the planner believes the grasp is; higher is better
     width: float  # opening that the grasp needs, metres
-    motion: ArmMotion | None = None  # of the arm that carries the hand, if one does
+    motion: ArmTrajectory | None = None  # of the arm that carries the hand, if one does
 
 
 # From an observation, and a seed for randomness in planning, to the grasp to execute; None if

@@ -1,7 +1,7 @@
 """Reading the shapes of an object's URDF file and its OBJ meshes."""
 
 import re
-from functools import lru_cache
+from functools import cache, lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -111,9 +111,10 @@ def _triangles(lines: list[str], known: int) -> NDArray[np.int64]:
     return np.where(triangles > 0, triangles - 1, known + triangles)
 
 
-def least_width(shape: Shape) -> float:
+@cache
+def least_width(path: Path) -> float:
     """The least distance between parallel planes around an object, one along a face; metres."""
-    hull = ConvexHull(np.concatenate([part.points for part in shape.hulls]))
+    hull = ConvexHull(np.concatenate([part.points for part in read_urdf(path, 1.0).hulls]))
     heights = hull.points[hull.vertices] @ hull.equations[:, :3].T
     return float(np.ptp(heights, axis=0).min())
 

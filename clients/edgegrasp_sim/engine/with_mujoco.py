@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # read on import; images need no display
 
@@ -41,7 +41,6 @@ JOINT_DAMPING = 400.0  # N m s/rad, about critical
 CONTACT_SECONDS = 0.00625  # in which a contact pushes bodies apart; no less than two substeps
 IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)  # of contacts, see MuJoCo's `solimp`
 COLLISION_DEPTH = 0.0002  # metres, which the hand overlaps something hard by at about 100 N
-SHAKE = Shake(0.01, 0.005)  # at 0.4 m/s: the hand follows, and turns sharply
 FRICTION_IMPEDANCE = 10.0  # that of friction over that of normal forces, lest held objects creep
 ARM_INERTIA = 1.0  # kg and kg m², of the arm behind the hand
 ARM_STIFFNESS = 30000.0  # N/m and N m/rad
@@ -51,19 +50,6 @@ FINGER_SPINNING_FRICTION = 0.005
 FINGER_SPEED = 0.2  # m/s, at which a finger moves where nothing stops it
 FINGER_INERTIA = 0.3  # kg, of a finger's drive
 FINGER_DAMPING = 400.0  # N s/m, with which the drive keeps to its speed
-CONSTANTS = {
-    "time_step": TIME_STEP,
-    "substeps": SUBSTEPS,
-    "gravity": GRAVITY,
-    "collision_depth": COLLISION_DEPTH,
-    "contact_seconds": CONTACT_SECONDS,
-    "friction_impedance": FRICTION_IMPEDANCE,
-    "arm_inertia": ARM_INERTIA,
-    "arm_stiffness": ARM_STIFFNESS,
-    "finger_spinning_friction": FINGER_SPINNING_FRICTION,
-    "finger_speed": FINGER_SPEED,
-    "finger_inertia": FINGER_INERTIA,
-}
 _SHARES = np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS
 _OBJECTS, _HAND = 1, 2  # bits of what collides: objects with all, the hand not with itself
 # What MuJoCo would do to a URDF besides: join links that no joint moves, look for meshes nearby.
@@ -77,9 +63,21 @@ class MujocoWorld(World):
     """A model, recompiled whenever bodies are added or removed, and its state."""
 
     name = "mujoco"
-    constants = CONSTANTS
+    constants: ClassVar = {
+        "time_step": TIME_STEP,
+        "substeps": SUBSTEPS,
+        "gravity": GRAVITY,
+        "collision_depth": COLLISION_DEPTH,
+        "contact_seconds": CONTACT_SECONDS,
+        "friction_impedance": FRICTION_IMPEDANCE,
+        "arm_inertia": ARM_INERTIA,
+        "arm_stiffness": ARM_STIFFNESS,
+        "finger_spinning_friction": FINGER_SPINNING_FRICTION,
+        "finger_speed": FINGER_SPEED,
+        "finger_inertia": FINGER_INERTIA,
+    }
     collision_depth = COLLISION_DEPTH
-    shake = SHAKE
+    shake = Shake(0.01, 0.005)  # at 0.4 m/s: the hand follows, and turns sharply
 
     def __init__(self) -> None:
         self._images = _Images()
@@ -89,8 +87,20 @@ class MujocoWorld(World):
         self._images.close()
 
     def reset(self) -> None:
-        self.spec = _empty()
-        self._model: Any = self.spec.compile()
+        self.spec = spec = mujoco.MjSpec()
+        spec.compiler.usethread = 0  # for so few meshes, threads cost more than they save
+        spec.option.timestep = TIME_STEP / SUBSTEPS
+        spec.option.gravity = (0.0, 0.0, -GRAVITY)
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP  # what rests costs nothing
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        spec.option.impratio = FRICTION_IMPEDANCE
+        spec.default.geom.solref = (CONTACT_SECONDS, 1.0)
+        spec.default.geom.solimp = IMPEDANCE
+        spec.visual.quality.offsamples = 0
+        spec.visual.quality.shadowsize = 0
+        spec.stat.extent = 1.0
+        self._model: Any = spec.compile()
         self._data: Any = mujoco.MjData(self._model)
         self._changed = False
         self._bodies = 0
@@ -574,25 +584,6 @@ def _look(eye: Any, T_world_camera: Matrix, camera: Intrinsics) -> None:
     eye.frustum_bottom = (centre_y - camera.height) * per_pixel
     eye.frustum_near, eye.frustum_far = camera.near, camera.far
     eye.orthographic = 0
-
-
-def _empty() -> Any:
-    """A model without bodies, and with the engine's settings."""
-    spec = mujoco.MjSpec()
-    spec.compiler.usethread = 0  # for so few meshes, threads cost more than they save
-    option, visual = spec.option, spec.visual
-    option.timestep = TIME_STEP / SUBSTEPS
-    option.gravity = (0.0, 0.0, -GRAVITY)
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP  # what rests costs nothing
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.impratio = FRICTION_IMPEDANCE
-    spec.default.geom.solref = (CONTACT_SECONDS, 1.0)
-    spec.default.geom.solimp = IMPEDANCE
-    visual.quality.offsamples = 0
-    visual.quality.shadowsize = 0
-    spec.stat.extent = 1.0
-    return spec
 
 
 def _weigh(body: Any, mass: float, corners: Matrix) -> None:

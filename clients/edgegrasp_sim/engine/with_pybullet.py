@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pybullet
@@ -29,20 +29,11 @@ from edgegrasp_sim.poses import Matrix, about_z
 
 SOLVER_ITERATIONS = 100
 COLLISION_DEPTH = 0.001  # metres
-SHAKE = Shake(0.05, 0.0125)  # at 1 m/s: the hand lags and comes half as far
 FINGER_SPINNING_FRICTION = 0.05  # metres: torque about a contact's normal, by its force
 FINGER_STIFFNESS = 30000.0  # N/m at a contact
 FINGER_DAMPING = 1000.0  # N s/m at a contact
 GEAR_FORCE = 30.0  # N, which keeps the fingers at one opening
 GEAR_ERP = 0.1
-CONSTANTS = {
-    "time_step": TIME_STEP,
-    "solver_iterations": SOLVER_ITERATIONS,
-    "gravity": GRAVITY,
-    "collision_depth": COLLISION_DEPTH,
-    "finger_spinning_friction": FINGER_SPINNING_FRICTION,
-    "gear_force": GEAR_FORCE,
-}
 # The Panda's collision meshes, which the published figures were measured with.
 _MESHES = Path(pybullet_data.getDataPath()) / "franka_panda" / "meshes" / "collision"
 _STRAIGHT, _HALF_TURN = [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]  # xyzw
@@ -52,9 +43,16 @@ class PybulletWorld(World):
     """One physics server; raises RuntimeError if none is left in this process."""
 
     name = "pybullet"
-    constants = CONSTANTS
+    constants: ClassVar = {
+        "time_step": TIME_STEP,
+        "solver_iterations": SOLVER_ITERATIONS,
+        "gravity": GRAVITY,
+        "collision_depth": COLLISION_DEPTH,
+        "finger_spinning_friction": FINGER_SPINNING_FRICTION,
+        "gear_force": GEAR_FORCE,
+    }
     collision_depth = COLLISION_DEPTH
-    shake = SHAKE
+    shake = Shake(0.05, 0.0125)  # at 1 m/s: the hand lags and comes half as far
 
     def __init__(self) -> None:
         self.client = _Client()
