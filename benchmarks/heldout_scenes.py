@@ -199,7 +199,7 @@ def picture(maker: Maker, made: Made) -> dict[str, Float64]:
     heights = (rays * true[..., None]) @ up + T_world_camera[2, 3]
     label = (np.isin(body, made.support) & (np.abs(heights) < FLAT)).astype(np.uint8)
     for number, item in enumerate(maker.objects):
-        label[body == item.body.uid] = 2 + number
+        label[body == item.body.uid] = FIRST + number
     label = on_the_surface(label, true, depth)
     for number in np.unique(label[label > 1]):
         if (label == number).sum() < LEAST * label.size:

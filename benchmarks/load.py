@@ -69,8 +69,17 @@ def main() -> None:
             runs.setdefault((clients, name), []).append(samples)
     for (clients, name), found in runs.items():
         rates = [sum(one.code == OK for one in run) / given.seconds for run in found]
-        row = {"server": name, "clients": clients, "per_second": statistics.median(rates)}
-        results["servers"].append(row | summary(list(itertools.chain(*found))))
+        samples = list(itertools.chain(*found))
+        answered = [one for one in samples if one.code == OK]
+        row = {
+            "server": name,
+            "clients": clients,
+            "per_second": statistics.median(rates),
+            "codes": dict(Counter(one.code for one in samples)),
+            "answered_ms": percentiles([one.seconds for one in answered]),
+            "beyond_the_detector_ms": percentiles([one.beyond for one in answered]),
+        }
+        results["servers"].append(row)
         print(results["servers"][-1], flush=True)
     write_results(given.output, "load", results)
 
@@ -112,16 +121,6 @@ def run_clients(
 
     with ThreadPoolExecutor(clients) as threads:
         return [sample for samples in threads.map(work, range(clients)) for sample in samples]
-
-
-def summary(samples: Sequence[Sample]) -> dict[str, Any]:
-    """Counts of outcomes, and times in milliseconds."""
-    answered = [one for one in samples if one.code == OK]
-    return {
-        "codes": dict(Counter(one.code for one in samples)),
-        "answered_ms": percentiles([one.seconds for one in answered]),
-        "beyond_the_detector_ms": percentiles([one.beyond for one in answered]),
-    }
 
 
 def percentiles(seconds: Sequence[float]) -> dict[str, float] | None:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from edgegrasp_camera.arrays import Float32, Float64
+from edgegrasp_camera.arrays import Float64
 from edgegrasp_camera.depth import Intrinsics, metres, unproject
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.options import parse_options
@@ -24,12 +24,6 @@ from edgegrasp_robot import Robot, load_robot, plan_picks, with_robot
 
 SAMPLE = "service/edgegrasp_service/playground/samples/seven_depth.png"
 FOCAL, SEEDS, FAR = 540.0, 20, 0.5  # pixels; seeds; metres from the arm's base to the objects
-
-
-def cloud_of_sample() -> Float32:
-    """The image's points (480, 640, 3), camera frame, metres."""
-    depth = metres(np.asarray(Image.open(Path(__file__).parents[1] / SAMPLE)))
-    return unproject(depth, Intrinsics(FOCAL, FOCAL, 320, 240)).astype(np.float32)
 
 
 def beside(detection: Detection) -> Float64:
@@ -71,7 +65,9 @@ def measure(detector: GraspDetector, robot: Robot, cloud: Any, fields: dict[str,
 def main(names: list[str]) -> None:
     """Print a table."""
     torch.set_num_threads(1)
-    detector, cloud = ModelCatalogue.load().get(), cloud_of_sample()
+    detector = ModelCatalogue.load().get()
+    depth = metres(np.asarray(Image.open(Path(__file__).parents[1] / SAMPLE)))
+    cloud = unproject(depth, Intrinsics(FOCAL, FOCAL, 320, 240)).astype(np.float32)
     options = parse_options({"viewpoint": (0.0, 0.0, 0.0)})
     pose = beside(detector.detect(cloud, options)).ravel().tolist()
     print("robot | plan | top_k | image to answer, ms, median / p95 | of it the arm | with a pick")

@@ -101,11 +101,10 @@ def run(server: Addresses, clients: int, seconds: float, seed: int) -> dict[str,
         list(pool.map(time.sleep, [START_SECONDS] * len(works)))  # until all have started
         where = server.http_url, server.grpc_address, stop
         beside = [pool.submit(work, *where) for work in works]
-        soak = Soak(server, seed)
-        asyncio.run(soak.run(clients, seconds))
+        figures = asyncio.run(Soak(server, seed).run(clients, seconds))
         stop.set()
         refused, *attacks = (work.result() for work in beside)
-    return soak.figures() | {"health_refused": refused, "attacks": attacks}
+    return figures | {"health_refused": refused, "attacks": attacks}
 
 
 # The clients
@@ -152,16 +151,13 @@ class Soak:
         self._memory: list[float] = []
         self._given = 0
 
-    async def run(self, clients: int, seconds: float) -> None:
-        """Send requests for `seconds`."""
+    async def run(self, clients: int, seconds: float) -> dict[str, Any]:
+        """Send requests for `seconds`; returns the figures."""
         self._todo = plans(self._seed, time.monotonic() + seconds)
         ways = itertools.cycle(("grpc", "stream", "rest"))
         sampling = asyncio.create_task(self._sample(seconds / MEMORY_SAMPLES))
         await asyncio.gather(*(self._send(way) for way in islice(ways, clients)))
         sampling.cancel()
-
-    def figures(self) -> dict[str, Any]:
-        """The results of the run."""
         return {
             "requests": self._given,
             "lost": self._given - self._outcomes.total(),
@@ -184,16 +180,16 @@ class Soak:
                 if way == "stream":
                     await self._stream(client, some)
                     continue
-                self._note(way, some[0], await self._one(client, some[0]))
-
-    async def _one(self, client: AsyncGraspClient, plan: Plan) -> str:
-        try:
-            async with asyncio.timeout(plan.wait if plan.kind == "cancelled" else None):
-                return outcome(plan, await client.detect(plan.points(), **plan.options()))
-        except TimeoutError:
-            return CANCELLED
-        except GraspClientError as error:
-            return outcome(plan, error)
+                (plan,) = some
+                try:
+                    async with asyncio.timeout(plan.wait if plan.kind == "cancelled" else None):
+                        answer = await client.detect(plan.points(), **plan.options())
+                        came = outcome(plan, answer)
+                except TimeoutError:
+                    came = CANCELLED
+                except GraspClientError as error:
+                    came = outcome(plan, error)
+                self._note(way, plan, came)
 
     async def _stream(self, client: AsyncGraspClient, some: list[Plan]) -> None:
         # The stream is left with the plans that are cancelled, so they come last.

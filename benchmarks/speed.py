@@ -96,7 +96,10 @@ def camera() -> dict[str, float]:
         if len(scene.points) == math.prod(IMAGE):
             image = scene.points.reshape(*IMAGE, 3)
             sent[f"640 x 480, {scene.name}"] = image, np.zeros(3)
-            sent[f"1280 x 720, {scene.name}"] = enlarged(image), np.zeros(3)
+            # Twice as many rows and columns; a little noise keeps points from lying on one another.
+            large = image.repeat(2, axis=0).repeat(2, axis=1)[120:840]
+            noise = np.random.default_rng(0).normal(0.0, ENLARGED_NOISE, large.shape)
+            sent[f"1280 x 720, {scene.name}"] = (large + noise).astype(np.float32), np.zeros(3)
     runs = {
         name: partial(ours.detect, cloud, DetectOptions(viewpoint=tuple(viewpoint.tolist())))
         for name, (cloud, viewpoint) in sent.items()
@@ -110,16 +113,6 @@ def demo_view() -> Observation:
     with ClutterSimulation() as simulation:
         simulation.reset(SceneKind.PILE, scene, num_objects=6)
         return simulation.observe_from(EVALUATION_VIEWS.sample(camera), noise, table="auto")
-
-
-def enlarged(image: np.ndarray) -> np.ndarray:
-    """An image (480, 640, 3) of points with twice as many rows and columns, cut to (720, 1280, 3).
-
-    A little noise keeps its points from lying on one another.
-    """
-    large = image.repeat(2, axis=0).repeat(2, axis=1)[120:840]
-    noise = np.random.default_rng(0).normal(0.0, ENLARGED_NOISE, large.shape)
-    return (large + noise).astype(np.float32)
 
 
 def server_footprint() -> dict[str, float]:
@@ -195,12 +188,10 @@ def observe(kind: SceneKind = SceneKind.PILE, table: TableView = "known") -> Obs
         return simulation.observe_from(views, np.random.default_rng(2), table=table)
 
 
-def request(
-    observation: Observation, num_approach_points: int = 32, num_candidates: int = 2000
-) -> DetectOptions:
+def request(observation: Observation, num_candidates: int = 2000) -> DetectOptions:
     """The options of a request with a known table."""
     return DetectOptions(
-        num_approach_points=num_approach_points,
+        num_approach_points=32,
         num_candidates=num_candidates,
         viewpoint=tuple(observation.camera_position.tolist()),
         support={"normal": (0.0, 0.0, 1.0), "offset": observation.table_height},

@@ -119,7 +119,13 @@ def surrounded(
         known.append((f"collision.obstacles.{row}", core.Box(*(2 * half)), place))
     T_base_scene = T_base_cloud @ np.linalg.inv(scene.frame.T_canonical_cloud)
     if scene.support is not None:
-        known.append(_support(scene, T_base_scene))
+        # A slab below the support plane, its middle below the arm's base.
+        normal, base = np.array(scene.support.normal), np.linalg.inv(T_base_scene)[:3, 3]
+        upright = Rotation.align_vectors(normal[None], [[0.0, 0.0, 1.0]])[0]
+        T_scene_slab = np.eye(4)
+        T_scene_slab[:3, :3] = upright.as_matrix()
+        T_scene_slab[:3, 3] = base - (scene.support.heights(base) + SLAB[2] / 2) * normal
+        known.append(("the support", core.Box(*SLAB), T_base_scene @ T_scene_slab))
     voxels = _voxels(robot, joints, scene, points, T_base_scene)
     if asked.avoid_unseen:
         hidden = _hidden(scene, voxels, T_base_scene)
@@ -186,18 +192,6 @@ def _near_robot(robot: Robot, joints: Float64, points: Float64, distance: float)
     options = core.RobotBodyFilterOptions(distance, num_threads=1)
     placed = np.ascontiguousarray(moved(T_root_base, points))
     return core.RobotBodyFilter(robot.scene, options).computeMask(joints, placed)
-
-
-def _support(scene: Scene, T_base_scene: Float64) -> Obstacle:
-    """A slab below the support plane, its middle below the arm's base."""
-    assert scene.support is not None
-    normal = np.array(scene.support.normal)
-    base = np.linalg.inv(T_base_scene)[:3, 3]
-    T_scene_slab = np.eye(4)
-    T_scene_slab[:3, :3] = Rotation.align_vectors(normal[None], [[0.0, 0.0, 1.0]])[0].as_matrix()
-    depth = scene.support.heights(base) + SLAB[2] / 2
-    T_scene_slab[:3, 3] = base - depth * normal
-    return "the support", core.Box(*SLAB), T_base_scene @ T_scene_slab
 
 
 def _voxels(
