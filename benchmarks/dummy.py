@@ -3,12 +3,12 @@
 import os
 import time
 import zlib
-from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from edgegrasp_camera.arrays import Array, Float32, Int64
+from edgegrasp_camera.arrays import Array, Float32
 from edgegrasp_model.errors import UnknownModel
 from edgegrasp_model.given import check_edges, check_hand_poses
 from edgegrasp_model.gripper import choose_gripper, load_gripper
@@ -27,26 +27,13 @@ WARNING = "The dummy detector made these grasps up."
 SECONDS = float(os.environ.get("DUMMY_SECONDS", "0"))  # of service time
 
 
-@dataclass(frozen=True)
-class DummyPrepared:
-    """A request between the stages."""
-
-    options: DetectOptions
-    points: Float32  # (N, 3)
-    drawn: Int64  # (A,) approach points, rows of `points`
-    batch: Float32  # (A,) scores, descending, which the network gives back
-    counts: dict[str, int]
-    seconds: dict[str, float] = field(default_factory=dict)
-    scene: None = None
-
-
 class DummyDetector:
     """Makes top-down grasps on points drawn from the seed; its network takes `seconds`."""
 
     def __init__(self, seconds: float = 0.0) -> None:
         self._seconds = seconds
 
-    def prepare(self, cloud: CloudInput, options: DetectOptions, *_: int) -> DummyPrepared:
+    def prepare(self, cloud: CloudInput, options: DetectOptions, *_: int) -> SimpleNamespace:
         """Draw approach points, the same ones for the same cloud and options."""
         points = check_cloud(cloud, options.num_approach_points or 1).points
         random = np.random.default_rng(options.seed)
@@ -55,15 +42,20 @@ class DummyDetector:
         scores = np.sort(random.random(len(drawn), dtype=np.float32))[::-1]
         counts = {"points": len(points), "scored": len(drawn)}
         counts["crc32"] = zlib.crc32(points.tobytes())  # a caller sees that the cloud is its own
-        return DummyPrepared(options, points, drawn, scores, counts)
+        # `drawn`: (A,) approach points, rows of `points` (N, 3); `batch`: (A,) descending scores,
+        # which the network gives back.
+        return SimpleNamespace(
+            options=options, points=points, drawn=drawn, batch=scores, counts=counts, seconds={},
+            scene=None,
+        )  # fmt: skip
 
-    def evaluate(self, prepared: DummyPrepared) -> Float32:
+    def evaluate(self, prepared: SimpleNamespace) -> Float32:
         """Wait as long as a network would take."""
         time.sleep(self._seconds)
         prepared.seconds["network"] = self._seconds
         return prepared.batch
 
-    def finish(self, prepared: DummyPrepared, logits: Float32) -> Detection:
+    def finish(self, prepared: SimpleNamespace, logits: Float32) -> Detection:
         """Put a grasp on each of the best approach points."""
         options, drawn = prepared.options, prepared.points[prepared.drawn]
         returned = (logits >= options.min_score) & (np.arange(len(drawn)) < GRASPS)

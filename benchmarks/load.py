@@ -65,7 +65,11 @@ def main() -> None:
         list(pool.map(time.sleep, [START_SECONDS] * PROCESSES))  # until all processes have started
         runs: dict[tuple[int, str], list[list[Sample]]] = {}
         for _, clients, name in itertools.product(range(given.rounds), given.clients, servers):
-            samples = send(pool, servers[name], clients, given.seconds, given.points)
+            processes = min(PROCESSES, clients)
+            start = time.monotonic() + START_SECONDS
+            what = servers[name], clients // processes, start, given.seconds, given.points
+            shares = [pool.submit(run_clients, *what, seed) for seed in range(processes)]
+            samples = [sample for share in shares for sample in share.result()]
             runs.setdefault((clients, name), []).append(samples)
     for (clients, name), found in runs.items():
         rates = [sum(one.code == OK for one in run) / given.seconds for run in found]
@@ -80,21 +84,8 @@ def main() -> None:
             "beyond_the_detector_ms": percentiles([one.beyond for one in answered]),
         }
         results["servers"].append(row)
-        print(results["servers"][-1], flush=True)
+        print(row, flush=True)
     write_results(given.output, "load", results)
-
-
-def send(
-    pool: ProcessPoolExecutor, address: str, clients: int, seconds: float, points: int
-) -> list[Sample]:
-    """Share the clients among the processes."""
-    processes = min(PROCESSES, clients)
-    start = time.monotonic() + START_SECONDS
-    shares = [
-        pool.submit(run_clients, address, clients // processes, start, seconds, points, seed)
-        for seed in range(processes)
-    ]
-    return [sample for share in shares for sample in share.result()]
 
 
 def run_clients(

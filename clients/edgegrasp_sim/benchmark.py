@@ -50,8 +50,6 @@ class BenchmarkConfig:
 
     def object_set(self) -> ObjectSet:
         """The objects to draw scenes from; FileNotFoundError if `objects` holds none for them."""
-        if self.objects is None:
-            return ObjectSet.builtin(self.scene)
         return ObjectSet.from_folder(self.objects, self.scene, self.split)
 
     def tasks(self) -> list[Task]:

@@ -12,8 +12,6 @@ from edgegrasp_sim.poses import Matrix
 CAMERA = Intrinsics()
 FARTHEST = 0.999  # of the camera's range, from which there is nothing
 TableView = Literal["known", "seen", "around", "auto"]
-_ALOFT = np.array([[0.0, 0.0, 0.015], [0.0, 0.0, 0.0]])  # metres the table is below the workspace
-_AROUND = np.array([[-0.06], [0.06]])  # metres; wrong depths move points that far out
 Float = TypeVar("Float", bound=np.floating)
 
 
@@ -102,13 +100,6 @@ def points_of(
     in_world = T_world_camera[:3, :3] @ in_camera + T_world_camera[:3, 3:]
     points: NDArray[np.float64] = in_world.T
     return points
-
-
-def seen_box(workspace: Matrix, table: TableView) -> Matrix | None:
-    """The box (2, 3) to crop a cloud to, lowest and highest corner; None keeps all of it."""
-    if table in ("around", "auto"):
-        return None
-    return workspace if table == "known" else np.asarray(workspace - _ALOFT + _AROUND)
 
 
 def crop(points: NDArray[Float], box: NDArray[np.floating], margin: float = 0.0) -> NDArray[Float]:

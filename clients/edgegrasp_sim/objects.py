@@ -118,13 +118,15 @@ class ObjectSet:
         return self.models[int(rng.integers(len(self.models)))]
 
     @classmethod
-    def from_folder(cls, root: Path, scene: SceneKind, split: str = "test") -> "ObjectSet":
+    def from_folder(cls, root: Path | None, scene: SceneKind, split: str = "test") -> "ObjectSet":
         """The objects of a folder, sorted by name; raises as `prepare_mesh`, or FileNotFoundError.
 
         URDF files in `<root>/<scene>/<split>` (VGN's layout), for bins, tables and shelves those of
         piles and packed scenes where they have no such folder, or in `root` itself; else meshes
-        there, `.obj` or `.stl`.
+        there, `.obj` or `.stl`. Without a `root`, those of `builtin`.
         """
+        if root is None:
+            return cls.builtin(scene)
         folder, name = root, root.name
         for kind in (scene.objects, scene):
             if (root / kind / split).is_dir():

@@ -18,7 +18,6 @@ from edgegrasp_sim.sensor import SENSORS, DepthNoise, DepthSensor, random_sensor
 from edgegrasp_sim.surroundings import OPEN_THICKNESS
 
 FOLDER = Path(__file__).parent / "protocols"
-RANDOM_SENSOR = "random"
 STRICT = ConfigDict(extra="forbid")
 Range = tuple[float, float]
 
@@ -72,7 +71,7 @@ class NoiseRules(DepthNoise):
 
     def depth_sensor(self, rng: np.random.Generator) -> DepthSensor | None:
         """The camera of the next view, if it is one with faults."""
-        return random_sensor(rng) if self.sensor == RANDOM_SENSOR else SENSORS.get(self.sensor)
+        return random_sensor(rng) if self.sensor == "random" else SENSORS.get(self.sensor)
 
 
 @dataclass(frozen=True, config=STRICT)

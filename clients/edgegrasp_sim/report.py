@@ -37,15 +37,10 @@ class Replay:
     def __init__(self, folder: ResultFolder, objects: Path | None = None) -> None:
         facts = folder.manifest()
         run = facts["run"]
-        self.scene = SceneKind(run["scene"])
-        self.protocol = protocol_from(run["protocol"])
         if objects is None and facts["objects_folder"] is not None:
             objects = Path(facts["objects_folder"])
-        models = (
-            ObjectSet.builtin(self.scene)
-            if objects is None
-            else ObjectSet.from_folder(objects, self.scene, facts["split"])
-        )
+        self.scene, self.protocol = SceneKind(run["scene"]), protocol_from(run["protocol"])
+        models = ObjectSet.from_folder(objects, self.scene, facts["split"])
         if models.digest != run["objects"]["digest"]:
             raise ValueError(
                 f"the objects in {objects} are not those of the benchmark in {folder.path}; "

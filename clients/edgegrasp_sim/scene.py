@@ -93,32 +93,16 @@ MakeObjects: TypeAlias = Callable[[Layout], list[SceneObject]]
 
 def make_packed(layout: Layout) -> list[SceneObject]:
     """Stand `PACKED_ATTEMPTS` objects or fewer upright, each where it touches no other."""
-    rng = layout.rng
-    placed: list[SceneObject] = []
-    for _ in range(PACKED_ATTEMPTS):
-        if len(placed) >= layout.num_objects:
-            break
-        model = layout.objects.sample(rng)
-        x, y = rng.uniform(*PACKED_RANGE, size=2)
-        upright = about_z(rng.uniform(0.0, 2.0 * np.pi))
-        placed = _place(layout, placed, model, (x, y), upright)
-    return placed
+    return _put_down(layout, PACKED_ATTEMPTS, lambda: layout.rng.uniform(*PACKED_RANGE, size=2))
 
 
 def make_table(layout: Layout) -> list[SceneObject]:
     """Put objects on a table or a shelf beside its fixed parts: most upright, some dropped."""
     rng, reach = layout.rng, np.array(layout.surroundings.reach)
-    placed: list[SceneObject] = []
-    for _ in range(CROWD_ATTEMPTS * layout.num_objects):
-        if len(placed) >= layout.num_objects:
-            break
-        model = layout.objects.sample(rng)
-        x, y = MIDDLE + rng.uniform(-reach, reach, size=2)
-        lying = rng.random() < LYING_SHARE
-        upright = None if lying else about_z(rng.uniform(0.0, 2.0 * np.pi))
-        turn = upright or Rotation.random(rng=rng).as_quat().tolist()
-        placed = _place(layout, placed, model, (x, y), turn)
-    return placed
+    attempts = CROWD_ATTEMPTS * layout.num_objects
+    return _put_down(
+        layout, attempts, lambda: MIDDLE + rng.uniform(-reach, reach, size=2), LYING_SHARE
+    )
 
 
 def make_bin(layout: Layout) -> list[SceneObject]:
@@ -215,27 +199,35 @@ def _drop(
     return dropped
 
 
-def _place(
+def _put_down(
     layout: Layout,
-    placed: list[SceneObject],
-    model: ObjectModel,
-    place: tuple[float, float],
-    quaternion_xyzw: Sequence[float],
+    attempts: int,  # objects drawn at most
+    draw_place: Callable[[], Matrix],  # gives x and y, metres
+    lying_share: float = 0.0,  # of the objects, which are turned any way
 ) -> list[SceneObject]:
-    """Put an object down if it touches nothing there; returns all placed objects."""
-    world, scale = layout.world, float(layout.rng.uniform(*layout.scales))
-    state = world.save_state()
-    new = load_object(world, model, (*place, 1.0), quaternion_xyzw, scale)
-    x, y, z = new.body.position
-    lowest = new.body.bounds[0, 2]
-    new.body.set_pose((x, y, z - lowest + TABLE_HEIGHT + CLEARANCE), quaternion_xyzw)
-    world.step()
-    if new.body.contacts():
-        new.body.remove()
-        world.restore_state(state)
-    else:
-        placed = settle(world, [*placed, new], layout.surroundings)
-    world.remove_state(state)
+    """Put objects down one by one, each where it touches nothing."""
+    world, rng = layout.world, layout.rng
+    placed: list[SceneObject] = []
+    for _ in range(attempts):
+        if len(placed) >= layout.num_objects:
+            break
+        model, (x, y) = layout.objects.sample(rng), draw_place()
+        lying = lying_share > 0.0 and rng.random() < lying_share
+        upright = None if lying else about_z(rng.uniform(0.0, 2.0 * np.pi))
+        turn = upright or Rotation.random(rng=rng).as_quat().tolist()
+        scale = float(rng.uniform(*layout.scales))
+        state = world.save_state()
+        new = load_object(world, model, (x, y, 1.0), turn, scale)
+        x, y, z = new.body.position
+        lowest = new.body.bounds[0, 2]
+        new.body.set_pose((x, y, z - lowest + TABLE_HEIGHT + CLEARANCE), turn)
+        world.step()
+        if new.body.contacts():
+            new.body.remove()
+            world.restore_state(state)
+        else:
+            placed = settle(world, [*placed, new], layout.surroundings)
+        world.remove_state(state)
     return placed
 
 

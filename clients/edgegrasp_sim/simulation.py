@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from edgegrasp_camera.picture import lit
 from edgegrasp_results import ArmTrajectory
 from edgegrasp_sim.arm import ArmGripper
-from edgegrasp_sim.camera import CAMERA, FARTHEST, Observation, TableView, crop, points_of, seen_box
+from edgegrasp_sim.camera import CAMERA, FARTHEST, Observation, TableView, crop, points_of
 from edgegrasp_sim.engine import ArmModel, make_world
 from edgegrasp_sim.engine.urdf import least_width
 from edgegrasp_sim.hand import MIN_OPENING, GraspResult, Gripper, hand_of, panda, run_grasp
@@ -41,6 +41,8 @@ PAINTS = np.array(
     ],
     dtype=np.float64,
 )  # of objects; none is yellow, as good grasps are
+_ALOFT = np.array([[0.0, 0.0, 0.015], [0.0, 0.0, 0.0]])  # metres the table is below the workspace
+_AROUND = np.array([[-0.06], [0.06]])  # metres; wrong depths move points that far out
 _CROP_MARGIN = 0.01  # metres; points further out cannot come back in by noise
 
 
@@ -189,7 +191,9 @@ class ClutterSimulation:
     ) -> Observation:
         """Look at the scene from each of the given poses, (4, 4) each."""
         workspace = np.asarray(self.surroundings.workspace)
-        box = seen_box(workspace, table)
+        box: Matrix | None = None  # to crop the cloud to
+        if table in ("known", "seen"):
+            box = workspace if table == "known" else workspace - _ALOFT + _AROUND
         clouds = []
         for T_world_camera in T_world_cameras:
             depth = self.world.render_depth(T_world_camera, CAMERA)

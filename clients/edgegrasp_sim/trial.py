@@ -138,7 +138,7 @@ class RoundDriver:
             grasp = self.plan(planner, self.look())
             if grasp is not None:
                 self.execute(grasp)
-        return self.result()
+        return replace(self._round, end=self.end)
 
     def look(self) -> Observation:
         """Take the next view."""
@@ -157,9 +157,12 @@ class RoundDriver:
     def plan(self, planner: Planner, observation: Observation) -> PlannedGrasp | None:
         """Ask the planner; None if it finds no grasp, or the view shows almost nothing."""
         seed = int(self._policy.integers(2**31))
+        # Something in front may hide all of the objects.
+        height = crop(observation.cloud, observation.workspace)[:, 2] - observation.table_height
+        shown = np.count_nonzero(height > 0.005) >= MIN_SEEN
         started = time.perf_counter()
         try:
-            grasp = planner(observation, seed) if _shows_objects(observation) else None
+            grasp = planner(observation, seed) if shown else None
         except StartCollides:
             grasp, started_in = None, self._round.start_collisions
             self._round = replace(self._round, start_collisions=started_in + 1)
@@ -193,10 +196,6 @@ class RoundDriver:
         self._update_end()
         return attempt
 
-    def result(self) -> Round:
-        """The round so far; complete once `end` is not None."""
-        return replace(self._round, end=self.end) if self.end is not None else self._round
-
     def _update_end(self) -> None:
         rules = self.protocol.round
         if self.simulation.num_objects == 0:
@@ -205,9 +204,3 @@ class RoundDriver:
             self.end = RoundEnd.FAILURES
         elif self._round.no_grasp >= rules.max_no_grasp:
             self.end = RoundEnd.NO_GRASP
-
-
-def _shows_objects(seen: Observation) -> bool:
-    """Whether enough is seen above the table; something in front may hide all of it."""
-    above = crop(seen.cloud, seen.workspace)[:, 2] > seen.table_height + 0.005
-    return int(np.count_nonzero(above)) >= MIN_SEEN

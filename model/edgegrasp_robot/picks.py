@@ -230,8 +230,14 @@ class _Arm:
             return pick
         ways = pick.line, back
         timed = [self._timed(free, path), *(self._timed(straight, way, True) for way in ways)]
-        if pick.put is not None:
-            timed += self._carried(pick.put, pick.grasp)
+        if (put := pick.put) is not None:
+            # From the end of the retreat over the place, down, and back with an empty hand.
+            T_base_hand = self._T_base_cloud @ pick.grasp.T_cloud_hand
+            with carrying(self._robot, put.around, put.load, T_base_hand) as scene:
+                over = self._free_path(scene, put.back[-1], put.down[0])
+                timed += [self._timed(scene, over), self._timed(scene, put.down, True)]
+                scene.removeGeometry(HELD)
+                timed.append(self._timed(scene, put.away, True))
         parts = [part for part in timed if part is not None]
         if len(parts) < len(timed):
             return pick
@@ -274,15 +280,6 @@ class _Arm:
                     put = _PutDown(back, down, away, around, load)
                     return replace(pick, plan=plan, put=put) if away else None
         return None
-
-    def _carried(self, put: _PutDown, grasp: Grasp) -> list[core.JointTrajectory | None]:
-        """From the end of the retreat over the place, down, and back with an empty hand."""
-        T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand
-        with carrying(self._robot, put.around, put.load, T_base_hand) as scene:
-            path = self._free_path(scene, put.back[-1], put.down[0])
-            parts = [self._timed(scene, path), self._timed(scene, put.down, True)]
-            scene.removeGeometry(HELD)
-            return [*parts, self._timed(scene, put.away, True)]
 
     def _retreat(self, pick: _Pick, held: Held | None = None) -> list[Float64]:
         """Joints along the retreat, on which the held points touch nothing; none: there is none."""

@@ -61,10 +61,13 @@ def touches(robot, joints, points, distance=0.0):
     return bool(_near_robot(robot, joints, points, distance).any())
 
 
-def test_every_box_gets_a_motion(robot):
+def test_every_box_gets_a_motion_unless_reach_is_asked_for(robot):
     detection = picks_of(robot)
     assert detection.counts["reachable"] == detection.counts["with_trajectory"] == len(BOXES)
     assert detection.warnings == []
+    detection = picks_of(robot, plan="reach")
+    assert [plan.trajectory for _, plan in plans_of(detection)] == [None] * len(BOXES)
+    assert "with_trajectory" not in detection.counts
 
 
 @settings(
@@ -201,13 +204,6 @@ def with_points(scene, points, number):
         points_in_cloud=np.concatenate([scene.points_in_cloud, points.astype(np.float32)]),
         object_of_point=np.append(scene.object_of_point, np.full(len(points), number)),
     )
-
-
-def test_reach_has_joints_and_no_motion(fr3):
-    detection = picks_of(fr3, plan="reach")
-    assert all(plan.trajectory is None for _, plan in plans_of(detection))
-    assert "with_trajectory" not in detection.counts
-    assert len(plans_of(detection)) == len(BOXES)
 
 
 def test_no_time_gives_no_motion_and_says_so(fr3):

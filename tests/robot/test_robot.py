@@ -1,5 +1,3 @@
-import shutil
-
 import numpy as np
 import pytest
 
@@ -9,17 +7,12 @@ from edgegrasp_robot import load_robot, load_robots, robot_names
 from edgegrasp_robot.robot import ROBOT_FOLDER, InvalidRobot
 
 
-def test_the_hand_of_the_fr3_is_where_franka_has_it():
-    robot = load_robot("fr3")
-    upright = robot.hand_pose([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4])
+def test_the_hands_are_where_the_makers_have_them():
+    upright = load_robot("fr3").hand_pose([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4])
     # 0.333 + 0.316 up, 0.0825 ahead, then 0.0825 up, 0.384 ahead, 0.088 ahead, 0.107 down.
     np.testing.assert_allclose(upright[:3, 3], (0.5545, 0.0, 0.6245), atol=1e-4)
     np.testing.assert_allclose(upright[:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-4)
-
-
-def test_the_hand_of_the_ur5_is_a_coupling_away_from_its_flange():
-    robot = load_robot("ur5")
-    straight = robot.hand_pose(np.zeros(6))
+    straight = load_robot("ur5").hand_pose(np.zeros(6))
     # DH parameters of UR: a2 + a3 ahead; d4 + d6 and the coupling aside; d1 - d5 up.
     expected = (0.425 + 0.39225, 0.10915 + 0.0823 + 0.0108, 0.089159 - 0.09465)
     np.testing.assert_allclose(straight[:3, 3], expected, atol=1e-4)
@@ -59,9 +52,13 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
-def test_a_file_that_is_wrong_says_how(tmp_path, case):
-    lines, word = BAD[case]
+def test_an_unknown_name_says_those_that_ship():
+    with pytest.raises(InvalidRobot, match="fr3"):
+        load_robot("r2d2")
+
+
+@pytest.mark.parametrize(("lines", "word"), BAD.values(), ids=BAD)
+def test_a_file_that_is_wrong_says_how(tmp_path, lines, word):
     with pytest.raises(InvalidRobot, match=r"mine\.toml") as error:
         load_robot(changed(tmp_path, **lines))
     assert word in str(error.value)
@@ -81,9 +78,3 @@ def test_a_missing_mesh_is_named(tmp_path):
     }  # fmt: skip
     with pytest.raises(InvalidRobot, match=r"mesh of tip: there is no 'package://lost/tip\.stl'"):
         load_robot(changed(tmp_path, **lines))
-    shutil.rmtree(tmp_path)
-
-
-def test_an_unknown_name_says_those_that_ship():
-    with pytest.raises(InvalidRobot, match="fr3"):
-        load_robot("r2d2")

@@ -56,16 +56,16 @@ def robot():
     return load_robots(SETTINGS.robots)["fr3"]
 
 
-def ask(robot, transport, settings=SETTINGS, remaining=60.0, **changes):
+def ask(robot, transport, settings=SETTINGS, **changes):
     """The answer to a request about the robot, and the catalogue that it went to."""
     catalogue = Catalogue(robot)
     asked = {"name": "fr3", "T_base_cloud": TURNED, "joints": robot.home} | changes
     request = Request(catalogue.cloud, {"robot": asked})
     if transport == "grpc":
         body = b"".join(wire_of(request))
-        return answer(Job("DetectGrasps", "grpc", body, remaining), catalogue, settings), catalogue
+        return answer(Job("DetectGrasps", "grpc", body, 60.0), catalogue, settings), catalogue
     text = {"points": catalogue.cloud.tolist(), "options": dict(request.options)}
-    job = Job("DetectGrasps", "http", json.dumps(text).encode(), remaining, "application/json")
+    job = Job("DetectGrasps", "http", json.dumps(text).encode(), 60.0, "application/json")
     return answer(job, catalogue, settings), catalogue
 
 
@@ -107,12 +107,10 @@ def test_reach_alone_and_what_is_out_of_reach(robot, transport):
 
 @pytest.mark.parametrize("transport", ["grpc", "http"])
 def test_the_client_reads_where_an_object_is_put(robot, transport):
-    place = {
-        "T_base_object": np.array(
-            [[1, 0, 0, 0.4], [0, 1, 0, -0.35], [0, 0, 1, 0.1], [0, 0, 0, 1.0]]
-        )
-    }
-    plan = read(transport, ask(robot, transport, place=place)[0].body).best_pick.arm
+    pose = np.eye(4)
+    pose[:3, 3] = 0.4, -0.35, 0.1
+    given, _ = ask(robot, transport, place={"T_base_object": pose})
+    plan = read(transport, given.body).best_pick.arm
     np.testing.assert_allclose(robot.hand_pose(plan.place_joints), plan.T_base_place, atol=1e-6)
     assert plan.trajectory.grasp_row < plan.trajectory.release_row < len(plan.trajectory.times)
     region = {"min": (0.3, -0.5, 0.0), "max": (0.6, -0.3, 0.3)}

@@ -41,6 +41,10 @@ def test_builtin_objects_fit_between_the_fingers(world: World, scene: SceneKind)
 def test_folders_are_read_in_order_of_names(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"<scene>/<split>/<name>\.urdf"):
         ObjectSet.from_folder(tmp_path, SceneKind.PILE)
+    for name in ("cup.obj", "cup.stl"):
+        (tmp_path / name).touch()
+    with pytest.raises(ValueError, match="several meshes named cup"):
+        ObjectSet.from_folder(tmp_path, SceneKind.PILE)
     folder = tmp_path / "packed" / "train"
     folder.mkdir(parents=True)
     for name in ("b", "a", "c"):
@@ -110,13 +114,6 @@ def test_a_file_without_a_solid_is_refused(cache, tmp_path, content, message) ->
     pytest.importorskip("coacd", reason="the extra `meshes` is not installed")
     (tmp_path / "shape.obj").write_text(content)
     with pytest.raises(ValueError, match=rf"shape\.obj.*({message})"):
-        ObjectSet.from_folder(tmp_path, SceneKind.PILE)
-
-
-def test_two_meshes_of_one_name_are_refused(tmp_path: Path) -> None:
-    for name in ("cup.obj", "cup.stl"):
-        (tmp_path / name).touch()
-    with pytest.raises(ValueError, match="several meshes named cup"):
         ObjectSet.from_folder(tmp_path, SceneKind.PILE)
 
 

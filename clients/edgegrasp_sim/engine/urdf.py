@@ -95,20 +95,17 @@ def parse_obj(text: str) -> list[tuple[str, Surface]]:
     found = []
     for (name, start, lines), end in zip(parts, ends, strict=True):
         if lines:
-            used, rows = np.unique(_triangles(lines, end), return_inverse=True)
+            corners = [list(map(int, line.split())) for line in lines]
+            if any(len(row) != 3 for row in corners):
+                corners = [[row[0], *two] for row in corners for two in pairwise(row[1:])]
+            # Faces count points from 1, or back from the last.
+            triangles = np.array(corners)
+            triangles = np.where(triangles > 0, triangles - 1, end + triangles)
+            used, rows = np.unique(triangles, return_inverse=True)
             found.append((name, Surface(whole[used], rows.reshape(-1, 3))))
         elif name and start < end and not any(lines for _, _, lines in parts):
             found.append((name, Surface(whole[start:end], np.empty((0, 3), np.int64))))
     return found
-
-
-def _triangles(lines: list[str], known: int) -> NDArray[np.int64]:
-    """The triangles (F, 3) of lines of faces, which count points from 1, or back from the last."""
-    rows = [list(map(int, line.split())) for line in lines]
-    if any(len(row) != 3 for row in rows):
-        rows = [[r[0], *two] for r in rows for two in pairwise(r[1:])]
-    triangles = np.array(rows)
-    return np.where(triangles > 0, triangles - 1, known + triangles)
 
 
 @cache
@@ -148,24 +145,22 @@ def _parts(element: ElementTree.Element, urdf: Path) -> list[Surface]:
         size = _numbers(shape, "scale", "1 1 1")
     elif shape.tag == "box":
         signs = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3), axis=-1).reshape(-1, 3)
-        parts = _hulls(signs * _numbers(shape, "size"))
+        points = signs * _numbers(shape, "size")
     elif shape.tag == "cylinder":
         angle = 2 * np.pi / SIDES * np.arange(SIDES)
         ring = _numbers(shape, "radius") * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         half = 0.5 * float(_numbers(shape, "length")[0])
-        parts = _hulls(np.concatenate([np.insert(ring, 2, end, axis=1) for end in (-half, half)]))
+        points = np.concatenate([np.insert(ring, 2, end, axis=1) for end in (-half, half)])
     elif shape.tag == "sphere":
         z = np.linspace(-1.0, 1.0, BALL)
         angle = np.pi * (1 + 5**0.5) * np.arange(BALL)
         around = np.stack([np.cos(angle), np.sin(angle)]) * np.sqrt(1 - z * z)
-        parts = _hulls(_numbers(shape, "radius") * np.stack([*around, z], axis=1))
+        points = _numbers(shape, "radius") * np.stack([*around, z], axis=1)
     else:
         raise ValueError(f"its shape {shape.tag} is unknown; use box, cylinder, sphere or mesh")
+    if shape.tag != "mesh":
+        parts = [hull for hull in [convex_hull(points)] if hull is not None]
     return [Surface(turn.apply(size * p) + move, faces) for p, faces in parts]
-
-
-def _hulls(points: Matrix) -> list[Surface]:
-    return [hull for hull in [convex_hull(points)] if hull is not None]
 
 
 def _origin(element: ElementTree.Element) -> tuple[Matrix, Rotation]:

@@ -13,23 +13,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_sim.engine import (
-    GRAVITY,
-    OBJECT_FRICTION,
-    OBJECT_MASS,
-    SLIDE_MASS,
-    TIME_STEP,
-    Arm,
-    ArmModel,
-    Body,
-    Contact,
-    Hand,
-    HandModel,
-    Intrinsics,
-    Shake,
-    Vector,
-    World,
-)
+from edgegrasp_sim import engine
+from edgegrasp_sim.engine import Body, Contact, Hand, HandModel, Intrinsics, Vector, World
 from edgegrasp_sim.engine.urdf import read_urdf
 from edgegrasp_sim.poses import Matrix, about_z, quaternion_xyzw, translation
 
@@ -64,9 +49,9 @@ class MujocoWorld(World):
 
     name = "mujoco"
     constants: ClassVar = {
-        "time_step": TIME_STEP,
+        "time_step": engine.TIME_STEP,
         "substeps": SUBSTEPS,
-        "gravity": GRAVITY,
+        "gravity": engine.GRAVITY,
         "collision_depth": COLLISION_DEPTH,
         "contact_seconds": CONTACT_SECONDS,
         "friction_impedance": FRICTION_IMPEDANCE,
@@ -77,20 +62,24 @@ class MujocoWorld(World):
         "finger_inertia": FINGER_INERTIA,
     }
     collision_depth = COLLISION_DEPTH
-    shake = Shake(0.01, 0.005)  # at 0.4 m/s: the hand follows, and turns sharply
+    shake = engine.Shake(0.01, 0.005)  # at 0.4 m/s: the hand follows, and turns sharply
 
     def __init__(self) -> None:
-        self._images = _Images()
+        self._drawn: Any = None  # the model that scene and context, made for its first image, show
+        self._scene: Any = None
+        self._context: Any = None
         self.reset()
 
     def close(self) -> None:
-        self._images.close()
+        if self._context is not None:
+            self._context.free()
+        self._drawn = self._scene = self._context = None
 
     def reset(self) -> None:
         self.spec = spec = mujoco.MjSpec()
         spec.compiler.usethread = 0  # for so few meshes, threads cost more than they save
-        spec.option.timestep = TIME_STEP / SUBSTEPS
-        spec.option.gravity = (0.0, 0.0, -GRAVITY)
+        spec.option.timestep = engine.TIME_STEP / SUBSTEPS
+        spec.option.gravity = (0.0, 0.0, -engine.GRAVITY)
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP  # what rests costs nothing
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -187,7 +176,7 @@ class MujocoWorld(World):
         body = self._add(np.asarray(position), quaternion_xyzw)
         body.add_freejoint()
         corners = np.concatenate([hull.points for hull in shape.hulls])
-        _weigh(body, OBJECT_MASS, corners)
+        _weigh(body, engine.OBJECT_MASS, corners)
         for number, surface in enumerate(shape.visible):
             name = f"{body.name} visible {number}"  # which the camera sees, and nothing touches
             self.spec.add_mesh(
@@ -199,7 +188,7 @@ class MujocoWorld(World):
             kind = mujoco.mjtGeom.mjGEOM_MESH
             body.add_geom(type=kind, meshname=name, contype=0, conaffinity=0, group=_VISIBLE)
         for number, hull in enumerate(shape.hulls):
-            friction = (OBJECT_FRICTION, 0, 0)
+            friction = (engine.OBJECT_FRICTION, 0, 0)
             self._add_hull(body, f"{body.name} {number}", hull.points, friction=friction)
         added = MujocoBody(self, body, corners)
         added.set_pose(position, quaternion_xyzw)
@@ -230,14 +219,29 @@ class MujocoWorld(World):
         joint = body.add_freejoint()
         joint.armature = ARM_INERTIA
         palm = self._build_hand(body, model)
-        self._drag(body, model.tool_force)
+        # Springs of limited force along all six axes pull it to the pose of a target.
+        target = self.spec.worldbody.add_body(name="-1 target", mocap=True)
+        target.add_site(name="target")
+        body.add_site(name="hand")
+        damping = 2.0 * (ARM_STIFFNESS * (ARM_INERTIA + body.mass)) ** 0.5
+        for axis in range(6):
+            spring = self.spec.add_actuator(
+                name=f"arm {axis}",
+                trntype=mujoco.mjtTrn.mjTRN_SITE,
+                target="hand",
+                refsite="target",
+                gear=np.eye(6)[axis],
+                forcelimited=True,
+                forcerange=(-model.tool_force, model.tool_force),
+            )
+            spring.set_to_position(ARM_STIFFNESS, damping)
         self._hand = MujocoHand(self, body, palm, model)
         self._hand.set_pose(position, (0.0, 0.0, 0.0, 1.0))
         return self._hand
 
-    def add_arm(self, arm: ArmModel, model: HandModel) -> "MujocoArm":
+    def add_arm(self, arm: engine.ArmModel, model: HandModel) -> "MujocoArm":
         self.substeps = ARM_SUBSTEPS
-        self.spec.option.timestep = TIME_STEP / ARM_SUBSTEPS
+        self.spec.option.timestep = engine.TIME_STEP / ARM_SUBSTEPS
         added = mujoco.MjSpec.from_string(arm.urdf.replace("</robot>", _URDF_AS_IT_IS))
         for body in added.bodies[1:]:
             body.gravcomp = 1.0
@@ -307,7 +311,40 @@ class MujocoWorld(World):
         return np.concatenate(palm)
 
     def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
-        return self._images.depth(self.model, self.data, T_world_camera, camera)
+        _gl_context(camera.width, camera.height)
+        model, data = self.model, self.data
+        if self._drawn is not model:
+            self.close()
+            self._drawn = model
+            self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 1)
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50.value)
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+            self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
+        scene, everything = self._scene, mujoco.mjtCatBit.mjCAT_ALL.value
+        option, free = mujoco.MjvOption(), mujoco.MjvCamera()
+        option.geomgroup[:] = np.arange(len(option.geomgroup)) == _VISIBLE
+        mujoco.mj_kinematics(model, data)
+        mujoco.mjv_updateScene(model, data, option, None, free, everything, scene)
+        scene.flags[:] = 0  # no lights, and both sides of every surface
+        scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 1
+        # OpenGL's camera samples pixel centres.
+        near, far, per_pixel = camera.near, camera.far, camera.near / camera.focal_length
+        centre_x, centre_y = camera.centre_x + 0.5, camera.centre_y - 0.5
+        for eye in scene.camera:
+            eye.pos, eye.forward = T_world_camera[:3, 3], T_world_camera[:3, 2]
+            eye.up = -T_world_camera[:3, 1]
+            eye.frustum_center = (0.5 * camera.width - centre_x) * per_pixel
+            eye.frustum_width = 0.5 * camera.width * per_pixel
+            eye.frustum_top = centre_y * per_pixel
+            eye.frustum_bottom = (centre_y - camera.height) * per_pixel
+            eye.frustum_near, eye.frustum_far = near, far
+            eye.orthographic = 0
+        image = np.empty((camera.height, camera.width), np.float32)
+        frame = mujoco.MjrRect(0, 0, camera.width, camera.height)
+        mujoco.mjr_render(frame, scene, self._context)
+        mujoco.mjr_readPixels(None, image, frame, self._context)
+        # Rows go up; depths from 1, near, to 0, far or nothing.
+        return near * far / (near + (far - near) * image[::-1].astype(np.float64))
 
     def _add(self, position: Matrix, quaternion_xyzw: Vector) -> Any:
         x, y, z, w = quaternion_xyzw
@@ -326,7 +363,7 @@ class MujocoWorld(World):
         """Add the carriage of swinging fingers, which slides along z."""
         slide = body.add_body(name=f"{body.name} slide", gravcomp=1.0)
         slide.explicitinertial = True
-        slide.mass, slide.inertia = SLIDE_MASS, [1e-5] * 3
+        slide.mass, slide.inertia = engine.SLIDE_MASS, [1e-5] * 3
         kind = mujoco.mjtJoint.mjJNT_SLIDE
         slide.add_joint(name=slide.name, type=kind, axis=(0.0, 0.0, 1.0), armature=FINGER_INERTIA)
         return slide
@@ -349,25 +386,6 @@ class MujocoWorld(World):
             solref=(CONTACT_SECONDS, 1.0),
             solimp=IMPEDANCE,
         )
-
-    def _drag(self, body: Any, force: float) -> None:
-        """Pull a body to the pose of a target, by springs of limited force along all six axes."""
-        target = self.spec.worldbody.add_body(name="-1 target", mocap=True)
-        target.add_site(name="target")
-        body.add_site(name="hand")
-        inertia = ARM_INERTIA + body.mass
-        damping = 2.0 * (ARM_STIFFNESS * inertia) ** 0.5
-        for axis in range(6):
-            spring = self.spec.add_actuator(
-                name=f"arm {axis}",
-                trntype=mujoco.mjtTrn.mjTRN_SITE,
-                target="hand",
-                refsite="target",
-                gear=np.eye(6)[axis],
-                forcelimited=True,
-                forcerange=(-force, force),
-            )
-            spring.set_to_position(ARM_STIFFNESS, damping)
 
     def remove(self, body: Any) -> None:
         """Remove a body and its meshes."""
@@ -475,7 +493,7 @@ class MujocoHand(MujocoBody, Hand):
         """Record what happened in the last substep."""
 
 
-class MujocoArm(MujocoHand, Arm):
+class MujocoArm(MujocoHand, engine.Arm):
     """A hand on an arm; its contacts are those of all substeps of the last time step."""
 
     substeps = ARM_SUBSTEPS
@@ -513,48 +531,6 @@ class MujocoArm(MujocoHand, Arm):
         self._found = ()
 
 
-class _Images:
-    """Renders depth images of a model; set up for the first image."""
-
-    def __init__(self) -> None:
-        self._model: Any = None
-        self._scene: Any = None
-        self._context: Any = None
-
-    def depth(
-        self, model: Any, data: Any, T_world_camera: Matrix, camera: Intrinsics
-    ) -> NDArray[np.float64]:
-        _gl_context(camera.width, camera.height)
-        if self._model is not model:
-            self.close()
-            self._model = model
-            self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 1)
-            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50.value)
-            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
-            self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
-        scene, everything = self._scene, mujoco.mjtCatBit.mjCAT_ALL.value
-        option, free = mujoco.MjvOption(), mujoco.MjvCamera()
-        option.geomgroup[:] = np.arange(len(option.geomgroup)) == _VISIBLE
-        mujoco.mj_kinematics(model, data)
-        mujoco.mjv_updateScene(model, data, option, None, free, everything, scene)
-        scene.flags[:] = 0  # no lights, and both sides of every surface
-        scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 1
-        for eye in scene.camera:
-            _look(eye, T_world_camera, camera)
-        image = np.empty((camera.height, camera.width), np.float32)
-        frame = mujoco.MjrRect(0, 0, camera.width, camera.height)
-        mujoco.mjr_render(frame, scene, self._context)
-        mujoco.mjr_readPixels(None, image, frame, self._context)
-        near, far = camera.near, camera.far
-        # Rows go up; depths from 1, near, to 0, far or nothing.
-        return near * far / (near + (far - near) * image[::-1].astype(np.float64))
-
-    def close(self) -> None:
-        if self._context is not None:
-            self._context.free()
-        self._model = self._scene = self._context = None
-
-
 @cache
 def _gl_context(width: int, height: int) -> Any:
     """The OpenGL context of this process, created once."""
@@ -569,21 +545,6 @@ def _gl_context(width: int, height: int) -> Any:
             "Debian and Ubuntu: apt-get install libegl1 libgl1"
         ) from error
     return context
-
-
-def _look(eye: Any, T_world_camera: Matrix, camera: Intrinsics) -> None:
-    """Place OpenGL's camera, which samples pixel centres, at the pinhole camera."""
-    per_pixel = camera.near / camera.focal_length
-    eye.pos = T_world_camera[:3, 3]
-    eye.forward = T_world_camera[:3, 2]
-    eye.up = -T_world_camera[:3, 1]
-    centre_x, centre_y = camera.centre_x + 0.5, camera.centre_y - 0.5
-    eye.frustum_center = (0.5 * camera.width - centre_x) * per_pixel
-    eye.frustum_width = 0.5 * camera.width * per_pixel
-    eye.frustum_top = centre_y * per_pixel
-    eye.frustum_bottom = (centre_y - camera.height) * per_pixel
-    eye.frustum_near, eye.frustum_far = camera.near, camera.far
-    eye.orthographic = 0
 
 
 def _weigh(body: Any, mass: float, corners: Matrix) -> None:

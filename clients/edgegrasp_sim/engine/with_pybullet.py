@@ -9,22 +9,8 @@ import pybullet
 import pybullet_data
 from numpy.typing import NDArray
 
-from edgegrasp_sim.engine import (
-    GRAVITY,
-    OBJECT_FRICTION,
-    OBJECT_MASS,
-    SLIDE_MASS,
-    TIME_STEP,
-    Body,
-    Contact,
-    Hand,
-    HandModel,
-    Intrinsics,
-    Parts,
-    Shake,
-    Vector,
-    World,
-)
+from edgegrasp_sim import engine
+from edgegrasp_sim.engine import Body, Contact, Hand, HandModel, Intrinsics, Parts, Vector, World
 from edgegrasp_sim.poses import Matrix, about_z
 
 SOLVER_ITERATIONS = 100
@@ -44,15 +30,15 @@ class PybulletWorld(World):
 
     name = "pybullet"
     constants: ClassVar = {
-        "time_step": TIME_STEP,
+        "time_step": engine.TIME_STEP,
         "solver_iterations": SOLVER_ITERATIONS,
-        "gravity": GRAVITY,
+        "gravity": engine.GRAVITY,
         "collision_depth": COLLISION_DEPTH,
         "finger_spinning_friction": FINGER_SPINNING_FRICTION,
         "gear_force": GEAR_FORCE,
     }
     collision_depth = COLLISION_DEPTH
-    shake = Shake(0.05, 0.0125)  # at 1 m/s: the hand lags and comes half as far
+    shake = engine.Shake(0.05, 0.0125)  # at 1 m/s: the hand lags and comes half as far
 
     def __init__(self) -> None:
         self.client = _Client()
@@ -68,12 +54,12 @@ class PybulletWorld(World):
     def reset(self) -> None:
         self.client.resetSimulation()
         self.client.setPhysicsEngineParameter(
-            fixedTimeStep=TIME_STEP,
+            fixedTimeStep=engine.TIME_STEP,
             numSolverIterations=SOLVER_ITERATIONS,
             # The order of contact pairs otherwise depends on what was loaded and moved before.
             deterministicOverlappingPairs=1,
         )
-        self.client.setGravity(0.0, 0.0, -GRAVITY)
+        self.client.setGravity(0.0, 0.0, -engine.GRAVITY)
         self._hand: PybulletHand | None = None
 
     def step(self, steps: int = 1) -> None:
@@ -109,7 +95,7 @@ class PybulletWorld(World):
             raise ValueError(f"PyBullet cannot read {path}: {error}") from error
         body = PybulletBody(self.client, uid)
         # A given mass also makes the engine compute the inertia from the collision shape.
-        body.change(-1, lateralFriction=OBJECT_FRICTION, mass=OBJECT_MASS)
+        body.change(-1, lateralFriction=engine.OBJECT_FRICTION, mass=engine.OBJECT_MASS)
         return body
 
     def add_box(
@@ -136,17 +122,25 @@ class PybulletWorld(World):
         """Depth, and the body at each pixel, -1 for none, unless the flags leave it out."""
         view = np.linalg.inv(T_world_camera)
         view[1:3] *= -1.0  # OpenGL's camera looks along -z with y up
+        near, far = camera.near, camera.far
+        projection = np.zeros((4, 4))
+        projection[0, 0] = 2.0 * camera.focal_length / camera.width
+        projection[1, 1] = 2.0 * camera.focal_length / camera.height
+        projection[0, 2] = 1.0 - 2.0 * camera.centre_x / camera.width
+        projection[1, 2] = 2.0 * camera.centre_y / camera.height - 1.0
+        projection[2, 2:] = -(far + near) / (far - near), -2.0 * far * near / (far - near)
+        projection[3, 2] = -1.0
         shape = camera.height, camera.width
         _, _, _, z_buffer, bodies = self.client.getCameraImage(
             camera.width,
             camera.height,
             viewMatrix=view.flatten(order="F").tolist(),
-            projectionMatrix=_projection(camera).flatten(order="F").tolist(),
+            projectionMatrix=projection.flatten(order="F").tolist(),
             renderer=pybullet.ER_TINY_RENDERER,
             flags=flags,
         )
         z = np.asarray(z_buffer, dtype=np.float64).reshape(shape)
-        depth = camera.far * camera.near / (camera.far - (camera.far - camera.near) * z)
+        depth = far * near / (far - (far - near) * z)
         return depth, np.resize(np.asarray(bodies, dtype=np.int64), shape)
 
 
@@ -221,7 +215,7 @@ class PybulletHand(PybulletBody, Hand):
             baseCollisionShapeIndex=palm,
             basePosition=position,
             baseInertialFramePosition=model.centre,
-            linkMasses=[SLIDE_MASS] * ahead + [model.finger_mass] * 2,
+            linkMasses=[engine.SLIDE_MASS] * ahead + [model.finger_mass] * 2,
             linkCollisionShapeIndices=[-1] * ahead + fingers,
             linkVisualShapeIndices=[-1] * links,
             linkPositions=[[0.0, 0.0, 0.0]] * ahead + [[0.0, 0.0, model.finger_base]] * 2,
@@ -295,7 +289,7 @@ class PybulletHand(PybulletBody, Hand):
         if self.model.advance is None:
             return
         finger = self.client.getJointState(self.uid, self._fingers[0])
-        half = finger[0] + TIME_STEP * finger[1]
+        half = finger[0] + engine.TIME_STEP * finger[1]
         self.client.setJointMotorControl2(
             self.uid,
             0,
@@ -332,15 +326,3 @@ def _boxes(client: _Client, parts: Parts) -> int:
         ],
     )
     return int(shape)
-
-
-def _projection(camera: Intrinsics) -> Matrix:
-    matrix = np.zeros((4, 4))
-    matrix[0, 0] = 2.0 * camera.focal_length / camera.width
-    matrix[1, 1] = 2.0 * camera.focal_length / camera.height
-    matrix[0, 2] = 1.0 - 2.0 * camera.centre_x / camera.width
-    matrix[1, 2] = 2.0 * camera.centre_y / camera.height - 1.0
-    matrix[2, 2] = -(camera.far + camera.near) / (camera.far - camera.near)
-    matrix[2, 3] = -2.0 * camera.far * camera.near / (camera.far - camera.near)
-    matrix[3, 2] = -1.0
-    return matrix
