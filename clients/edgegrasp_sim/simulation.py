@@ -70,11 +70,9 @@ class ClutterSimulation:
     ) -> None:
         self.gripper, self.arm, self.min_opening = gripper, arm, min_opening
         self.hand = panda() if gripper is None else hand_of(gripper)
-        self.object_sets = (
-            dict(objects)
-            if objects is not None
-            else {kind: ObjectSet.builtin(kind) for kind in SceneKind}
-        )
+        if objects is None:
+            objects = {kind: ObjectSet.builtin(kind) for kind in SceneKind}
+        self.object_sets = dict(objects)
         self.surroundings = OPEN_TABLE
         self.world = make_world(engine)
         self._objects: list[SceneObject] = []

@@ -276,7 +276,13 @@ class MujocoWorld(World):
         for number, part in enumerate(palm):
             name = f"{body.name} palm {number}"
             self._add_hull(body, name, part, friction=friction, contype=_HAND)
-        carrier = body if model.advance is None else self._add_slide(body)
+        carrier = body
+        if model.advance is not None:  # swinging fingers are on a carriage that slides along z
+            carrier = body.add_body(name=f"{body.name} slide", gravcomp=1.0)
+            carrier.explicitinertial = True
+            carrier.mass, carrier.inertia = engine.SLIDE_MASS, [1e-5] * 3
+            kind, along = mujoco.mjtJoint.mjJNT_SLIDE, (0.0, 0.0, 1.0)
+            carrier.add_joint(name=carrier.name, type=kind, axis=along, armature=FINGER_INERTIA)
         for side, parts in zip((1.0, -1.0), model.fingers, strict=True):
             base = np.array([0.0, 0.0, model.finger_base]) - model.centre
             name = f"{body.name} finger {side:+.0f}"
@@ -358,15 +364,6 @@ class MujocoWorld(World):
         self.spec.add_mesh(name=name, uservert=points.ravel())
         kind = mujoco.mjtGeom.mjGEOM_MESH
         body.add_geom(type=kind, meshname=name, group=_SOLID, **contact)
-
-    def _add_slide(self, body: Any) -> Any:
-        """Add the carriage of swinging fingers, which slides along z."""
-        slide = body.add_body(name=f"{body.name} slide", gravcomp=1.0)
-        slide.explicitinertial = True
-        slide.mass, slide.inertia = engine.SLIDE_MASS, [1e-5] * 3
-        kind = mujoco.mjtJoint.mjJNT_SLIDE
-        slide.add_joint(name=slide.name, type=kind, axis=(0.0, 0.0, 1.0), armature=FINGER_INERTIA)
-        return slide
 
     def _drive(self, joint: str, force: float | None = None) -> Any:
         """Add a drive of a joint; it exerts at most a force."""
