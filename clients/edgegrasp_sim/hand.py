@@ -291,12 +291,12 @@ def _holds_when_shaken(
     objects: Mapping[int, SceneObject],
 ) -> bool:
     """Shake the lifted hand; returns whether it still holds the object."""
-    shake = gripper.world.shake
+    world = gripper.world
     T_world_lifted = retreat_pose(T_world_hand)
     moves = [(T_world_lifted, LIFT_STEP)]
     for along in np.eye(3)[:2]:
-        for way in (shake.distance, -shake.distance, 0.0):
-            moves.append((T_world_lifted @ translation(*(way * along)), shake.step_length))
+        for way in (world.shake_distance, -world.shake_distance, 0.0):
+            moves.append((T_world_lifted @ translation(*(way * along)), world.shake_step))
     for T_world_next, step_length in moves:
         for _ in gripper.steps_to(T_world_next, step_length=step_length):
             pass

@@ -86,13 +86,6 @@ class Contact(NamedTuple):
     distance: float  # metres; negative where the two overlap
 
 
-class Shake(NamedTuple):
-    """How a hand is shaken while it holds an object: to either side and back, along x and y."""
-
-    distance: float  # metres to either side
-    step_length: float  # metres in each time step
-
-
 Parts: TypeAlias = tuple[Matrix, ...]  # convex ones, each by its points, (P, 3) metres
 
 
@@ -137,7 +130,9 @@ class World(Protocol):
     name: ClassVar[str]  # of the engine
     constants: ClassVar[dict[str, float]]  # for the record of a result
     collision_depth: ClassVar[float]  # metres; a finger sliding along an object overlaps it by less
-    shake: ClassVar[Shake]  # of a held object
+    # How a hand is shaken while it holds an object: to either side and back, along x and y.
+    shake_distance: ClassVar[float]  # metres to either side
+    shake_step: ClassVar[float]  # metres in each time step
 
     def __enter__(self) -> Self:
         return self

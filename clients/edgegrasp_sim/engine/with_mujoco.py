@@ -62,7 +62,7 @@ class MujocoWorld(World):
         "finger_inertia": FINGER_INERTIA,
     }
     collision_depth = COLLISION_DEPTH
-    shake = engine.Shake(0.01, 0.005)  # at 0.4 m/s: the hand follows, and turns sharply
+    shake_distance, shake_step = 0.01, 0.005  # at 0.4 m/s: the hand follows, and turns sharply
 
     def __init__(self) -> None:
         self._drawn: Any = None  # the model that scene and context, made for its first image, show

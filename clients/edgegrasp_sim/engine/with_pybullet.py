@@ -38,7 +38,7 @@ class PybulletWorld(World):
         "gear_force": GEAR_FORCE,
     }
     collision_depth = COLLISION_DEPTH
-    shake = engine.Shake(0.05, 0.0125)  # at 1 m/s: the hand lags and comes half as far
+    shake_distance, shake_step = 0.05, 0.0125  # at 1 m/s: the hand lags and comes half as far
 
     def __init__(self) -> None:
         self.client = _Client()
