@@ -233,7 +233,7 @@ class ClutterSimulation:
             ahead = sight[np.searchsorted(row, part)]
             for reach in (2.0, 30.0):  # then everything behind the surface
                 hits = self.world.first_hits(points[part] - reach * ahead, points[part] + ahead)
-                found = np.array([numbers.get(uid, -1) for uid in hits])
+                found = np.array([numbers.get(uid, -1) for uid in hits], dtype=np.int64)
                 painted[part[found >= 0]] = PAINTS[found[found >= 0] % len(PAINTS)]
                 part, ahead = part[found < 0], ahead[found < 0]
         light = lit(np.where(seen, depth, np.nan), CAMERA.focal_length, CAMERA.focal_length)

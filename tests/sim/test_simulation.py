@@ -55,6 +55,14 @@ def test_a_grasp_that_holds_nothing_says_so_and_moves_nothing(simulation) -> Non
     assert simulation.placements == before
 
 
+def test_an_object_in_the_air_has_another_colour_than_what_is_around_it(simulation) -> None:
+    simulation.reset_from_poses([cube_at(0.15, 0.15, 0.2)])
+    image = simulation.color_image(FRONT).astype(int)
+    assert image.shape == (480, 640, 3)
+    red = image[..., 0] > 1.8 * image[..., 1]
+    assert 1000 < red.sum() < 20_000
+
+
 @pytest.mark.parametrize("name", gripper_names())
 def test_every_gripper_lifts_a_cube_between_its_pads(engine: str, name: str) -> None:
     gripper = load_gripper(name)
