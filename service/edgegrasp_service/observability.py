@@ -61,10 +61,6 @@ class Call:
         """The client whose share of the server it uses: its token's name or its network."""
         return self.token or network_of(self.peer)
 
-    def limit(self, timeout: float) -> None:
-        """Set the deadline to at most `timeout` seconds after the start."""
-        self.deadline = min(self.deadline, self.start + timeout)
-
     def end_stage(self, name: str) -> None:
         """Record the end of a stage, which began when the previous one ended."""
         self.stages[name] = time.monotonic() - self.start - sum(self.stages.values())

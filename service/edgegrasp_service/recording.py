@@ -52,7 +52,7 @@ class Recorder:
 
     def record(self, job: Job, answer: Answer) -> None:
         """Queue one request and its answer for writing."""
-        size = job.size + len(answer.body)
+        size = len(job.body) + len(answer.body)
         if not self._hold(size):
             logger.warning("%s is not recorded: the disk is too slow", job.request_id)
             return

@@ -192,8 +192,6 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
         call = Call("grpc", method, headers.get(REQUEST_ID_HEADER, ""), address)
         call.long = method in ("DetectGraspsStream", "HealthWatch", "Reflection")
         with self._service.observe(call):
-            if (remaining := context.time_remaining()) is not None:
-                call.limit(remaining)
             name = ((REQUEST_ID_HEADER, call.request_id),)
             try:
                 context.set_trailing_metadata(name)
@@ -216,8 +214,9 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
                 await _abort(call, context, report(error))
 
     async def _answer(self, method: Method, call: Call, context: Any) -> None:
-        service = self._service
-        async with service.admit(call, service.settings.max_body_bytes) as ticket:
+        service, remaining = self._service, context.time_remaining()
+        timeout = math.inf if remaining is None else remaining
+        async with service.admit(call, service.settings.max_body_bytes, timeout) as ticket:
             body = await receive(service.settings, context.read())
             if body is EOF:
                 raise InvalidRequest("request", "nothing", "Send one message.")
@@ -420,8 +419,7 @@ async def _answer(service: GraspService, stream: Call, request: dict[str, Any]) 
     detection = b""
     try:
         with service.observe(call):
-            call.limit(_timeout(request))
-            async with service.admit(call, len(body)) as ticket:
+            async with service.admit(call, len(body), _timeout(request)) as ticket:
                 answer = await service.answer(call, ticket, Job("DetectGrasps", "grpc", body))
                 detection = answer.body
     except Exception as error:

@@ -9,6 +9,7 @@ import mimetypes
 import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, nullcontext, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import fastapi_offline
@@ -103,17 +104,9 @@ class HttpMiddleware:
         page = path.startswith((f"{ASSETS}/", PLAYGROUND))
         method = METHODS.get(path, "Docs" if page else "other")
         peer = scope["client"][0] if scope["client"] else ""
-        body_complete = (
-            headers.get("content-length", "0") == "0" and "transfer-encoding" not in headers
-        )
+        has_body = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
         call = Call("http", method, headers.get(REQUEST_ID_HEADER, ""), peer)
         with self._service.observe(call):
-
-            async def receive_and_note() -> Message:
-                nonlocal body_complete
-                message = await receive()
-                body_complete = body_complete or not message.get("more_body", False)
-                return message
 
             async def send_with_headers(message: Message) -> None:
                 if message["type"] == "http.response.start":
@@ -124,7 +117,8 @@ class HttpMiddleware:
                         (b"x-content-type-options", b"nosniff"),
                     ]
                     # An answered request whose body is still arriving is not waited for.
-                    if not body_complete or self._service.stopping.is_set():
+                    arriving = has_body and "read" not in call.stages
+                    if arriving or self._service.stopping.is_set():
                         extra.append((b"connection", b"close"))
                     message = {**message, "headers": [*message.get("headers", []), *extra]}
                 await send(message)
@@ -136,14 +130,15 @@ class HttpMiddleware:
             try:
                 self._check(scope, call, headers)
                 async with self._page(call.client) if method == "Docs" else nullcontext():
-                    await self._app(scope, receive_and_note, send_with_headers)
+                    await self._app(scope, receive, send_with_headers)
             except Exception as error:
                 if not isinstance(error, EdgeGraspError | HTTPException):
                     logger.exception("%s failed", method)
                 if call.code:  # half an answer is sent: the client must see that it is incomplete
                     call.problem, call.code = report(error), ""
                     scope["state"]["abort"]()
-                    await _disconnected(receive)
+                    while (await receive())["type"] != "http.disconnect":
+                        pass
                 else:
                     await _error_response(call, scope, error)(scope, receive, send_with_headers)
 
@@ -163,9 +158,10 @@ class HttpMiddleware:
         if count > MAX_HEADERS or size > most:
             fix = f"Send at most {MAX_HEADERS}, of {most} bytes."
             raise HeadersTooLarge("headers", f"{count} entries of {size} bytes", fix)
-        if call.method not in ("Live", "Ready") and not self._serves(headers.get("host", "")):
+        host = headers.get("host", "")
+        if call.method not in ("Live", "Ready") and not self._serves(host):
             fix = "Use an address of the server, or name it in the setting allowed_hosts."
-            raise InvalidRequest("Host", brief(headers.get("host", "")), fix)
+            raise InvalidRequest("Host", brief(host), fix)
         if call.method not in PUBLIC:
             self._service.authorize(call, headers.get("authorization"))
         if (encoding := headers.get("content-encoding", "identity").lower()) != "identity":
@@ -237,45 +233,64 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
         routes.append(Route(f"{PLAYGROUND}grippers.json", grippers, methods=["GET"]))
         if settings.samples is not None:
             routes.append(Mount(f"{PLAYGROUND}samples", StaticFiles(directory=settings.samples)))
-        routes.append(Route(PLAYGROUND, _File(PLAYGROUND_FILES / "index.html"), methods=["GET"]))
+        routes.append(_file(PLAYGROUND, PLAYGROUND_FILES / "index.html"))
         routes += _files(PLAYGROUND, PLAYGROUND_FILES)
     return Router(routes, redirect_slashes=False)
 
 
-class _File:
-    """A route to a file, read once at the start: reading in threads would delay other requests."""
-
-    def __init__(self, file: Path) -> None:
-        kind, _ = mimetypes.guess_type(file.name)
-        self._response = Response(file.read_bytes(), media_type=kind)
+class _SlowResponse(Response):
+    """A response that is sent as the client takes it."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the file."""
-        await _send_slowly(self._response, send)
+        """Send it; returns once the client has taken most of it."""
+        start = {"type": "http.response.start", "status": self.status_code}
+        await send({**start, "headers": self.raw_headers})
+        for place in range(0, len(self.body), PIECE):
+            piece = self.body[place : place + PIECE]
+            await send({"type": "http.response.body", "body": piece, "more_body": True})
+        await send({"type": "http.response.body"})
 
 
-def _files(path: str, folder: Path) -> list[BaseRoute]:
+def _file(path: str, file: Path) -> Route:
+    """A route to a file, read once at the start: reading in threads would delay other requests."""
+    kind, _ = mimetypes.guess_type(file.name)
+    return Route(path, _SlowResponse(file.read_bytes(), media_type=kind), methods=["GET"])
+
+
+def _files(path: str, folder: Path) -> list[Route]:
     """Routes to all files of a folder."""
-    files = {one.relative_to(folder).as_posix(): one for one in folder.rglob("*") if one.is_file()}
-    return [Route(f"{path}{name}", _File(one), methods=["GET"]) for name, one in files.items()]
+    files = (one for one in folder.rglob("*") if one.is_file())
+    return [_file(f"{path}{one.relative_to(folder).as_posix()}", one) for one in files]
 
 
+@dataclass
 class _Work:
     """A route to the workers: reads a body once there is room, and sends their answer."""
 
-    def __init__(self, service: GraspService, method: Method) -> None:
-        self._service = service
-        self._method = method
+    service: GraspService
+    method: Method
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request; raises the errors of `GraspService`."""
-        service, call, headers = self._service, scope["call"], Headers(scope=scope)
-        call.limit(requested_timeout(headers))
+        service, call, headers = self.service, scope["call"], Headers(scope=scope)
+        timeout = requested_timeout(headers)
         size = int(headers.get("content-length", service.settings.max_body_bytes))
-        async with service.admit(call, size) as ticket:
-            job = await self._read_job(scope, headers, receive)
+        async with service.admit(call, size, timeout) as ticket:
+            body, more = bytearray(), True
+            start = asyncio.get_running_loop().time()
+            while more:
+                reading = connections.receive(service.settings, receive(), len(body), start)
+                message = await reading
+                if message["type"] == "http.disconnect":
+                    raise Cancelled("The client left before its request was whole.")
+                body += message.get("body", b"")
+                service.check_size(len(body))
+                more = message.get("more_body", False)
+            content_type = headers.get("content-type", "")
+            query = scope["query_string"].decode("latin-1")
+            job = Job(self.method, "http", body, content_type=content_type, query=query)
             answering = asyncio.create_task(service.answer(call, ticket, job))
-            leaving = asyncio.create_task(_disconnected(receive))
+            leaving = asyncio.ensure_future(receive())  # after a whole body: that the client left
             try:
                 await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
                 if not answering.done():
@@ -284,47 +299,11 @@ class _Work:
             finally:
                 leaving.cancel()
                 answering.cancel()
-            response = Response(answer.body, media_type="application/json")
+            response: Response = _SlowResponse(answer.body, media_type="application/json")
             if answer.error is not None:
                 response = _problem_response(call, answer.error)
-            sending = _send_slowly(response, send)
+            sending = response(scope, receive, send)
             await connections.send(service.settings, sending, call.bytes_out)
-
-    async def _read_job(self, scope: Scope, headers: Headers, receive: Receive) -> Job:
-        pieces: list[bytearray] = []
-        received, more = 0, True
-        start = asyncio.get_running_loop().time()
-        while more:
-            message = await connections.receive(self._service.settings, receive(), received, start)
-            if message["type"] == "http.disconnect":
-                raise Cancelled("The client left before its request was whole.")
-            part = message.get("body", b"")
-            if pieces and len(pieces[-1]) < PIECE:
-                pieces[-1] += part
-            else:
-                pieces.append(bytearray(part))
-            received += len(part)
-            self._service.check_size(received)
-            more = message.get("more_body", False)
-        query = scope["query_string"].decode("latin-1")
-        content_type = headers.get("content-type", "")
-        return Job(self._method, "http", b"", content_type=content_type, query=query, pieces=pieces)
-
-
-async def _send_slowly(response: Response, send: Send) -> None:
-    """Send a response as the client takes it; returns once it has taken most of it."""
-    start = {"type": "http.response.start", "status": response.status_code}
-    await send({**start, "headers": response.raw_headers})
-    for place in range(0, len(response.body), PIECE):
-        piece = response.body[place : place + PIECE]
-        await send({"type": "http.response.body", "body": piece, "more_body": True})
-    await send({"type": "http.response.body"})
-
-
-async def _disconnected(receive: Receive) -> None:
-    """Wait until the client has disconnected."""
-    while (await receive())["type"] != "http.disconnect":
-        pass
 
 
 def requested_timeout(headers: Headers) -> float:

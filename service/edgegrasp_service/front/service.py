@@ -118,8 +118,10 @@ class GraspService:
             call.token, call.is_admin = known.name, known.is_admin
 
     @asynccontextmanager
-    async def admit(self, call: Call, size: int) -> AsyncIterator["Ticket"]:
+    async def admit(self, call: Call, size: int, timeout: float) -> AsyncIterator["Ticket"]:
         """Hold a slot and `size` bytes until the answer is sent or the deadline passes.
+
+        The deadline is `timeout` seconds after the call's start, or earlier by the settings.
 
         Raises:
             NotReady: Weights are not loaded yet, or the server is stopping.
@@ -129,7 +131,7 @@ class GraspService:
         """
         self.loaded()
         self.check_size(size)
-        call.limit(self.settings.max_request_seconds)
+        call.deadline = call.start + min(timeout, self.settings.max_request_seconds)
         async with self.admission.admit(call.client, call.deadline, size) as ticket:
             call.end_stage("admission")
             yield ticket
@@ -144,7 +146,7 @@ class GraspService:
             WorkerLost: The worker died for another reason.
         """
         call.end_stage("read")
-        call.bytes_in = job.size
+        call.bytes_in = len(job.body)
         self.check_size(call.bytes_in)
         self.admission.resize(ticket, call.bytes_in)
         ticket.body_arrived = True
@@ -258,8 +260,7 @@ def _digest(job: Job) -> bytes:
     """Digest of a request as a worker sees it; run it in a thread, as bodies may be large."""
     kind = f"{job.method}\n{job.transport}\n{job.content_type}\n{job.query}\n"
     digest = hashlib.sha256(kind.encode("utf-8", "surrogateescape"))
-    for part in job.parts:
-        digest.update(part)
+    digest.update(job.body)
     return digest.digest()
 
 

@@ -44,22 +44,11 @@ class Job:
 
     method: Method
     transport: Transport
-    body: bytes  # of HTTP, or the serialized request message
+    body: bytes | bytearray  # of HTTP, or the serialized request message
     remaining: float = 0.0  # seconds until its deadline at the time it was handed over
     content_type: str = ""  # HTTP: the header as sent
     query: str = ""  # HTTP: the query string, without the question mark
     request_id: str = ""  # for the worker's log
-    pieces: Sequence[bytearray] = ()  # the body where the front has it in pieces
-
-    @property
-    def parts(self) -> Sequence[bytes | bytearray]:
-        """The body, in one or more parts."""
-        return self.pieces or (self.body,)
-
-    @property
-    def size(self) -> int:
-        """Bytes of the body."""
-        return sum(map(len, self.parts))
 
 
 @dataclass
@@ -99,10 +88,10 @@ MESSAGES = {kind.__name__: kind for kind in (Ready, Job, Answer)}
 
 def pack(message: Any) -> Sequence[bytes | bytearray]:
     """Serialize one of MESSAGES: lengths, plain fields as JSON, and the body without a copy."""
-    fields = {name: one for name, one in vars(message).items() if name not in ("body", "pieces")}
+    fields = dict(vars(message))
+    body = fields.pop("body", b"")
     text = json.dumps([type(message).__name__, fields], default=vars).encode()
-    parts = message.parts if isinstance(message, Job) else (getattr(message, "body", b""),)
-    return HEADER.pack(len(text), sum(map(len, parts))) + text, *parts
+    return HEADER.pack(len(text), len(body)) + text, body
 
 
 def unpack(text: bytes, body: bytes) -> Any:
@@ -186,23 +175,19 @@ def _work(
     robots = [robot.describe() for robot in load_robots(settings).values()]
     with limited_memory(settings.max_worker_bytes):
         _send(pool, Ready(os.getpid(), catalogue.describe(), robots=robots))
-        _answer_jobs(pool, partial(answer, catalogue=catalogue, settings=settings))
-
-
-def _answer_jobs(pool: socket.socket, work: Callable[[Any], Answer]) -> None:
-    jobs = pool.makefile("rb")
-    while (job := receive(jobs)) is not None:
-        signal.setitimer(signal.ITIMER_REAL, max(job.remaining, 0.0) + ORPHAN_SECONDS)
-        try:
-            answer: Answer = work(job)
-        except BaseException:  # out of memory
-            facts = Facts(traceback=traceback.format_exc())
-            _send(pool, Answer(b"", facts, report(WorkerLost(LOST))))
-            return
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        _send(pool, answer)
-        del job, answer  # otherwise they would add to the next request's
-        gc.collect()
+        jobs = pool.makefile("rb")
+        while (job := receive(jobs)) is not None:
+            signal.setitimer(signal.ITIMER_REAL, max(job.remaining, 0.0) + ORPHAN_SECONDS)
+            try:
+                found = answer(job, catalogue, settings)
+            except BaseException:  # out of memory
+                facts = Facts(traceback=traceback.format_exc())
+                _send(pool, Answer(b"", facts, report(WorkerLost(LOST))))
+                return
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            _send(pool, found)
+            del job, found  # otherwise they would add to the next request's
+            gc.collect()
 
 
 @contextlib.contextmanager
