@@ -18,10 +18,6 @@ from edgegrasp_model.errors import (
 STOPPING = "The server is stopping. Try another one."  # the message of a NotReady
 
 
-class ServiceError(EdgeGraspError):
-    """Base of the service's own errors."""
-
-
 class Unauthenticated(InvalidRequest):
     """The token is missing or unknown; its value never appears in a message."""
 
@@ -34,15 +30,15 @@ class HeadersTooLarge(InvalidRequest):
     """HTTP headers or gRPC metadata exceed the server's limits."""
 
 
-class ReloadFailed(ServiceError):  # noqa: N818
+class ReloadFailed(EdgeGraspError):  # noqa: N818
     """New weights cannot be used; the old ones stay in use."""
 
 
-class NotReady(ServiceError):  # noqa: N818
+class NotReady(EdgeGraspError):  # noqa: N818
     """Weights are still loading, or the server is stopping."""
 
 
-class Overloaded(ServiceError):  # noqa: N818
+class Overloaded(EdgeGraspError):  # noqa: N818
     """The server is full."""
 
     def __init__(self, message: str, retry_after: float = 1.0) -> None:
@@ -54,18 +50,18 @@ class RequestTimeout(InvalidRequest):
     """A body arrives too slowly."""
 
 
-class DeadlineExceeded(ServiceError):  # noqa: N818
+class DeadlineExceeded(EdgeGraspError):  # noqa: N818
     """The caller's deadline passed before the answer was ready."""
 
     def __init__(self, message: str = "The deadline passed before there was an answer.") -> None:
         super().__init__(message)
 
 
-class Cancelled(ServiceError):  # noqa: N818
+class Cancelled(EdgeGraspError):  # noqa: N818
     """The caller disconnected; this error is never read."""
 
 
-class WorkerLost(ServiceError):  # noqa: N818
+class WorkerLost(EdgeGraspError):  # noqa: N818
     """The worker process of the request died or ran out of memory, and is being replaced."""
 
 
@@ -73,19 +69,19 @@ class HarmfulRequest(InvalidRequest):
     """A request that killed its worker process is refused for a while."""
 
 
-class DiskFull(ServiceError):  # noqa: N818
+class DiskFull(EdgeGraspError):  # noqa: N818
     """The data to store cannot be written."""
 
 
-class DetectorFailed(ServiceError):  # noqa: N818
+class DetectorFailed(EdgeGraspError):  # noqa: N818
     """The detector failed on a good request."""
 
 
-class InvalidSettings(ServiceError):  # noqa: N818
+class InvalidSettings(EdgeGraspError):  # noqa: N818
     """A setting is of the wrong type, out of range or unknown."""
 
 
-class AddressInUse(ServiceError):  # noqa: N818
+class AddressInUse(EdgeGraspError):  # noqa: N818
     """A port or socket cannot be bound."""
 
     def __init__(self, transport: str, place: str, why: str) -> None:

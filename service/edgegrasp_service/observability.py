@@ -224,7 +224,7 @@ class Metrics:
         self._results = counter("stream_results", "results sent on streams", ("code",))
         self.workers_replaced = counter("workers_replaced", "worker processes that died")
         self._model_info = self._gauge("model_info", "loaded weights", MODEL_LABELS)
-        self._reloads = counter("reloads", "weights loaded anew", ("outcome",))
+        self.reloads = counter("reloads", "weights loaded anew", ("outcome",))
 
     def count_call(self, call: Call) -> None:
         """Count a call that has ended; a request within a stream counts as a result."""
@@ -239,10 +239,6 @@ class Metrics:
         if call.problem is None and call.method.startswith("DetectGrasps") and call.facts.model:
             self._candidates.observe(call.facts.counts.get("candidates", 0))
             self._grasps.observe(call.facts.grasps)
-
-    def reloaded(self, succeeded: bool) -> None:
-        """Count a reload."""
-        self._reloads.labels("succeeded" if succeeded else "failed").inc()
 
     def watch(self, name: str, meaning: str, value: Callable[[], float]) -> None:
         """Add a gauge whose value is computed when metrics are read."""

@@ -3,7 +3,6 @@
 import hashlib
 import re
 import ssl
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,12 +32,14 @@ class Token:
 
 
 class Tokens:
-    """Checks the tokens of requests.
+    """The tokens in the files that the settings name; raises InvalidSettings for a bad file.
 
     Without ordinary tokens none is required; without admin tokens nobody may reload weights.
     """
 
-    def __init__(self, known: Iterable[Token] = ()) -> None:
+    def __init__(self, settings: Settings) -> None:
+        known = _read_tokens("token_file", settings.token_file)
+        known += _read_tokens("admin_token_file", settings.admin_token_file)
         # Looked up by digest, so that timing reveals nothing about a token.
         self._known = {token.digest: token for token in known}
         self.required = any(not token.is_admin for token in self._known.values())  # by requests
@@ -63,12 +64,6 @@ class Tokens:
         if admin and not found.is_admin:
             raise PermissionDenied(HEADER, "a token that is good for detection only", ADMIN_FIX)
         return found
-
-
-def load_tokens(settings: Settings) -> Tokens:
-    """The tokens in the files that the settings name; raises InvalidSettings for a bad file."""
-    tokens = _read_tokens("token_file", settings.token_file)
-    return Tokens(tokens + _read_tokens("admin_token_file", settings.admin_token_file))
 
 
 def _read_tokens(setting: str, path: Path | None) -> list[Token]:

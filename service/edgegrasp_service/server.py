@@ -29,9 +29,9 @@ from edgegrasp_service.front.connections import (
 from edgegrasp_service.front.grpc import GrpcServer
 from edgegrasp_service.front.http import HttpMiddleware, create_router
 from edgegrasp_service.front.service import GraspService, Observer
-from edgegrasp_service.observability import LogQueue, Metrics, log_call, start_logging, write_line
+from edgegrasp_service.observability import LogQueue, Metrics, start_logging, write_line
 from edgegrasp_service.recording import Recorder, check_outcomes
-from edgegrasp_service.security import ServerTls, load_tokens
+from edgegrasp_service.security import ServerTls, Tokens
 from edgegrasp_service.settings import UNIX, Settings
 from edgegrasp_service.worker.pool import Launched, WorkerPool
 from edgegrasp_service.worker.process import PIECE
@@ -64,9 +64,7 @@ class Server:
         self.metrics = Metrics(lambda: self.pool.models)
         self.pool = WorkerPool(settings, nursery, self.metrics.workers_replaced.inc, launched)
         self._recorder: Recorder | None = None
-        observers = (self.metrics.count_call, log_call, *observers)
-        reloaded = self.metrics.reloaded
-        self.service = GraspService(settings, self.pool, self._tls, observers, reloaded)
+        self.service = GraspService(settings, self.pool, self._tls, self.metrics, observers)
         if settings.record_folder is not None:
             hold = self.service.admission.hold
             self._recorder = Recorder(settings.record_folder, settings.record_bytes, hold)
@@ -79,7 +77,7 @@ class Server:
         watch("requests_in_flight", "requests not yet answered", lambda: service.in_flight)
         watch("requests_active", "requests that workers have", lambda: pool.busy)
         waiting = "requests let in that no worker has"
-        watch("queue_depth", waiting, lambda: max(0, admission.tickets - pool.busy))
+        watch("queue_depth", waiting, lambda: max(0, len(admission.tickets) - pool.busy))
         watch("held_bytes", "bytes of bodies in the server", lambda: admission.held_bytes)
         watch("workers", "worker processes", lambda: len(pool.pids))
         self.http_url = self.grpc_address = ""  # once ports are open: http://host:port, host:port
@@ -111,7 +109,7 @@ class Server:
             self.grpc_address = grpc_server.address
             await grpc_server.start()
             trimming = asyncio.create_task(
-                trim_grpc(grpc_server.port, settings.max_connections, http_connections.__len__)
+                trim_grpc(grpc_server.port, settings.max_connections, http_connections.taken)
             )
             http_task = asyncio.create_task(http_server.serve(sockets=[http_socket]))
             load_task = asyncio.create_task(self._load(grpc_server, ready))
@@ -250,7 +248,7 @@ def warn(settings: Settings) -> None:
         local = settings.host == "localhost" or settings.host.startswith(UNIX)
     if not local and settings.tls_certificate is None:
         logger.warning("%s: others can reach this server, and nothing is encrypted", settings.host)
-    if not local and not (load_tokens(settings).required or settings.tls_client_ca):
+    if not local and not (Tokens(settings).required or settings.tls_client_ca):
         logger.warning("%s: others can reach this server, and it asks nobody who", settings.host)
     for folder in settings.weights:
         if folder.is_dir() and not any(folder.glob("*.safetensors")):

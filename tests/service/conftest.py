@@ -179,7 +179,7 @@ class Running:
     @property
     def waiting(self) -> int:
         """Requests let in that no worker has."""
-        return self.server.service.admission.tickets - self.server.pool.busy
+        return len(self.server.service.admission.tickets) - self.server.pool.busy
 
     async def until(self, condition: Callable[[], bool]) -> None:
         """Return once something is so."""

@@ -15,7 +15,7 @@ from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client import AccessDeniedError, AsyncGraspClient, ServerUnavailableError, Tls
 from edgegrasp_service.errors import InvalidSettings, ReloadFailed
 from edgegrasp_service.probe import is_ready, read_settings
-from edgegrasp_service.security import ServerTls, load_tokens
+from edgegrasp_service.security import ServerTls, Tokens
 from edgegrasp_service.server import warn
 from edgegrasp_service.settings import Settings
 
@@ -155,15 +155,6 @@ async def test_no_tls_older_than_1_2_and_a_health_check(serve, server_tls, pem) 
     assert loaded.http.current.minimum_version == ssl.TLSVersion.TLSv1_2
 
 
-async def test_the_health_check_waits_for_weights(begin) -> None:
-    running, ready = await begin(lambda stages: stages.shut("load"))
-    port = int(running.server.http_url.rpartition(":")[2])
-    assert not await asyncio.to_thread(is_ready, http_port=port)
-    running.stages.open("load")
-    await ready.wait()
-    assert await asyncio.to_thread(is_ready, "0.0.0.0", str(port))
-
-
 async def test_the_health_check_reads_what_the_server_reads(
     serve, server_tls, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -215,6 +206,6 @@ def test_bad_files_are_named(tmp_path: Path, text: str | bytes | None, sentence:
     if text is not None:
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(InvalidSettings) as caught:
-        load_tokens(Settings(token_file=path))
+        Tokens(Settings(token_file=path))
     assert sentence in str(caught.value)
     assert "short" not in str(caught.value)

@@ -12,8 +12,8 @@ import os
 import socket
 import struct
 import time
-from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections import Counter, defaultdict
+from collections.abc import AsyncIterator, Awaitable, Callable, Sized
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -85,20 +85,17 @@ class Places:
 
     def __init__(self, most: int, grace: float = 0.0, spare: int = 0) -> None:
         self._most, self._grace, self._spare = most + spare, grace, spare
-        self._taken: dict[Place, None] = {}  # the latest used at the end
-
-    def __len__(self) -> int:
-        return len(self._taken)
+        self.taken: dict[Place, None] = {}  # the latest used at the end
 
     def take(self, owner: str, on_eviction: Callable[[], None]) -> Place:
         """Take a place until `release`, or until it is evicted. Raises Overloaded."""
-        if len(self._taken) >= self._most:
+        if len(self.taken) >= self._most:
             since = time.monotonic() - self._grace
-            counts = Counter(one.owner for one in self._taken)
+            counts = Counter(one.owner for one in self.taken)
             mine = counts[owner] + 1
             idle = [
                 place
-                for place in self._taken
+                for place in self.taken
                 if place.idle and (place.used <= since or counts[place.owner] > mine)
             ]
             if not idle:
@@ -108,22 +105,22 @@ class Places:
             self.release(evicted)
             evicted.on_eviction()
         place = Place(owner, on_eviction)
-        self._taken[place] = None
+        self.taken[place] = None
         return place
 
     def use(self, place: Place, idle: bool = True) -> None:
         """Mark a place as used now, and as idle or busy. Raises Overloaded."""
         if place.idle and not idle and self._spare:
-            busy = sum(not other.idle for other in self._taken)
+            busy = sum(not other.idle for other in self.taken)
             if busy >= self._most - self._spare:
                 raise Overloaded(f"{busy} connections have requests. Try again in 1 s.")
         place.idle, place.used = idle, time.monotonic()
-        if place in self._taken:
-            self._taken[place] = self._taken.pop(place)
+        if place in self.taken:
+            self.taken[place] = self.taken.pop(place)
 
     def release(self, place: Place) -> None:
         """Return a place."""
-        self._taken.pop(place, None)
+        self.taken.pop(place, None)
 
     @asynccontextmanager
     async def hold(self, owner: str) -> AsyncIterator[Place]:
@@ -199,7 +196,9 @@ class HttpProtocol(HttpToolsProtocol):
         """Take a place, and wait for the first headers."""
         super().connection_made(transport)
         transport.max_size = PIECE  # read in one turn of the event loop
-        self.transport = _LingeringTransport(transport, self._receiving)  # type: ignore[assignment]
+        self.transport = _LingeringTransport(  # type: ignore[assignment]
+            transport, lambda: self._in_headers or self.cycle is None or self.cycle.more_body
+        )
         self._await_headers()
         try:
             owner = network_of(self.client[0] if self.client else "")
@@ -300,10 +299,6 @@ class HttpProtocol(HttpToolsProtocol):
         self.transport.write(head.encode() + body)
         self.transport.close()
 
-    def _receiving(self) -> bool:
-        """Whether more of a request is to come."""
-        return self._in_headers or self.cycle is None or self.cycle.more_body
-
     def _await_headers(self) -> None:
         self._in_headers = True
         if self._header_timer is None:
@@ -316,40 +311,40 @@ class HttpProtocol(HttpToolsProtocol):
             self._refuse(RequestTimeout("headers", value, "Send them at once."))
 
 
+@dataclass
 class _LingeringTransport:
     """A transport whose `close` leaves the client a few seconds to read its answer.
 
     A socket that is closed while bytes arrive is reset, and the answer may be lost.
     """
 
-    def __init__(self, transport: asyncio.Transport, receiving: Callable[[], bool]) -> None:
-        self._transport = transport
-        self._receiving = receiving
-        self._closing = False
+    transport: asyncio.Transport
+    receiving: Callable[[], bool]  # whether more of a request is to come
+    closing: bool = False
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._transport, name)
+        return getattr(self.transport, name)
 
     def is_closing(self) -> bool:
         """Whether it is closed or closing."""
-        return self._closing or self._transport.is_closing()
+        return self.closing or self.transport.is_closing()
 
     def write(self, data: bytes) -> None:
         """Send, unless it is closing."""
-        if not self._closing:
-            self._transport.write(data)
+        if not self.closing:
+            self.transport.write(data)
 
     def close(self) -> None:
         """Send what is buffered, discard what is received, and close."""
         if self.is_closing():
             return
-        self._closing = True
-        if self._receiving() and self._transport.can_write_eof():
-            self._transport.write_eof()
-            self._transport.resume_reading()
+        self.closing = True
+        if self.receiving() and self.transport.can_write_eof():
+            self.transport.write_eof()
+            self.transport.resume_reading()
         else:
-            self._transport.close()
-        asyncio.get_running_loop().call_later(LINGER_SECONDS, self._transport.abort)
+            self.transport.close()
+        asyncio.get_running_loop().call_later(LINGER_SECONDS, self.transport.abort)
 
 
 # gRPC
@@ -381,45 +376,36 @@ def grpc_bounds(settings: Settings) -> list[tuple[str, int]]:
     ]
 
 
-async def trim_grpc(port: int, most: int, others: Callable[[], int]) -> None:
+async def trim_grpc(port: int, most: int, others: Sized) -> None:
     """Keep closing surplus connections to gRPC's port, which gRPC cannot limit by client.
 
     Args:
         port: Of gRPC.
         most: Connections that may stay.
-        others: How many connections there are to other ports, whose descriptors do not count.
+        others: Connections to other ports, whose descriptors do not count.
     """
     while True:
         await asyncio.sleep(TRIM_SECONDS)
-        if len([*DESCRIPTORS.iterdir()]) - others() > most:
-            with contextlib.ExitStack() as stack:
-                _trim(_accepted(port, stack), most)
+        if len([*DESCRIPTORS.iterdir()]) - len(others) > most:
+            with contextlib.ExitStack() as duplicates:
+                _trim(port, most, duplicates)
 
 
-def _trim(connections: list[socket.socket], most: int) -> None:
-    """Shut down the longest silent connections of the clients that have most."""
-    found: dict[str, list[tuple[int, socket.socket]]] = {}
-    for connection in connections:
-        with contextlib.suppress(OSError):
-            owner = network_of(connection.getpeername()[0])
-            info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, LAST_RECEIVED.size)
-            found.setdefault(owner, []).append((*LAST_RECEIVED.unpack(info), connection))
-    for rows in found.values():
-        rows.sort(key=lambda row: row[0])
-    for _ in range(sum(map(len, found.values())) - most):
-        _, connection = max(found.values(), key=len).pop()
-        with contextlib.suppress(OSError):
-            connection.shutdown(socket.SHUT_RDWR)
-
-
-def _accepted(port: int, stack: contextlib.ExitStack) -> list[socket.socket]:
-    """Duplicates of the accepted connections to a port, open until the stack closes."""
-    found = []
+def _trim(port: int, most: int, duplicates: contextlib.ExitStack) -> None:
+    """Shut down the longest silent connections to a port of the clients that have most."""
+    found: defaultdict[str, list[tuple[int, socket.socket]]] = defaultdict(list)
     for link in DESCRIPTORS.iterdir():
         with contextlib.suppress(OSError):
             if not link.is_socket():
                 continue
-            one = stack.enter_context(socket.socket(fileno=os.dup(int(link.name))))
-            if one.family != socket.AF_UNIX and one.getsockname()[1] == port and one.getpeername():
-                found.append(one)
-    return found
+            one = duplicates.enter_context(socket.socket(fileno=os.dup(int(link.name))))
+            if one.family != socket.AF_UNIX and one.getsockname()[1] == port:
+                owner = network_of(one.getpeername()[0])  # an OSError for the one that listens
+                info = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, LAST_RECEIVED.size)
+                found[owner].append((*LAST_RECEIVED.unpack(info), one))
+    for rows in found.values():
+        rows.sort(key=lambda row: row[0])
+    for _ in range(sum(map(len, found.values())) - most):
+        _, longest = max(found.values(), key=len).pop()
+        with contextlib.suppress(OSError):
+            longest.shutdown(socket.SHUT_RDWR)

@@ -173,7 +173,7 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
     async def check(self, messages: Any, context: Any) -> None:
         """Answer a health check, or refuse one of many silent ones at little cost."""
         peer = context.peer()
-        if self._checking[peer] and len(self._small_reads) >= SMALL_READS:
+        if self._checking[peer] and len(self._small_reads.taken) >= SMALL_READS:
             why = "This connection has a health check without a message."
             await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, why)
         self._checking[peer] += 1

@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import fastapi_offline
 from fastapi.encoders import jsonable_encoder
@@ -288,7 +289,8 @@ class _Work:
                 more = message.get("more_body", False)
             content_type = headers.get("content-type", "")
             query = scope["query_string"].decode("latin-1")
-            job = Job(self.method, "http", body, content_type=content_type, query=query)
+            whole = cast(bytes, body)  # not copied
+            job = Job(self.method, "http", whole, content_type=content_type, query=query)
             answering = asyncio.create_task(service.answer(call, ticket, job))
             leaving = asyncio.ensure_future(receive())  # after a whole body: that the client left
             try:

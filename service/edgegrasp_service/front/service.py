@@ -27,12 +27,11 @@ from edgegrasp_service.errors import (
     PayloadTooLarge,
     PermissionDenied,
     ReloadFailed,
-    ServiceError,
     WorkerLost,
     report,
 )
-from edgegrasp_service.observability import CALL, Call
-from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, load_tokens
+from edgegrasp_service.observability import CALL, Call, Metrics, log_call
+from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.pool import CRASH_FIX, CRASHED, WORKER_LOST, WorkerPool
 from edgegrasp_service.worker.process import Answer, Job
@@ -57,21 +56,21 @@ class GraspService:
         settings: Settings,
         pool: WorkerPool,
         tls: ServerTls | None,
-        observers: Sequence[Observer],
-        reloaded: Callable[[bool], None],  # told of every reload whether it succeeded
+        metrics: Metrics,
+        observers: Sequence[Observer],  # told of every call, as the metrics and the log are
     ) -> None:
         self.settings = settings
         self.pool = pool
-        self.tokens = load_tokens(settings)  # replaced on reload
+        self.tokens = Tokens(settings)  # replaced on reload
         self.stopping = asyncio.Event()  # when set, new requests are refused
         self.in_flight = 0  # number of calls in progress
         self.admission = Admission(pool.size, settings.max_queue_length, settings.max_held_bytes)
-        self._observers = observers
+        self._observers = (metrics.count_call, log_call, *observers)
         self.record: Recorder | None = None  # called with each job and its answer
         # Requests that killed workers, by digest: until when they are remembered, dead workers.
         self._deaths: dict[bytes, tuple[float, int]] = {}
         self._tls = tls
-        self._reloaded = reloaded
+        self._reloads = metrics.reloads
         self._reloading = asyncio.Lock()
         self._tasks: set[asyncio.Task[Any]] = set()
 
@@ -195,7 +194,8 @@ class GraspService:
         except TimeoutError:
             logger.warning("grace is over: requests in flight are abandoned")
             gone = "The server stopped before there was an answer. Try another one."
-            self.admission.refuse_all(NotReady(gone))
+            for ticket in self.admission.tickets:
+                ticket.refuse(NotReady(gone))
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(1.0):  # time for the errors to be sent
                     await self.admission.empty()
@@ -231,11 +231,11 @@ class GraspService:
             raise ReloadFailed("A reload is under way already. Try again later.")
         async with self._reloading:
             try:
-                tokens = load_tokens(self.settings)
+                tokens = Tokens(self.settings)
                 certificates = self._tls and self._tls.read()
                 await self.pool.start()
             except Exception as error:
-                self._reloaded(False)
+                self._reloads.labels("failed").inc()
                 known = isinstance(error, EdgeGraspError)
                 logger.error("reload failed: %s", error, exc_info=not known)
                 why = error if known else "The log says why."
@@ -243,7 +243,7 @@ class GraspService:
             self.tokens = tokens
             if self._tls and certificates:
                 self._tls.use(certificates)
-            self._reloaded(True)
+            self._reloads.labels("succeeded").inc()
             digests = {model["name"]: model["digest"] for model in self.pool.models}
             logger.info("reloaded", extra={"fields": {"digests": digests}})
             return self.pool.models
@@ -276,10 +276,9 @@ class Ticket:
     body_arrived: bool = False
     at_work: bool = False  # whether a worker has started it
     bytes: int = 0
-    released: bool = False
-    reason: ServiceError | None = None  # why it was refused
+    reason: EdgeGraspError | None = None  # why it was refused
 
-    def refuse(self, reason: ServiceError) -> None:
+    def refuse(self, reason: EdgeGraspError) -> None:
         """End the request with an error, at any stage."""
         self.reason = reason
         if not self.timeout.expired():
@@ -303,15 +302,10 @@ class Admission:
         self._workers = workers
         self._max_tickets = workers + max_waiting
         self._max_bytes = max_bytes
-        self._tickets: list[Ticket] = []  # in the order they came
+        self.tickets: list[Ticket] = []  # of the requests in the server, in the order they came
         self._client_bytes: Counter[str] = Counter()
         self._freed = asyncio.Event()  # set when a request frees bytes or its place
         self.service_seconds: deque[float] = deque(maxlen=LATEST)  # of workers' latest jobs
-
-    @property
-    def tickets(self) -> int:
-        """Requests in the server."""
-        return len(self._tickets)
 
     @asynccontextmanager
     async def admit(self, client: str, deadline: float, size: int) -> AsyncIterator[Ticket]:
@@ -328,18 +322,18 @@ class Admission:
         if remaining <= 0.0:
             raise DeadlineExceeded()
         wait = self._estimated_wait
-        if self._tickets and wait * MARGIN > remaining:
+        if self.tickets and wait * MARGIN > remaining:
             raise self._overloaded(
-                f"{len(self._tickets)} requests come first, which take about {wait:.3g} s, and "
+                f"{len(self.tickets)} requests come first, which take about {wait:.3g} s, and "
                 f"the deadline is {remaining:.3g} s away"
             )
-        if len(self._tickets) >= self._max_tickets:
-            counts = Counter(ticket.client for ticket in self._tickets)
+        if len(self.tickets) >= self._max_tickets:
+            counts = Counter(ticket.client for ticket in self.tickets)
             holder, count = counts.most_common(1)[0]
             if count <= counts[client] + 1 or not self._refuse_latest(holder):
-                raise self._overloaded(f"it holds {len(self._tickets)} requests")
+                raise self._overloaded(f"it holds {len(self.tickets)} requests")
         ticket = Ticket(client, asyncio.timeout_at(deadline))
-        self._tickets.append(ticket)
+        self.tickets.append(ticket)
         try:
             async with ticket.timeout:
                 await self._reserve(ticket, size)
@@ -353,9 +347,9 @@ class Admission:
 
     def _refuse_latest(self, holder: str) -> bool:
         """Refuse the latest request of a client that is not being worked on; false without one."""
-        for ticket in reversed(self._tickets):
+        for ticket in reversed(self.tickets):
             if ticket.client == holder and not ticket.at_work:
-                held = sum(one.client == holder for one in self._tickets)
+                held = sum(one.client == holder for one in self.tickets)
                 why = f"this client holds {held} of {self._max_tickets} places, and others wait"
                 ticket.refuse(self._overloaded(why))
                 self._release(ticket)
@@ -364,7 +358,7 @@ class Admission:
 
     def resize(self, ticket: Ticket, size: int) -> None:
         """Set the number of bytes that a request holds."""
-        if not ticket.released:
+        if ticket in self.tickets:
             self.held_bytes += size - ticket.bytes
             self._client_bytes[ticket.client] += size - ticket.bytes
             ticket.bytes = size
@@ -378,14 +372,9 @@ class Admission:
         self._freed.set()
         return True
 
-    def refuse_all(self, reason: ServiceError) -> None:
-        """End every request with an error."""
-        for ticket in self._tickets:
-            ticket.refuse(reason)
-
     async def empty(self) -> None:
         """Return once no request is in the server."""
-        while self._tickets:
+        while self.tickets:
             self._freed.clear()
             await self._freed.wait()
 
@@ -393,7 +382,7 @@ class Admission:
     def _estimated_wait(self) -> float:
         """Estimated seconds until a worker begins a new request."""
         pace = statistics.median(self.service_seconds) if self.service_seconds else 0.0
-        ahead = sum(ticket.body_arrived for ticket in self._tickets)  # others' bodies may be late
+        ahead = sum(ticket.body_arrived for ticket in self.tickets)  # others' bodies may be late
         return max(0, ahead + 1 - self._workers) * pace / self._workers
 
     def _overloaded(self, why: str) -> Overloaded:
@@ -407,7 +396,7 @@ class Admission:
             and self._client_bytes[ticket.client] + size > self._max_bytes // 2
         ):
             holder, most = max(self._client_bytes.items(), key=lambda row: row[1], default=("", 0))
-            several = sum(held.client == holder and held.bytes > 0 for held in self._tickets) > 1
+            several = sum(held.client == holder and held.bytes > 0 for held in self.tickets) > 1
             greedy = several and most > self._client_bytes[ticket.client] + size
             if not (greedy and self._refuse_latest(holder)):
                 self._freed.clear()
@@ -415,10 +404,7 @@ class Admission:
         self.resize(ticket, size)
 
     def _release(self, ticket: Ticket) -> None:
-        if ticket.released:
-            return
-        self.resize(ticket, 0)
-        ticket.released = True
-        self._tickets.remove(ticket)
-        if not self._client_bytes[ticket.client]:
-            del self._client_bytes[ticket.client]
+        if ticket in self.tickets:
+            self.resize(ticket, 0)
+            self.tickets.remove(ticket)
+            self._client_bytes += Counter()  # forgets those without any

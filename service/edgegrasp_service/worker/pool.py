@@ -109,9 +109,10 @@ class WorkerPool:
         """
         launched = self._launched or launch(self._settings, self._nursery_command)
         self._launched = None
-        nursery = await _Nursery.start(*launched)
+        nursery = _Nursery(*launched)
         workers = [_Worker(nursery) for _ in range(self.size)]
         try:
+            await nursery.loaded()
             await asyncio.gather(*(worker.start() for worker in workers))
         except BaseException:
             nursery.close()
@@ -237,22 +238,13 @@ class _Nursery:
         self._crashed: defaultdict[int, asyncio.Future[bool]]
         self._crashed = defaultdict(asyncio.get_running_loop().create_future)
 
-    @classmethod
-    async def start(cls, process: subprocess.Popen[bytes], control: socket.socket) -> "_Nursery":
+    async def loaded(self) -> None:
         """Wait until it has loaded; raises InvalidSettings on failure."""
-        nursery = cls(process, control)
-        try:
-            ready = await asyncio.to_thread(receive, control.makefile("rb"))
-            if ready is None or ready.failure:
-                raise InvalidSettings(
-                    ready.failure if ready else "the process that loads weights died"
-                )
-        except BaseException:
-            nursery.close()
-            raise
-        nursery.pid = ready.pid
-        control.setblocking(False)
-        return nursery
+        ready = await asyncio.to_thread(receive, self._control.makefile("rb"))
+        if ready is None or ready.failure:
+            raise InvalidSettings(ready.failure if ready else "the process that loads weights died")
+        self.pid = ready.pid
+        self._control.setblocking(False)
 
     def watch(self, lost: Callable[[], None]) -> None:
         """Call `lost` when the nursery dies."""

@@ -44,7 +44,7 @@ class Job:
 
     method: Method
     transport: Transport
-    body: bytes | bytearray  # of HTTP, or the serialized request message
+    body: bytes  # of HTTP, in the front a bytearray; or the serialized request message
     remaining: float = 0.0  # seconds until its deadline at the time it was handed over
     content_type: str = ""  # HTTP: the header as sent
     query: str = ""  # HTTP: the query string, without the question mark
