@@ -28,7 +28,7 @@ from edgegrasp_service.front.connections import (
 )
 from edgegrasp_service.front.grpc import GrpcServer
 from edgegrasp_service.front.http import HttpMiddleware, create_router
-from edgegrasp_service.front.service import GraspService, Observer
+from edgegrasp_service.front.service import GraspService
 from edgegrasp_service.observability import LogQueue, Metrics, start_logging, write_line
 from edgegrasp_service.recording import Recorder, check_outcomes
 from edgegrasp_service.security import ServerTls, Tokens
@@ -46,25 +46,19 @@ REPEAT_SECONDS = 10.0  # seconds between log lines about the same socket error
 class Server:
     """Both transports of one service. Must be created in the running event loop.
 
-    `observers` receive every call, like the metrics and the log.
-
     Raises:
         InvalidSettings: A certificate or a token cannot be used.
     """
 
     def __init__(
-        self,
-        settings: Settings,
-        observers: Sequence[Observer] = (),
-        nursery: Sequence[str] = (),
-        launched: Launched | None = None,
+        self, settings: Settings, nursery: Sequence[str] = (), launched: Launched | None = None
     ) -> None:
         self._settings = settings
         self._tls = ServerTls(settings) if settings.tls_certificate else None
         self.metrics = Metrics(lambda: self.pool.models)
         self.pool = WorkerPool(settings, nursery, self.metrics.workers_replaced.inc, launched)
         self._recorder: Recorder | None = None
-        self.service = GraspService(settings, self.pool, self._tls, self.metrics, observers)
+        self.service = GraspService(settings, self.pool, self._tls, self.metrics)
         if settings.record_folder is not None:
             hold = self.service.admission.hold
             self._recorder = Recorder(settings.record_folder, settings.record_bytes, hold)
@@ -128,7 +122,7 @@ class Server:
                 await asyncio.sleep(notice)
                 await self.service.drain(self._settings.grace_seconds - notice)
                 http_server.should_exit = True
-                await asyncio.gather(http_task, grpc_server.stop(CLOSE_SECONDS))
+                await asyncio.gather(http_task, grpc_server.server.stop(CLOSE_SECONDS))
                 stopped.cancel()
                 trimming.cancel()
                 self.pool.close()

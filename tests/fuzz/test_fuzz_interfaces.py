@@ -101,17 +101,8 @@ def tools(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return mcp.grasp_tools(Client(), folder)  # type: ignore[arg-type]
 
 
-NAMES = [
-    "cloud.npy",
-    "depth.npy",
-    "mask.npy",
-    "junk.npy",
-    "../x",
-    "/etc/passwd",
-    ".",
-    "\0",
-    "x" * 300,
-]
+FILES = [f"{name}.npy" for name in ("cloud", "depth", "mask", "junk")]
+NAMES = [*FILES, "../x", "/etc/passwd", ".", "\0", "x" * 300]
 ARGUMENTS = {
     "generate_grasps_from_point_cloud": {
         "point_cloud_file": "cloud.npy", "num_grasps": 3, "viewpoint": [0, 0, 1],

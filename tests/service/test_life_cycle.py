@@ -47,12 +47,15 @@ async def test_not_ready_until_loaded(begin, cloud) -> None:
     assert [(await watch.read()).status for watch in watches] == [Status.NOT_SERVING] * 2
     not_ready = (200, 503, 503, Status.NOT_SERVING, "UNAVAILABLE")
     assert await states(running, cloud) == not_ready
+    port = int(running.server.http_url.rpartition(":")[2])
+    assert not await asyncio.to_thread(is_ready, http_port=port)
     assert (await running.http().get("/v1/models")).json()["title"] == "Not ready"
     assert "edgegrasp_model_info{" not in running.metrics()
     running.stages.open("load")
     await ready.wait()
     assert [(await watch.read()).status for watch in watches] == [Status.SERVING] * 2
     assert await states(running, cloud) == (200, 200, 200, Status.SERVING, "OK")
+    assert await asyncio.to_thread(is_ready, "0.0.0.0", str(port))
     running.stop.set()
     assert [(await watch.read()).status for watch in watches] == [Status.NOT_SERVING] * 2
 

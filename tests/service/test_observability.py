@@ -14,8 +14,6 @@ import grpc
 import httpx
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
@@ -140,15 +138,6 @@ def test_lines_not_written_are_counted(name: str) -> None:
         writer.handle(logging.makeLogRecord({"msg": "%d", "args": ("no number",)}))
         writer.close()
     assert writer.dropped == 4
-
-
-@settings(max_examples=30, derandomize=True, deadline=None)
-@given(st.text(), st.text())
-def test_one_record_is_one_line(message: str, value: str) -> None:
-    record = logging.makeLogRecord({"msg": "%s", "args": (message,), "fields": {"value": value}})
-    line = JsonFormatter().format(record)
-    assert "\n" not in line
-    assert json.loads(line)["message"] == message
 
 
 DASHBOARD = Path(__file__).parents[2] / "docker" / "grafana" / "edgegrasp.json"

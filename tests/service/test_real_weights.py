@@ -34,11 +34,12 @@ def scene() -> dict[str, np.ndarray]:
     }
 
 
+def as_list(grasp: Any) -> list[Any]:
+    return [np.asarray(v, np.float32).tolist() for v in vars(grasp).values() if v is not None]
+
+
 def as_lists(detection: Any) -> list[list[Any]]:
-    return [
-        [np.asarray(v, np.float32).tolist() for v in vars(grasp).values() if v is not None]
-        for grasp in detection.grasps
-    ]
+    return [as_list(grasp) for grasp in detection.grasps]
 
 
 def test_many_options_give_the_same_grasps_everywhere(catalogue, scene, real_server, tmp_path):
@@ -79,15 +80,7 @@ def test_many_options_give_the_same_grasps_everywhere(catalogue, scene, real_ser
 
 
 def evaluated(scoring: Any) -> list[Any]:
-    return [
-        evaluation.reason
-        or [
-            None if value is None else np.asarray(value, np.float32).tolist()
-            for value in vars(evaluation.grasp).values()
-            if value is not None
-        ]
-        for evaluation in scoring.evaluations
-    ]
+    return [one.reason or as_list(one.grasp) for one in scoring.evaluations]
 
 
 def test_scores_are_the_same_everywhere(catalogue, scene, real_server) -> None:

@@ -127,12 +127,3 @@ def test_the_settings_in_effect_are_printed(monkeypatch: pytest.MonkeyPatch) -> 
     assert (printed["http_port"], printed["grpc_port"]) == (9, 7)
     assert printed["weights"] == ["/a", "/b"]
     assert set(printed) == set(Settings.model_fields)
-
-
-@pytest.mark.parametrize(
-    ("flag", "nearest"), [("--htp-port", "--http-port"), ("--tokens", "--token-file")]
-)
-def test_an_unknown_flag_suggests_the_nearest(flag: str, nearest: str) -> None:
-    done = serve(flag, "1")
-    assert done.exit_code != 0
-    assert nearest in done.output

@@ -187,8 +187,6 @@ class HttpProtocol(HttpToolsProtocol):
         self._write_timer: asyncio.TimerHandle | None = None
         self._header_timer: asyncio.TimerHandle | None = None
         self._header_bytes = 0
-        self._in_headers = True
-        self._pieces = self._body_bytes = 0
         self._refusal: EdgeGraspError | None = None  # why the parser is ended
         self._place = Place("", lambda: None)
 

@@ -91,14 +91,14 @@ class GrpcServer:
     def __init__(self, service: GraspService, credentials: grpc.ServerCredentials | None) -> None:
         settings = service.settings
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
-        self._server = aio.server(options=grpc_bounds(settings))
+        self.server = aio.server(options=grpc_bounds(settings))
         methods = _Methods(service, self._health)
-        self._server.add_generic_rpc_handlers((methods,))
+        self.server.add_generic_rpc_handlers((methods,))
         # It has a queue of its own: no other calls come before it.
         checking = grpc.stream_stream_rpc_method_handler(
             methods.check, response_serializer=_serialized
         )
-        self._server.add_registered_method_handlers(  # type: ignore[attr-defined]
+        self.server.add_registered_method_handlers(  # type: ignore[attr-defined]
             HEALTH, {"Check": checking}
         )
         sockets = settings.host.startswith(UNIX)
@@ -106,9 +106,9 @@ class GrpcServer:
         place = f"{settings.host}/grpc.sock" if sockets else f"{host}:{settings.grpc_port}"
         try:
             if credentials is None:
-                port = self._server.add_insecure_port(place)
+                port = self.server.add_insecure_port(place)
             else:
-                port = self._server.add_secure_port(place, credentials)
+                port = self.server.add_secure_port(place, credentials)
         except RuntimeError as error:
             raise AddressInUse("gRPC", place, str(error)) from None
         self.address = place if sockets else f"{host}:{port}"
@@ -117,17 +117,13 @@ class GrpcServer:
     async def start(self) -> None:
         """Open the port; health checks report NOT_SERVING."""
         await self.set_serving(False)
-        await self._server.start()
+        await self.server.start()
 
     async def set_serving(self, serving: bool) -> None:
         """Set the status that health checks report."""
         status = STATES.SERVING if serving else STATES.NOT_SERVING
         for name in ("", SERVICE.full_name):
             await self._health.set(name, status)
-
-    async def stop(self, grace_seconds: float) -> None:
-        """Refuse new requests and wait for those in flight."""
-        await self._server.stop(grace_seconds)
 
 
 class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in its stubs only

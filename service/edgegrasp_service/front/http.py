@@ -259,7 +259,6 @@ def _file(path: str, file: Path) -> Route:
 
 
 def _files(path: str, folder: Path) -> list[Route]:
-    """Routes to all files of a folder."""
     files = (one for one in folder.rglob("*") if one.is_file())
     return [_file(f"{path}{one.relative_to(folder).as_posix()}", one) for one in files]
 
@@ -320,7 +319,6 @@ def requested_timeout(headers: Headers) -> float:
 
 
 def _problem_response(call: Call, problem: Problem) -> Response:
-    """The answer for an error."""
     call.problem = problem
     headers = {}
     if problem.retry_after is not None:

@@ -11,7 +11,7 @@ import math
 import statistics
 import time
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -44,20 +44,12 @@ MOST_HARMFUL = 1000  # requests remembered
 LATEST = 15  # latest service times, whose median is the pace; one slow request does not change it
 MARGIN = 1.5  # the wait is estimated from a median, and half of the requests take longer
 
-Observer = Callable[[Call], None]
-Recorder = Callable[[Job, Answer], None]
-
 
 class GraspService:
     """The front process without its transports."""
 
     def __init__(
-        self,
-        settings: Settings,
-        pool: WorkerPool,
-        tls: ServerTls | None,
-        metrics: Metrics,
-        observers: Sequence[Observer],  # told of every call, as the metrics and the log are
+        self, settings: Settings, pool: WorkerPool, tls: ServerTls | None, metrics: Metrics
     ) -> None:
         self.settings = settings
         self.pool = pool
@@ -65,8 +57,9 @@ class GraspService:
         self.stopping = asyncio.Event()  # when set, new requests are refused
         self.in_flight = 0  # number of calls in progress
         self.admission = Admission(pool.size, settings.max_queue_length, settings.max_held_bytes)
-        self._observers = (metrics.count_call, log_call, *observers)
-        self.record: Recorder | None = None  # called with each job and its answer
+        # Called with each call that has ended; with each job and its answer.
+        self.observers: list[Callable[[Call], None]] = [metrics.count_call, log_call]
+        self.record: Callable[[Job, Answer], None] | None = None
         # Requests that killed workers, by digest: until when they are remembered, dead workers.
         self._deaths: dict[bytes, tuple[float, int]] = {}
         self._tls = tls
@@ -106,7 +99,7 @@ class GraspService:
             else:
                 call.code = "OK" if call.problem is None else call.problem.code
             loop = asyncio.get_running_loop()
-            for observer in self._observers:
+            for observer in self.observers:
                 loop.call_soon(observer, call)  # once the answer is being sent
 
     def authorize(self, call: Call, authorization: str | None) -> None:

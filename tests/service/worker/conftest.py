@@ -26,10 +26,15 @@ def ask(
     told = answer(job, DummyCatalogue(), settings)
     assert bool(told.body) == (told.error is None)
     if told.error is not None:
-        assert 400 <= told.error.status < 500, told.facts.traceback
-        told.error.detail.encode()  # what cannot be encoded cannot be answered
-        assert len(told.error.detail) < 2000
+        check_problem(told.error, told.facts.traceback)
     return told
+
+
+def check_problem(problem: Problem, traceback: str = "") -> None:
+    """An error of the caller's, which can be sent."""
+    assert 400 <= problem.status < 500, traceback or problem
+    problem.detail.encode()  # what cannot be encoded cannot be answered
+    assert len(problem.detail) < 2000, problem.detail[:200]
 
 
 def problem(*asked: Any, **more: Any) -> Problem:
