@@ -31,6 +31,8 @@ from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import DeadlineError, GraspClient, InvalidRequestError
 from edgegrasp_service.front.connections import HEALTH_PLACES, PAGES
 
+from .test_stream import request
+
 ROOT = Path(__file__).parents[2]
 PATIENCE = 30
 MIB = 2**20
@@ -356,9 +358,8 @@ async def test_silent_health_checks_and_watchers_hold_up_nobody(serve, monkeypat
 async def test_errors_in_a_stream_that_is_left_open_hold_up_nobody(serve, cloud) -> None:
     running = await serve()
     stream = running.stub().DetectGraspsStream()
-    for points in (b"1", b"22"):
-        request = grasp_pb2.DetectGraspsRequest(points=points)
-        await stream.write(grasp_pb2.DetectGraspsStreamRequest(request=request))
+    for _ in range(2):
+        await stream.write(request("", cloud[:0]))
         assert (await stream.read()).error.detail.kind == "invalid-request"
     await check_health(running.server.grpc_address)
     assert (await running.http().get("/health/live")).status_code == 200
@@ -369,14 +370,14 @@ async def test_errors_in_a_stream_that_is_left_open_hold_up_nobody(serve, cloud)
 async def test_silent_streams_give_their_places_to_others(serve, cloud, monkeypatch) -> None:
     monkeypatch.setattr("edgegrasp_service.front.grpc.STREAM_GRACE_SECONDS", 0.0)
     running = await serve(max_streams=2)
-    request, stub = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes()), running.stub()
+    stub = running.stub()
     silent = [stub.DetectGraspsStream() for _ in range(4)]
     ended = [asyncio.ensure_future(call.code()) for call in silent]
     await running.until(lambda: sum(code.done() for code in ended) == 2)
     codes = {code.result() for code in ended if code.done()}
     assert codes == {grpc.StatusCode.RESOURCE_EXHAUSTED}
     mine = stub.DetectGraspsStream()
-    await mine.write(grasp_pb2.DetectGraspsStreamRequest(request=request))
+    await mine.write(request("", cloud))
     assert (await mine.read()).detection.grasps
     for call in (*silent, mine):
         call.cancel()

@@ -18,13 +18,13 @@ import pytest
 from grpc import StatusCode
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client import AsyncGraspClient, GraspClient, GraspClientError, StreamRequest
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import AddressInUse
 from edgegrasp_service.probe import is_ready
 
 from .conftest import PATIENCE, is_error
+from .test_stream import request
 
 Status = health_pb2.HealthCheckResponse
 
@@ -123,8 +123,7 @@ async def test_idle_connections_do_not_hold_a_stop_up(serve, cloud) -> None:
     watch = health.Watch(health_pb2.HealthCheckRequest())
     await watch.read()
     stream = running.stub().DetectGraspsStream()
-    request = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes())
-    await stream.write(grasp_pb2.DetectGraspsStreamRequest(request=request))
+    await stream.write(request("", cloud))
     assert len((await stream.read()).detection.grasps) == 10
     running.stop.set()
     await asyncio.wait_for(running.serving, 60)

@@ -20,10 +20,6 @@ from edgegrasp_service.worker.process import Answer, Job
 from .conftest import is_error
 
 
-def grown(running) -> int:
-    return len(running.server.pool.pids)
-
-
 @pytest.mark.parametrize("fault", ["kill", "eat"])
 async def test_a_worker_that_dies_fails_its_own_request_only(
     serve, transport, cloud, fault: str
@@ -112,9 +108,9 @@ async def test_workers_killed_under_load(serve, cloud) -> None:
     for killed in range(4):
         before = outcomes[""]
         await running.until(lambda before=before: outcomes[""] >= before + 10)
-        await running.until(lambda: grown(running) == 2)
+        await running.until(lambda: len(running.server.pool.pids) == 2)
         os.kill(running.server.pool.pids[killed % 2], signal.SIGKILL)
-        await running.until(lambda: grown(running) == 2)
+        await running.until(lambda: len(running.server.pool.pids) == 2)
     stop.set()
     await asyncio.gather(*asking)
     assert set(outcomes) <= {"", "worker-lost"}
@@ -129,7 +125,7 @@ async def test_a_nursery_that_dies_is_replaced(serve, cloud) -> None:
     await running.until(lambda: running.stages.begun["load"] == 2)
     await running.until(lambda: pool.models[0]["digest"] == "2")
     os.kill(pool.pids[0], signal.SIGKILL)
-    await running.until(lambda: grown(running) == 0)
+    await running.until(lambda: len(running.server.pool.pids) == 0)
     assert (await client.detect(cloud)).fine
 
 
