@@ -68,10 +68,6 @@ def mutated(draw: st.DrawFn, originals: list[bytes]) -> bytes:
     return bytes(data)
 
 
-def files(file_format: str) -> st.SearchStrategy[bytes]:
-    return st.one_of(mutated(FILES[file_format]), st.binary(max_size=200))
-
-
 NUMBERS = st.one_of(
     st.integers(-3, 300),
     st.sampled_from([2**31, 2**53, 2**63, 2**64, 10**400, -(2**63), 0.1, 1e308, -0.0, 1e-320]),
