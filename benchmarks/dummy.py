@@ -44,10 +44,8 @@ class DummyDetector:
         counts["crc32"] = zlib.crc32(points.tobytes())  # a caller sees that the cloud is its own
         # `drawn`: (A,) approach points, rows of `points` (N, 3); `batch`: (A,) descending scores,
         # which the network gives back.
-        return SimpleNamespace(
-            options=options, points=points, drawn=drawn, batch=scores, counts=counts, seconds={},
-            scene=None,
-        )  # fmt: skip
+        stages: dict[str, Any] = {"counts": counts, "seconds": {}, "scene": None}
+        return SimpleNamespace(options=options, points=points, drawn=drawn, batch=scores, **stages)
 
     def evaluate(self, prepared: SimpleNamespace) -> Float32:
         """Wait as long as a network would take."""

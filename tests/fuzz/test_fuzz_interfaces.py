@@ -86,7 +86,8 @@ def test_mutated_inference_messages_are_answered_or_refused(content: bytes) -> N
     with refused(), contextlib.suppress(DecodeError):
         request = messages.ModelInferRequest.FromString(content)
         tensors = open_inference._grpc_inputs(request)
-        parameters = open_inference._grpc_parameters(request.parameters)
+        given = request.parameters.items()
+        parameters = {name: open_inference._value(each) for name, each in given}
         MODELS.infer("grasps", tensors, parameters, 1.0, [])
 
 
