@@ -209,16 +209,17 @@ def batches(data: Path, images: list[SceneImage], rng: np.random.Generator) -> I
     All that are read are appended to `images`.
     """
     read: set[Path] = set()
+    orders, draws = rng.spawn(2)  # the latter is used in another thread
     with ThreadPoolExecutor(1) as pool:
         waiting = None
         while True:
             new = [path for path in _files(data)[HELD_OUT:] if path not in read]
             read.update(new)
             images += read_images(new)
-            order = rng.permutation(len(images))
+            order = orders.permutation(len(images))
             for start in range(0, len(order) - BATCH + 1, BATCH):
                 chosen = [images[k] for k in order[start : start + BATCH].tolist()]
-                following = pool.submit(make_batch, chosen, rng)
+                following = pool.submit(make_batch, chosen, draws)
                 if waiting is not None:
                     yield waiting.result()
                 waiting = following
