@@ -144,9 +144,11 @@ def _read_npz(data: bytes, max_points: int) -> CloudInput:
         if not members.keys() & {"points", *(known & NPZ_IMAGE)}:
             raise ValueError(f"with {', '.join(sorted(members)[:5])}, and no array points")
         arrays: dict[str, Any] = {}
-        for name in [name for name in members if name in known]:
-            content = _unzipped(archive, members[name], max_points)
-            arrays[name] = read_npy(content, max_points, "cloud" if name == "points" else name)
+        for name, info in members.items():
+            if name in known:
+                content = _unzipped(archive, info, max_points)
+                field = "cloud" if name == "points" else name
+                arrays[name] = read_npy(content, max_points, field)
     rgb, unread = arrays.pop("rgb", None), sorted(members.keys() - known)
     said = (f"arrays of the file that are not read: {', '.join(unread[:5])}.",) if unread else ()
     if "depth" in arrays:

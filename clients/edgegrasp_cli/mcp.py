@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pydantic import Field
@@ -205,9 +205,12 @@ class _Tools:
     def _image(
         self, name: str, intrinsics: list[float], scale: float | None, pose: Matrix | None
     ) -> "DepthImage":
-        given = {"intrinsics": intrinsics, "depth_scale": scale, "T_cloud_camera": pose}
-        said = {field: value for field, value in given.items() if value is not None}
-        return cast("DepthImage", {"depth": self._path(name), **said})
+        image: DepthImage = {"depth": self._path(name), "intrinsics": intrinsics}
+        if scale is not None:
+            image["depth_scale"] = scale
+        if pose is not None:
+            image["T_cloud_camera"] = pose
+        return image
 
     def _in_image(
         self, asked: dict[str, Any], mask: str | None, pose: Matrix | None

@@ -200,7 +200,9 @@ def _load(path: Path, file: RobotFile) -> Robot:
     named = gripper_file if gripper_file.is_file() else file.gripper
     hand = GripperGeometry.model_validate(gripper_fields(named))
     gripper = gripper_from_fields(hand)
-    beyond = _keep_arm_alone(path, root, file.flange_frame, joints, packages)
+    beyond = _cut_beyond(root, file.flange_frame)
+    _fix_other_joints(root, joints)
+    _check_meshes(path, root, packages)
     arm = as_text(root)
     _add_hand(root, file, gripper)
     shaped = [link for link in root.findall("link") if link.find("collision") is not None]
@@ -315,14 +317,8 @@ def _chain(path: Path, root: Element, file: RobotFile) -> list[Element]:
     return joints[::-1]
 
 
-def _keep_arm_alone(
-    path: Path, root: Element, flange: str, moving: Sequence[Element], packages: Sequence[str]
-) -> set[str]:
-    """Remove the links beyond the flange, its own shape, and what planning does not look at.
-
-    Meshes get absolute paths; joints but the arm's are fixed, and continuous ones limited to one
-    turn each way. Returns the links beyond, the flange among them.
-    """
+def _cut_beyond(root: Element, flange: str) -> set[str]:
+    """Remove the links beyond the flange and its own shape; the flange is named among them."""
     names = [str(link.get("name")) for link in root.findall("link")]
     carriers = {name: [_link(joint, "parent") for joint in _above(root, name)] for name in names}
     beyond = {name for name in names if flange in (name, *carriers[name])}
@@ -336,6 +332,11 @@ def _keep_arm_alone(
             or (part.tag == "joint" and _link(part, "parent") in beyond)
         ):
             root.remove(part)
+    return beyond
+
+
+def _fix_other_joints(root: Element, moving: Sequence[Element]) -> None:
+    """Fix all joints but the arm's; continuous joints are limited to one turn each way."""
     for joint in root.findall("joint"):
         if joint not in moving:
             joint.set("type", "fixed")
@@ -345,13 +346,6 @@ def _keep_arm_alone(
             if limit is None:
                 limit = ElementTree.SubElement(joint, "limit", effort="1", velocity="1")
             limit.attrib.update(lower=str(-2 * np.pi), upper=str(2 * np.pi))
-    for link in root.findall("link"):
-        for mesh in link.findall("collision/geometry/mesh"):
-            field = f"urdf: the mesh of {link.get('name')}"
-            mesh.set("filename", str(_located(path, field, str(mesh.get("filename")), packages)))
-        for visual in link.findall("visual"):
-            link.remove(visual)
-    return beyond
 
 
 def _add_hand(root: Element, file: RobotFile, gripper: Gripper) -> None:
@@ -372,6 +366,15 @@ def _add_hand(root: Element, file: RobotFile, gripper: Gripper) -> None:
 
 def _numbers(values: ArrayLike) -> str:
     return " ".join(f"{value:.12g}" for value in np.asarray(values))
+
+
+def _check_meshes(path: Path, root: Element, packages: Sequence[str]) -> None:
+    for link in root.findall("link"):
+        for mesh in link.findall("collision/geometry/mesh"):
+            field = f"urdf: the mesh of {link.get('name')}"
+            mesh.set("filename", str(_located(path, field, str(mesh.get("filename")), packages)))
+        for visual in link.findall("visual"):  # planning does not look at it
+            link.remove(visual)
 
 
 def _allowed(srdf: Path | None, links: Sequence[str], beyond: set[str]) -> list[tuple[str, str]]:

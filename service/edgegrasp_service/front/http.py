@@ -138,8 +138,7 @@ class HttpMiddleware:
                 if call.code:  # half an answer is sent: the client must see that it is incomplete
                     call.problem, call.code = report(error), ""
                     scope["state"]["abort"]()
-                    while (await receive())["type"] != "http.disconnect":
-                        pass
+                    await _disconnected(receive)
                 else:
                     await _error_response(call, scope, error)(scope, receive, send_with_headers)
 
@@ -291,7 +290,7 @@ class _Work:
             whole = cast(bytes, body)  # not copied
             job = Job(self.method, "http", whole, content_type=content_type, query=query)
             answering = asyncio.create_task(service.answer(call, ticket, job))
-            leaving = asyncio.ensure_future(receive())  # after a whole body: that the client left
+            leaving = asyncio.create_task(_disconnected(receive))
             try:
                 await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
                 if not answering.done():
@@ -305,6 +304,12 @@ class _Work:
                 response = _problem_response(call, answer.error)
             sending = response(scope, receive, send)
             await connections.send(service.settings, sending, call.bytes_out)
+
+
+async def _disconnected(receive: Receive) -> None:
+    """Wait until the client has disconnected."""
+    while (await receive())["type"] != "http.disconnect":
+        pass
 
 
 def requested_timeout(headers: Headers) -> float:
