@@ -47,7 +47,7 @@ class BenchmarkFlags(Cluster, PlannerFlags):
 
     scene: str | None = Field(
         None,
-        description="packed, pile, bin, bin-full, table or shelf; else the protocol's, or pile",
+        description="packed, pile, bin, bin-full, bin-deep, table, shelf; else the protocol's",
     )
     protocol: str = Field(
         "edgegrasp",

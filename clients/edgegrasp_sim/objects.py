@@ -45,13 +45,14 @@ class SceneKind(StrEnum):
     BIN = "bin"
     TABLE = "table"
     FULL_BIN = "bin-full"
+    DEEP_BIN = "bin-deep"
     SHELF = "shelf"
 
     @property
     def objects(self) -> "SceneKind":
         """The kind whose objects it uses unless it has its own."""
         match self:
-            case SceneKind.BIN | SceneKind.FULL_BIN:
+            case SceneKind.BIN | SceneKind.FULL_BIN | SceneKind.DEEP_BIN:
                 return SceneKind.PILE
             case SceneKind.TABLE | SceneKind.SHELF:
                 return SceneKind.PACKED

@@ -12,8 +12,10 @@ from edgegrasp_sim.engine import TIME_STEP, Body, World
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import Matrix, about_z
 from edgegrasp_sim.surroundings import (
+    DEEP_BIN_INSIDE,
     MIDDLE,
     SIZE,
+    SMALL_BIN_INSIDE,
     TABLE_HEIGHT,
     Box,
     Surroundings,
@@ -236,7 +238,8 @@ STANDING_IN: dict[SceneKind, tuple[MakeSurroundings | None, tuple[float, float],
     SceneKind.PACKED: (None, PACKED_SCALE, make_packed),
     SceneKind.PILE: (None, PILE_SCALE, make_pile),
     SceneKind.BIN: (random_bin, PILE_SCALE, make_bin),
-    SceneKind.FULL_BIN: (partial(random_bin, small=True), PILE_SCALE, make_full_bin),
+    SceneKind.FULL_BIN: (partial(random_bin, extents=SMALL_BIN_INSIDE), PILE_SCALE, make_full_bin),
+    SceneKind.DEEP_BIN: (partial(random_bin, extents=DEEP_BIN_INSIDE), PILE_SCALE, make_bin),
     SceneKind.TABLE: (random_table, PACKED_SCALE, make_table),
     SceneKind.SHELF: (random_shelf, PACKED_SCALE, make_table),
 }

@@ -131,7 +131,7 @@ class ClutterSimulation:
 
     def reset(
         self,
-        scene: SceneKind | str,  # `packed`, `pile`, `bin`, `table`, `bin-full` or `shelf`
+        scene: SceneKind | str,  # a kind or its name
         rng: np.random.Generator,  # the scene's own stream
         num_objects: int = 5,  # how many to try to place
         scales: tuple[float, float] | None = None,  # of the factor on sizes; None: usual

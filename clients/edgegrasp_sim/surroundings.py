@@ -32,6 +32,7 @@ Corners = tuple[tuple[float, float, float], tuple[float, float, float]]  # lowes
 # above its fingertips, so that along a higher wall it holds little.
 BIN_INSIDE: tuple[Span, Span, Span] = ((0.40, 0.60), (0.30, 0.42), (0.03, 0.08))
 SMALL_BIN_INSIDE: tuple[Span, Span, Span] = ((0.30, 0.40), (0.24, 0.30), (0.03, 0.08))
+DEEP_BIN_INSIDE: tuple[Span, Span, Span] = ((0.36, 0.60), (0.26, 0.42), (0.08, 0.22))
 BIN_WALL: Span = (0.008, 0.015)  # its floor is as thick; objects are pressed through thinner ones
 GROUND = 0.2  # metres, depth of a floor into what it stands on, for the same reason
 STAND_SHARE = 0.3  # of the bins, which stand off the table: on a stand, a conveyor
@@ -109,9 +110,10 @@ def open_table(thickness: float = OPEN_THICKNESS) -> Surroundings:
 OPEN_TABLE = open_table()
 
 
-def random_bin(rng: np.random.Generator, *, small: bool = False) -> Surroundings:
-    """An open box on a table or over it, its floor at `TABLE_HEIGHT`; a small one gets full."""
-    extents = SMALL_BIN_INSIDE if small else BIN_INSIDE
+def random_bin(
+    rng: np.random.Generator, extents: tuple[Span, Span, Span] = BIN_INSIDE
+) -> Surroundings:
+    """An open box of inner `extents` on a table or over it, its floor at `TABLE_HEIGHT`."""
     length, width, height = (rng.uniform(*extent) for extent in extents)
     wall = rng.uniform(*BIN_WALL)
     stand = rng.uniform(*STAND) if rng.random() < STAND_SHARE else 0.0

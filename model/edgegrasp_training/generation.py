@@ -48,15 +48,16 @@ HOUSEHOLD_STREAM = 6
 APPROACH_POINTS = 12  # few balls with many labels each are the cheapest to train on
 BIN_APPROACH_POINTS = 24  # walls block most hands there
 PACKED, PILE, BIN, TABLE = SceneKind.PACKED, SceneKind.PILE, SceneKind.BIN, SceneKind.TABLE
+DEEP_BIN = SceneKind.DEEP_BIN
 # Four in ten scenes are those of the benchmark of the paper.
 MIXTURE = (PACKED, PILE, BIN, TABLE, BIN, PACKED, TABLE, PILE, BIN, TABLE)
 # A scene holds one object and Poisson(this) more.
-FURTHER_OBJECTS = {PACKED: 4, PILE: 4, BIN: 7, TABLE: 5}
+FURTHER_OBJECTS = {PACKED: 4, PILE: 4, BIN: 7, DEEP_BIN: 9, TABLE: 5}
 _ABOVE, _STEEP = (0.0, np.radians(40)), (np.radians(20), np.radians(75))
 _ANY_SIDE = 0.0, 2 * np.pi
 _LOW_TARGET = (MIDDLE, MIDDLE, 0.1)  # metres
 VIEWS = dict.fromkeys((PACKED, PILE), ViewRange((0.45, 0.75), (0.0, np.radians(75)), _ANY_SIDE))
-VIEWS[BIN] = ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET)
+VIEWS[BIN] = VIEWS[DEEP_BIN] = ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET)
 VIEWS[TABLE] = ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET)
 # Of household objects, more from one side: a tall or wide one hides its back there.
 SIDE_VIEWS = ViewRange((0.5, 1.2), (np.radians(40), np.radians(80)), _ANY_SIDE, _LOW_TARGET)
@@ -64,7 +65,7 @@ KEPT_DISTANCE = 0.18  # metres from the nearest hand that was tried: from its ax
 BEHIND_TIPS = 0.1122  # metres behind the fingertips, where the Panda's frame is
 AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
 # Of the views that are not cut off, where support and workspace are given.
-GIVEN_SHARE = {PACKED: 0.0, PILE: 0.0, BIN: 0.7, TABLE: 0.3}
+GIVEN_SHARE = {PACKED: 0.0, PILE: 0.0, BIN: 0.7, DEEP_BIN: 0.5, TABLE: 0.3}
 AIMED_SHARE = 0.85  # of the views of bins and tables with grasps of the objects alone
 AIM_MARGIN = np.array([[-0.005], [0.005]])  # metres around an object
 AROUND_MARGIN = 0.006  # metres around an obstacle
@@ -200,7 +201,7 @@ def generate_scene(
             low, high = PACKED_SCALE if kind.objects is PACKED else PILE_SCALE
             sizes = low * WIDER_SCALES[0], high * WIDER_SCALES[1]
             sizes = HOUSEHOLD_SCALE if household else sizes
-            seen_from = SIDE_VIEWS if household and kind is not BIN else VIEWS[kind]
+            seen_from = SIDE_VIEWS if household and kind not in (BIN, DEEP_BIN) else VIEWS[kind]
             look = partial(ask, simulation, kind, seen_from, streams)
             hard = _make_scene(simulation, kind, sizes, options, streams[SCENE_STREAM], look)
             models = [model.origin or model for model in simulation.object_models]
@@ -284,7 +285,7 @@ def ask(
     objects = _objects_of(simulation) if aimed else None
     fields = simulation.gripper
     request = DetectOptions(
-        num_approach_points=BIN_APPROACH_POINTS if kind is BIN else APPROACH_POINTS,
+        num_approach_points=BIN_APPROACH_POINTS if kind in (BIN, DEEP_BIN) else APPROACH_POINTS,
         seed=int(choice.integers(2**32)),
         viewpoint=tuple(observation.camera_position.tolist()),
         support=support,

@@ -10,8 +10,8 @@ class GenerationOptions(BaseModel, extra="forbid"):
     """What to generate."""
 
     scenes: int = Field(100, ge=1, description="Scenes")
-    scene: Literal["packed", "pile", "bin", "table"] | None = Field(
-        None, description="Kind of the scenes: packed, pile, bin or table; else all of them"
+    scene: Literal["packed", "pile", "bin", "bin-deep", "table"] | None = Field(
+        None, description="Kind of the scenes; else packed, pile, bin and table"
     )
     views_per_scene: int = Field(2, ge=1, description="Cameras in each scene")
     grasps_per_view: int = Field(
