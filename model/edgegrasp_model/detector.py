@@ -39,6 +39,7 @@ from edgegrasp_model.ranking import (
     detected_objects,
     found_support,
     grasps_in_cloud,
+    judged_together,
     select,
 )
 from edgegrasp_model.results import NoGrasp, Pace
@@ -210,6 +211,8 @@ class GraspDetector:
             logits, outcome = np.empty(0, dtype=np.float32), np.empty(0, dtype=np.int8)
             if scored is not None and scene is not None:
                 logits = self._before_outcomes(scored.logits)
+                if self.sees_hands:
+                    logits = judged_together(logits, scored.sample, scene, gripper)
             scale, shift = self._outcomes
             score = expit(scale * logits + shift)
             if scene is not None and not scene.approach_allowed.any():
@@ -219,11 +222,7 @@ class GraspDetector:
             elif scene is not None and sample is not None:
                 found = object_probability(scene, sample.candidates.contact_index)
                 score, ratings = score * found, expit(logits) * found
-                # Among balls the highest scores are still the best grasps.
-                sure = SURE_SCORE if self.sees_hands else 1.0
-                rows, outcome = select(
-                    scene, sample, score, ratings, gripper, options, counts, sure
-                )
+                rows, outcome = select(scene, sample, score, ratings, gripper, options, counts)
                 best, free = sample.candidates.take(rows), sample.collision_free[rows]
                 clear = clearances(scene, best.T_cloud_hand, gripper)
                 grasps = grasps_in_cloud(scene, best, gripper, score[rows], free, clear)

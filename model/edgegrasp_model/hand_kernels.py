@@ -109,6 +109,19 @@ def non_max_suppression(
     return order[kept], order[dropped]
 
 
+def mean_of_alike(
+    values: Float32, T_cloud_tcp: Float32, number: Int64, near: float, angle: float
+) -> Float32:
+    """The mean value (E,) of the other hands on the same object that are like each one.
+
+    Those are within `near` metres of it, T_cloud_tcp (E, 4, 4), and `angle` radians; half a turn
+    about the approach counts as none. `number` (E,) are the objects. NaN where there is none.
+    """
+    mean = np.empty_like(values)
+    _average_alike(values, number, *_compared(T_cloud_tcp, near, angle), mean)
+    return mean
+
+
 def _compared(T_cloud_tcp: Float32, near: float, angle: float) -> tuple[Float32, Float32, Float32]:
     """Places (E, 3), rotations (E, 3, 3), and limits (2,): squared distance, `_likeness`."""
     turn = np.ascontiguousarray(T_cloud_tcp[:, :3, :3])
@@ -443,6 +456,25 @@ def _suppress(
             kept[m] = True
             xs[found], ys[found], zs[found], rows[found] = px, py, pz, row
             found += 1
+
+
+@compiled("contract")
+def _average_alike(
+    values: Float32, number: Int64, place: Float32, turn: Float32, limits: Float32, mean: Float32
+) -> None:
+    total, count = np.zeros(len(values)), np.zeros(len(values), np.int64)
+    for i in range(len(values)):
+        px, py, pz = place[i]
+        for j in range(i):
+            x, y, z = place[j, 0] - px, place[j, 1] - py, place[j, 2] - pz
+            near = number[i] == number[j] and x * x + y * y + z * z < limits[0]
+            if near and _likeness(turn[i], turn[j]) > limits[1]:
+                total[i] += values[j]
+                total[j] += values[i]
+                count[i] += 1
+                count[j] += 1
+    for i in range(len(values)):
+        mean[i] = total[i] / count[i] if count[i] else np.nan
 
 
 @compiled("contract")

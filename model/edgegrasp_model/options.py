@@ -737,8 +737,8 @@ class DetectOptions(Strict):
     )
     order: Literal["score", "highest", "clearance"] = Field(
         default="score",
-        description="score: by score and, where scores are close or from 0.9 on, by how the "
-        "hand lies, the best grasp of each object first if it has 0.5 or more; "
+        description="score: by score and, where scores are close, by how the hand lies, the best "
+        "grasp of each object first if it has 0.5 or more; "
         "highest: by height of the TCP along up among scores of 0.9 and more, then the "
         "others by score; clearance: by clearance",
     )

@@ -15,7 +15,7 @@ from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_description import seen_part
-from edgegrasp_model.hand_kernels import non_max_suppression
+from edgegrasp_model.hand_kernels import mean_of_alike, non_max_suppression
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Outcome, Ungraspable
 from edgegrasp_model.scene.cloud import UP
@@ -26,11 +26,33 @@ from edgegrasp_results import DebugInfo, DetectedObject, FoundSupport, Grasp
 
 COLLIDING = 0.5  # factor on the score of a colliding grasp in the ranking
 GOOD_SCORE = 0.5  # score from which an object has a good grasp
-SURE_SCORE = 0.9  # score from which other things decide than the score (the paper's robot policy)
+SURE_SCORE = 0.9  # score from which the order `highest` goes by height (the paper's robot policy)
 HIDDEN = 0.004  # metres of unseen space into which an object may extend
 FLAT = 0.012  # metres of visible height below which the support may block grasps
 DRAWBACK, FAR = 0.01, 0.1  # of a rating; metres from an object's middle
+# Hands that are judged together: metres and radians apart; weight of a hand's own logit; factor
+# that calibrates the average.
+ALIKE, ALIKE_ANGLE, OWN, SHARPER = 0.03, math.radians(30), 0.3, 1.3
 OUTCOMES = list(Outcome)
+
+
+def judged_together(
+    logits: Float32,  # (E,) of the scored candidates
+    sample: Sample,
+    scene: Scene,
+    gripper: Gripper,
+) -> Float32:
+    """The logits (E,), averaged over hands that are alike.
+
+    The best of many logits is too high by chance, and a robot's pose is never exact: where hands
+    like it slip, a hand slips too.
+    """
+    candidates = sample.candidates
+    number = scene.object_of_point[candidates.contact_index]
+    T_cloud_tcp = candidates.T_cloud_hand @ gripper.T_hand_tcp
+    others = mean_of_alike(logits, T_cloud_tcp, number, ALIKE, ALIKE_ANGLE)
+    averaged = np.float32(SHARPER * OWN) * logits + np.float32(SHARPER * (1.0 - OWN)) * others
+    return np.where(np.isnan(others), logits, averaged)
 
 
 def select(
@@ -41,7 +63,6 @@ def select(
     gripper: Gripper,
     options: DetectOptions,
     counts: dict[str, int],  # gets the number of candidates left after each step
-    sure: float,  # rating from which grasps count as equally good
 ) -> tuple[Int64, NDArray[np.int8]]:
     """Order the scored candidates, drop low scores and near duplicates, keep the first top_k.
 
@@ -54,8 +75,7 @@ def select(
     free = sample.collision_free | (options.collision.mode == "ignore")
     preferred = rating
     if options.order == "score":
-        taken = drawbacks(scene, sample.candidates.contact_index, T_cloud_tcp)
-        preferred = np.minimum(rating, sure) - taken
+        preferred = rating - drawbacks(scene, sample.candidates.contact_index, T_cloud_tcp)
     order = ranked(preferred, free, options.order, T_cloud_tcp[:, :3, 3] @ UP, clearance)
 
     outcome = np.full(len(score), CODE[Outcome.BEYOND_TOP_K])
@@ -76,7 +96,7 @@ def select(
 
 
 def drawbacks(scene: Scene, contact_index: Int64, T_cloud_tcp: Float32) -> Floats:
-    """What is taken off ratings (E,), so that not noise decides among grasps that are equally good.
+    """What is taken off ratings (E,), of which noise would else decide among equal ones.
 
     A hand should be vertical, near the middle of its object as seen from above, and close level and
     across the line of sight, where both sides are seen; its object should be large.

@@ -13,6 +13,7 @@ from edgegrasp_camera.depth import DepthView, Intrinsics, fuse_depth_images
 from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue, choose_device
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, UnknownModel
+from edgegrasp_model.hand_kernels import mean_of_alike
 from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import Collision, DetectOptions, parse_options
@@ -284,11 +285,11 @@ def test_a_palm_in_space_that_no_camera_saw_counts_as_colliding(camera, blocked)
     assert collides(behind, hand, PANDA, Collision()).tolist() == [blocked]
 
 
-def opinionated(bias: float, seed: int = 0) -> GraspDetector:
-    """A detector of random weights, to which most grasps seem good, or none."""
-    network = build_network(TINY["hand"], torch.Generator().manual_seed(seed))
+def hopeless() -> GraspDetector:
+    """A detector to which no grasp seems any good."""
+    network = build_network(TINY["hand"])
     with torch.no_grad():
-        list(network.parameters())[-1].fill_(bias)  # of the last layer
+        list(network.parameters())[-1].fill_(-50.0)  # the bias of the last layer
     return GraspDetector(network, CheckpointMetadata("no", TINY["hand"], 0.0045, "panda"), PANDA)
 
 
@@ -309,15 +310,23 @@ def test_an_object_without_a_good_grasp_has_a_reason(size, options, reason) -> N
     floor = {"normal": (0, 0, 1), "offset": 0.0}
     known = {"viewpoint": (0.3, 0.2, 0.5), "support": floor, "objects": "off"}
     asked = parse_options(known | {"approach_direction": {"preset": "top-down"}} | options)
-    (single,) = opinionated(-50.0).detect(box_on_table(3000, size=size), asked).objects
+    (single,) = hopeless().detect(box_on_table(3000, size=size), asked).objects
     assert single.reason == reason
 
 
-@pytest.mark.parametrize(("bias", "same"), [(9.0, True), (0.0, False)])
-def test_of_sure_grasps_the_best_placed_comes_first_whatever_their_scores(bias, same) -> None:
-    first = []
-    for seed in range(3):
-        random = opinionated(bias, seed).detect(CLOUD, DetectOptions.model_validate(ASKED))
-        assert {grasp.score >= 0.9 for grasp in random.grasps} == {same}
-        first.append(random.grasps[0].T_cloud_hand.tobytes())
-    assert (len(set(first)) == 1) == same
+def hands(places: list[float], turns: list[float]) -> np.ndarray:
+    """Upright hands along x, turned about the approach, radians.  # (E, 4, 4)."""
+    poses = np.tile(np.eye(4, dtype=np.float32), (len(places), 1, 1))
+    poses[:, 0, 3] = places
+    cosine, sine = np.cos(turns), np.sin(turns)
+    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cosine, -sine, sine, cosine
+    return poses
+
+
+def test_hands_are_averaged_with_others_on_the_same_object_that_are_near_and_turned_alike() -> None:
+    poses = hands([0.0, 0.01, 0.02, 0.1, 0.01, 0.01], [0.0, 0.1, np.pi, 0.0, 0.0, 1.0])
+    logits = np.array([3.0, -1.0, -2.0, 2.0, 5.0, 7.0], dtype=np.float32)
+    number = np.array([0, 0, 0, 0, 1, 0])  # the fifth is on another object
+    found = mean_of_alike(logits, poses, number, 0.03, 0.5)
+    np.testing.assert_allclose(found[:3], [-1.5, 0.5, 1.0], atol=1e-6)
+    assert np.isnan(found[3:]).all()
