@@ -225,6 +225,11 @@ def test_a_hand_that_hits_a_large_thing_fails_and_does_not_move_it(engine: str) 
         assert before[:, 2].max() == pytest.approx(TABLE_HEIGHT + 0.15, abs=1e-3)
 
 
+def test_a_deep_bin_has_walls_as_high_as_a_hand(simulation: ClutterSimulation) -> None:
+    assert simulation.reset(SceneKind.DEEP_BIN, np.random.default_rng(2), 2) > 0
+    assert seen_from_above(simulation)[:, 2].max() > TABLE_HEIGHT + 0.08
+
+
 def test_a_full_bin_hides_its_floor(simulation: ClutterSimulation) -> None:
     most = 40
     number = simulation.reset(SceneKind.FULL_BIN, np.random.default_rng(2), most, (1.6, 1.6))
