@@ -47,7 +47,8 @@ class BenchmarkFlags(Cluster, PlannerFlags):
 
     scene: str | None = Field(
         None,
-        description="packed, pile, bin, bin-full, bin-deep, table, shelf; else the protocol's",
+        description="packed, pile, bin, bin-full, bin-deep, table or shelf; else the protocol's, "
+        "or pile",
     )
     protocol: str = Field(
         "edgegrasp",

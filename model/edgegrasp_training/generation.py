@@ -49,6 +49,7 @@ APPROACH_POINTS = 12  # few balls with many labels each are the cheapest to trai
 BIN_APPROACH_POINTS = 24  # walls block most hands there
 PACKED, PILE, BIN, TABLE = SceneKind.PACKED, SceneKind.PILE, SceneKind.BIN, SceneKind.TABLE
 DEEP_BIN = SceneKind.DEEP_BIN
+BINS = BIN, DEEP_BIN  # seen from above only
 # Four in ten scenes are those of the benchmark of the paper.
 MIXTURE = (PACKED, PILE, BIN, TABLE, BIN, PACKED, TABLE, PILE, BIN, TABLE)
 # A scene holds one object and Poisson(this) more.
@@ -57,7 +58,7 @@ _ABOVE, _STEEP = (0.0, np.radians(40)), (np.radians(20), np.radians(75))
 _ANY_SIDE = 0.0, 2 * np.pi
 _LOW_TARGET = (MIDDLE, MIDDLE, 0.1)  # metres
 VIEWS = dict.fromkeys((PACKED, PILE), ViewRange((0.45, 0.75), (0.0, np.radians(75)), _ANY_SIDE))
-VIEWS[BIN] = VIEWS[DEEP_BIN] = ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET)
+VIEWS |= dict.fromkeys(BINS, ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET))
 VIEWS[TABLE] = ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET)
 # Of household objects, more from one side: a tall or wide one hides its back there.
 SIDE_VIEWS = ViewRange((0.5, 1.2), (np.radians(40), np.radians(80)), _ANY_SIDE, _LOW_TARGET)
@@ -201,7 +202,7 @@ def generate_scene(
             low, high = PACKED_SCALE if kind.objects is PACKED else PILE_SCALE
             sizes = low * WIDER_SCALES[0], high * WIDER_SCALES[1]
             sizes = HOUSEHOLD_SCALE if household else sizes
-            seen_from = SIDE_VIEWS if household and kind not in (BIN, DEEP_BIN) else VIEWS[kind]
+            seen_from = SIDE_VIEWS if household and kind not in BINS else VIEWS[kind]
             look = partial(ask, simulation, kind, seen_from, streams)
             hard = _make_scene(simulation, kind, sizes, options, streams[SCENE_STREAM], look)
             models = [model.origin or model for model in simulation.object_models]
@@ -285,7 +286,7 @@ def ask(
     objects = _objects_of(simulation) if aimed else None
     fields = simulation.gripper
     request = DetectOptions(
-        num_approach_points=BIN_APPROACH_POINTS if kind in (BIN, DEEP_BIN) else APPROACH_POINTS,
+        num_approach_points=BIN_APPROACH_POINTS if kind in BINS else APPROACH_POINTS,
         seed=int(choice.integers(2**32)),
         viewpoint=tuple(observation.camera_position.tolist()),
         support=support,
