@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from edgegrasp_camera.arrays import Floats, Int64
+from edgegrasp_camera.arrays import Float32, Floats, Int64
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import Sample, Sampler
 from edgegrasp_model.detector import GraspDetector
@@ -27,6 +27,7 @@ from edgegrasp_model.options import (
     SupportPlane,
     Workspace,
 )
+from edgegrasp_model.ranking import judged_together
 from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_model.scene.scene import Scene, SelectedPoints, build_scene, select_points
 from edgegrasp_sim.camera import Observation, TableView, ViewRange
@@ -48,25 +49,34 @@ HOUSEHOLD_STREAM = 6
 APPROACH_POINTS = 12  # few balls with many labels each are the cheapest to train on
 BIN_APPROACH_POINTS = 24  # walls block most hands there
 PACKED, PILE, BIN, TABLE = SceneKind.PACKED, SceneKind.PILE, SceneKind.BIN, SceneKind.TABLE
-DEEP_BIN = SceneKind.DEEP_BIN
-BINS = BIN, DEEP_BIN  # seen from above only
+DEEP_BIN, FULL_BIN, SHELF = SceneKind.DEEP_BIN, SceneKind.FULL_BIN, SceneKind.SHELF
+BINS = BIN, DEEP_BIN, FULL_BIN  # seen from above only
 # Four in ten scenes are those of the benchmark of the paper.
 MIXTURE = (PACKED, PILE, BIN, TABLE, BIN, PACKED, TABLE, PILE, BIN, TABLE)
 # A scene holds one object and Poisson(this) more.
-FURTHER_OBJECTS = {PACKED: 4, PILE: 4, BIN: 7, DEEP_BIN: 9, TABLE: 5}
+FURTHER_OBJECTS = {PACKED: 4, PILE: 4, BIN: 7, DEEP_BIN: 9, FULL_BIN: 24, TABLE: 5, SHELF: 3}
 _ABOVE, _STEEP = (0.0, np.radians(40)), (np.radians(20), np.radians(75))
-_ANY_SIDE = 0.0, 2 * np.pi
+_ANY_SIDE, _FRONT = (0.0, 2 * np.pi), (np.radians(230), np.radians(310))
 _LOW_TARGET = (MIDDLE, MIDDLE, 0.1)  # metres
 VIEWS = dict.fromkeys((PACKED, PILE), ViewRange((0.45, 0.75), (0.0, np.radians(75)), _ANY_SIDE))
 VIEWS |= dict.fromkeys(BINS, ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET))
 VIEWS[TABLE] = ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET)
+VIEWS[SHELF] = ViewRange((0.45, 1.0), (np.radians(45), np.radians(90)), _FRONT, _LOW_TARGET)
 # Of household objects, more from one side: a tall or wide one hides its back there.
 SIDE_VIEWS = ViewRange((0.5, 1.2), (np.radians(40), np.radians(80)), _ANY_SIDE, _LOW_TARGET)
 KEPT_DISTANCE = 0.18  # metres from the nearest hand that was tried: from its axis there,
 BEHIND_TIPS = 0.1122  # metres behind the fingertips, where the Panda's frame is
 AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
 # Of the views that are not cut off, where support and workspace are given.
-GIVEN_SHARE = {PACKED: 0.0, PILE: 0.0, BIN: 0.7, DEEP_BIN: 0.5, TABLE: 0.3}
+GIVEN_SHARE = {
+    PACKED: 0.0,
+    PILE: 0.0,
+    BIN: 0.7,
+    DEEP_BIN: 0.5,
+    FULL_BIN: 0.5,
+    TABLE: 0.3,
+    SHELF: 0.3,
+}
 AIMED_SHARE = 0.85  # of the views of bins and tables with grasps of the objects alone
 AIM_MARGIN = np.array([[-0.005], [0.005]])  # metres around an object
 AROUND_MARGIN = 0.006  # metres around an obstacle
@@ -76,20 +86,15 @@ VARIED_SHARE = 0.85  # of the scenes of an object folder, made of stretched and 
 NUM_HOUSEHOLD = 12  # household objects that a scene is drawn from,
 HOUSEHOLD_SCALE = 0.9, 1.1  # and the range of their scales
 WIDER_SCALES = 0.85, 1.15  # factors on the ends of a scene's range of scales
-HARD_SHARE = 0.8  # of the scenes, where one is looked for that the guiding network finds hard
-HARD_TRIES = 3  # scenes looked through for a hard one
-HARD_LOOKS = 6  # into each of them
+CLEARED_SHARE = 0.75  # of the scenes, which the network clears as a robot would
+FAILURES = 2  # in a row, after which it gets another scene
 SENSOR_SHARE = 0.4  # of the views, with the faults of a depth camera
 OTHER_NOISE = 0.3  # of the views, with another noise than the benchmark's
 MAX_NOISE = 0.004  # metres
 EXACT_PLANE = SupportPlane(normal=(0.0, 0.0, 1.0), offset=TABLE_HEIGHT)
 
-BEST_SHARE = 0.1  # of the candidates, by score: those a network would execute
-UNSURE = 0.1, 0.8  # range of scores that leave the outcome open
-SURE = 0.99  # score of the best grasp from which on a view teaches little
-EASY_SHARE = 0.4  # of the grasps, tried in a view whose best grasp is sure
 FREE_SHARE = 0.75  # of the grasps chosen at random, those that are collision-free
-GUIDED_SHARE = 0.5  # of the tried grasps, the network's best and unsure ones
+LIKELY, LIKELY_SHARE = 1 / 3, 0.7  # best part of an object's grasps, most of which are tried there
 
 # Of a random hand.
 OPENING = 0.04, 0.14  # metres, as the other ranges
@@ -202,57 +207,28 @@ def generate_scene(
             low, high = PACKED_SCALE if kind.objects is PACKED else PILE_SCALE
             sizes = low * WIDER_SCALES[0], high * WIDER_SCALES[1]
             sizes = HOUSEHOLD_SCALE if household else sizes
-            seen_from = SIDE_VIEWS if household and kind not in BINS else VIEWS[kind]
-            look = partial(ask, simulation, kind, seen_from, streams)
-            hard = _make_scene(simulation, kind, sizes, options, streams[SCENE_STREAM], look)
-            models = [model.origin or model for model in simulation.object_models]
-            names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
-            made: dict[str, Any] = {"engine": simulation.world.name, "gripper": hand}
-            made |= {"objects": names, "object_digests": digests}
-            for number in range(options.views_per_scene):
-                query = hard if hard is not None and number == 0 else look()
+            from_side = household and kind in (PACKED, PILE, TABLE)
+            seen_from = SIDE_VIEWS if from_side else VIEWS[kind]
+            cleared = options.weights is not None and streams[SCENE_STREAM].random() < CLEARED_SHARE
+            guide = detector(options.weights) if cleared and options.weights else None
+            failures = FAILURES
+            for _ in range(options.views_per_scene):
+                if simulation.num_objects == 0 or failures == FAILURES:
+                    count = 1 + int(streams[SCENE_STREAM].poisson(FURTHER_OBJECTS[kind]))
+                    simulation.reset(kind, streams[SCENE_STREAM], count, sizes)
+                    failures = 0
+                models = [model.origin or model for model in simulation.object_models]
+                names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
+                made: dict[str, Any] = {"engine": simulation.world.name, "gripper": hand}
+                made |= {"objects": names, "object_digests": digests}
+                query = ask(simulation, kind, seen_from, streams, guided=guide is not None)
                 choice = streams[CHOICE_STREAM]
-                view = label(simulation, query, options, choice, hard=hard is not None)
+                view, best = label(simulation, query, options, choice, guide)
                 views.append(replace(view, **made))
+                if guide is not None:
+                    success = best is not None and simulation.execute_grasp(best).success
+                    failures = 0 if success else failures + 1
     return views
-
-
-def _make_scene(
-    simulation: ClutterSimulation,
-    kind: SceneKind,
-    scales: tuple[float, float],
-    options: GenerationOptions,
-    rng: np.random.Generator,
-    look: Callable[[], Query],
-) -> Query | None:
-    """Make a scene, with weights mostly one they find hard; returns that hard view, if any."""
-    guide = None
-    if options.weights is not None and rng.random() < HARD_SHARE:
-        guide = detector(options.weights)
-    for _ in range(1 if guide is None else HARD_TRIES):
-        simulation.reset(kind, rng, 1 + int(rng.poisson(FURTHER_OBJECTS[kind])), scales)
-        hard = None if guide is None else _hard_view(simulation, guide, look)
-        if hard is not None:
-            return hard
-    return None
-
-
-def _hard_view(
-    simulation: ClutterSimulation, guide: GraspDetector, look: Callable[[], Query]
-) -> Query | None:
-    """The first view in which the network is unsure or wrong; easy objects are removed first."""
-    for _ in range(min(simulation.num_objects, HARD_LOOKS)):
-        observation, request = query = look()
-        if len(observation.cloud) == 0:
-            return None
-        grasps = guide.detect(observation.cloud, request).grasps
-        unsure = not grasps or grasps[0].score < SURE
-        if unsure or not simulation.try_grasp(grasps[0].T_cloud_hand).success:
-            return query
-        if simulation.num_objects == 1:
-            return None
-        simulation.execute_grasp(grasps[0].T_cloud_hand)
-    return None
 
 
 def ask(
@@ -260,8 +236,10 @@ def ask(
     kind: SceneKind,
     seen_from: ViewRange,
     streams: list[np.random.Generator],
+    *,
+    guided: bool,  # whether a network clears the scene, and has to be asked as a robot asks it
 ) -> Query:
-    """Observe the scene and make a request like a benchmark's, with fewer approach points.
+    """Observe the scene and make a request like a benchmark's, unless guided for a few balls only.
 
     In bins, on tables and in some other views the cloud holds all that the camera sees, and the
     support is given, not quite where it is, or has to be found.
@@ -282,18 +260,19 @@ def ask(
     workspace: Workspace | None = Workspace(min=low, max=high)
     if around and choice.random() >= GIVEN_SHARE[kind]:
         support, workspace = AutoPlane(), None
-    aimed = not open_table and choice.random() < AIMED_SHARE
+    aimed = not open_table and not guided and choice.random() < AIMED_SHARE
     objects = _objects_of(simulation) if aimed else None
     fields = simulation.gripper
+    few = BIN_APPROACH_POINTS if kind in BINS else APPROACH_POINTS
     request = DetectOptions(
-        num_approach_points=BIN_APPROACH_POINTS if kind in BINS else APPROACH_POINTS,
+        num_approach_points=None if guided else few,
         seed=int(choice.integers(2**32)),
         viewpoint=tuple(observation.camera_position.tolist()),
         support=support,
         workspace=workspace,
         approach_region=objects,
         contact_region=objects,
-        collision=Collision(mode="penalise"),
+        collision=Collision(mode="avoid" if guided else "penalise"),
         gripper=None if fields is None else GripperGeometry.model_validate(fields),
     )
     return observation, request
@@ -325,19 +304,18 @@ def _objects_of(simulation: ClutterSimulation) -> Region:
 def label(
     simulation: ClutterSimulation,  # holds the scene
     query: Query,  # A view of it and the request
-    options: GenerationOptions,  # how many to try, and the weights that guide the choice
+    options: GenerationOptions,  # how many to try
     rng: np.random.Generator,  # chooses among the candidates
-    *,
-    hard: bool,  # whether the scene is known to be hard, even where the best grasp is sure
-) -> LabelledView:
-    """Sample candidates as the detector does and try some of them."""
+    guide: GraspDetector | None,  # guides the choice
+) -> tuple[LabelledView, Float32 | None]:
+    """Sample candidates as the detector does and try some; also the guide's best hand (4, 4)."""
     observation, request = query
-    found = choose_grasps(query, options, rng, hard=hard)
+    found = choose_grasps(query, options, rng, guide)
     if found is None:
         nothing, rows = np.empty((0, 3), dtype=np.float32), np.empty(0, dtype=np.int64)
         camera, success = observation.camera_position, rows.astype(np.int8)
-        return LabelledView(nothing, nothing, camera, rows, rows, None, success)
-    selected, scene, candidates = found
+        return LabelledView(nothing, nothing, camera, rows, rows, None, success), None
+    selected, scene, candidates, best = found
     T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
     # Points far from every grasp carry no information.
@@ -348,7 +326,7 @@ def label(
     plane = None if selected.support is None else selected.support.plane
     far = cKDTree(places).query(scene.points_in_cloud)[0] > KEPT_DISTANCE
     kept = np.flatnonzero(~far)
-    return LabelledView(
+    view = LabelledView(
         points=scene.points_in_cloud[kept],
         normals=scene.frame.directions_in_cloud(scene.cloud.normals)[kept],
         camera_position=observation.camera_position,
@@ -361,64 +339,85 @@ def label(
         at_side=None if scene.at_side is None else scene.at_side[kept],
         object_of_point=scene.object_of_point[kept].astype(np.int16),
     )
+    return view, None if best is None else T_world_hand[best]
 
 
 def choose_grasps(
-    query: Query, options: GenerationOptions, rng: np.random.Generator, *, hard: bool
-) -> tuple[SelectedPoints, Scene, Candidates] | None:
-    """Sample candidates of a view as the detector does and choose some; None without any."""
+    query: Query,
+    options: GenerationOptions,
+    rng: np.random.Generator,
+    guide: GraspDetector | None = None,
+) -> tuple[SelectedPoints, Scene, Candidates, int | None] | None:
+    """Sample candidates of a view as the detector does and choose some; None without any.
+
+    The last is the row of the guide's best among them.
+    """
     observation, request = query
     if len(observation.cloud) == 0:
         return None
-    guide = None if options.weights is None else detector(options.weights)
-    selected = sample = score = None
     if guide is None:
         selected = select_points(check_cloud(observation.cloud), request, {}, [])
         scene = build_scene(selected, request, VOXEL_SIZE, {})
-        if scene is not None and scene.approach_allowed.any():
-            gripper = choose_gripper(request, load_gripper(), {})
-            radius = max(CROP_RADIUS, gripper.max_opening / 2)
-            sample = Sampler(scene, request, gripper, radius, {}, sees_hands=True).all()
+        if scene is None or not scene.approach_allowed.any():
+            return None
+        gripper = choose_gripper(request, load_gripper(), {})
+        radius = max(CROP_RADIUS, gripper.max_opening / 2)
+        sample = Sampler(scene, request, gripper, radius, {}, sees_hands=True).all()
+        rows, best = _any(sample, options.grasps_per_view, rng), None
     else:
         prepared = guide.prepare(observation.cloud, request)
-        selected, scene = prepared.selected, prepared.scene
-        if (scored := guide.evaluate(prepared)) is not None:
-            sample, score = scored.sample, scored.logits
-    if selected is None or scene is None or sample is None or len(sample.candidates) == 0:
+        selected, scene, scored = prepared.selected, prepared.scene, guide.evaluate(prepared)
+        if scene is None or scored is None or len(scored.logits) == 0:
+            return None
+        sample = scored.sample
+        rating = judged_together(scored.logits, sample, scene, prepared.gripper)
+        number = scene.object_of_point[sample.candidates.contact_index]
+        rows = _likely(number, scored.logits, rating, options.grasps_per_view, rng)
+        best = int(np.searchsorted(rows, rating.argmax()))
+    if len(sample.candidates) == 0:
         return None
-    candidates = sample.candidates.take(_chosen(sample, score, options.grasps_per_view, rng, hard))
-    return selected, scene, candidates
+    return selected, scene, sample.candidates.take(rows), best
 
 
-def _chosen(
-    sample: Sample, logit: Floats | None, total: int, rng: np.random.Generator, hard: bool
+def _any(sample: Sample, total: int, rng: np.random.Generator) -> Int64:
+    """Ascending rows of candidates to try, `total` at most, most of them collision-free."""
+    free = rng.permutation(np.flatnonzero(sample.collision_free))
+    hit = rng.permutation(np.flatnonzero(~sample.collision_free))
+    free = free[: max(round(FREE_SHARE * total), total - len(hit))]
+    return np.sort(np.concatenate([free, hit[: round((1.0 - FREE_SHARE) * total)]]))
+
+
+def _likely(
+    number: Int64,  # (E,) the candidates' objects
+    logit: Float32,  # (E,) the network's
+    rating: Float32,  # (E,) that a robot would go by
+    total: int,
+    rng: np.random.Generator,
 ) -> Int64:
-    """Ascending rows of the candidates to try, `total` at most, fewer if the best one is sure.
+    """Ascending rows of candidates to try, some `total`: the best of each object, others like it.
 
-    Some that a network would execute, as many whose outcome it leaves open, the rest at random.
+    Of scores that are trained on grasps drawn at random the best ones are too high.
     """
-    left = np.ones(len(sample.candidates), dtype=bool)
-    guided = 0
-    if logit is not None:
-        score = 1.0 / (1.0 + np.exp(-logit))
-        free = np.flatnonzero(sample.collision_free)
-        ranked = free[np.argsort(-logit[free])][: round(BEST_SHARE * len(logit)) + 1]
-        if not hard and len(ranked) > 0 and score[ranked[0]] >= SURE:
-            total = round(EASY_SHARE * total)
-        each = round(GUIDED_SHARE * total / 2)
-        first, others = ranked[: each // 2], ranked[each // 2 :]
-        left[first] = False
-        left[rng.permutation(others)[: each - len(first)]] = False
-        unsure = np.flatnonzero(left & (score > UNSURE[0]) & (score < UNSURE[1]))
-        left[rng.permutation(unsure)[:each]] = False
-        guided = int((~left).sum())
-    count = total - guided
-    free = rng.permutation(np.flatnonzero(left & sample.collision_free))
-    hit = rng.permutation(np.flatnonzero(left & ~sample.collision_free))
-    free = free[: max(round(FREE_SHARE * count), count - len(hit))]
-    left[free] = False
-    left[hit[: round((1.0 - FREE_SHARE) * count)]] = False
-    return np.flatnonzero(~left)
+    firsts = [_in_object(number, value)[0] == 0 for value in (logit, rating)]
+    chosen = firsts[0] | firsts[1]
+    place, size = _in_object(number, logit)
+    likely = rng.permutation(np.flatnonzero(~chosen & (place < LIKELY * size)))
+    other = rng.permutation(np.flatnonzero(~chosen & (place >= LIKELY * size)))
+    left = max(total - int(chosen.sum()), 0)
+    chosen[likely[: round(LIKELY_SHARE * left)]] = True
+    chosen[other[: round((1.0 - LIKELY_SHARE) * left)]] = True
+    return np.flatnonzero(chosen)
+
+
+def _in_object(number: Int64, value: Floats) -> tuple[Int64, Int64]:
+    """The place (E,) of each candidate among those of its object, best first, and how many."""
+    order = np.lexsort((-value, number))
+    _, start, row, size = np.unique(
+        number[order], return_index=True, return_inverse=True, return_counts=True
+    )
+    place, count = np.empty((2, len(number)), dtype=np.int64)
+    place[order], count[order] = np.arange(len(number)) - start[row], size[row]
+    return place, count
 
 
 def random_gripper(rng: np.random.Generator) -> dict[str, Any]:

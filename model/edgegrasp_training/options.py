@@ -10,8 +10,8 @@ class GenerationOptions(BaseModel, extra="forbid"):
     """What to generate."""
 
     scenes: int = Field(100, ge=1, description="Scenes")
-    scene: Literal["packed", "pile", "bin", "bin-deep", "table"] | None = Field(
-        None, description="Kind of the scenes; else packed, pile, bin and table"
+    scene: Literal["packed", "pile", "bin", "bin-full", "bin-deep", "table", "shelf"] | None = (
+        Field(None, description="Kind of the scenes; else packed, pile, bin and table")
     )
     views_per_scene: int = Field(2, ge=1, description="Cameras in each scene")
     grasps_per_view: int = Field(
@@ -19,7 +19,7 @@ class GenerationOptions(BaseModel, extra="forbid"):
     )
     seed: int = Field(1, ge=0, description="Seed of everything random")
     weights: Path | None = Field(
-        None, description="Network that chooses half of the grasps: its best and its least certain"
+        None, description="Network that clears most of the scenes: its grasps are tried"
     )
     gripper: str = Field(
         "panda",

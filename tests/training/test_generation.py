@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from benchmarks import ur5_objects
 
+from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_model.networks.config import HAND
 from edgegrasp_sim.engine import ENGINES, choose_engine, installed, make_world
 from edgegrasp_sim.engine.urdf import parse_obj
@@ -56,6 +57,20 @@ def test_nothing_is_made_twice_and_a_lost_view_is_made_again_the_same(data: Path
     assert missing_scenes(data, SMALL) == [2]
     assert [index for index, _, _ in generate(data, None, SMALL)] == [2]
     assert lost.read_bytes() == before
+
+
+def test_a_network_clears_the_scenes_and_its_own_grasps_are_tried(tmp_path: Path) -> None:
+    shipped = WEIGHTS_FOLDER / "edgegrasp-plus.safetensors"
+    asked = {"scenes": 2, "views_per_scene": 3, "scene": "packed", "seed": 7}
+    held = []
+    for weights in (shipped, None):
+        folder = tmp_path / str(weights is None)
+        list(generate(folder, None, small(weights=weights, **asked)))
+        views = [load_view(path) for path in find_views([folder])]
+        left = np.array([len(view.objects) for view in views]).reshape(2, 3)
+        assert (left[:, 2] < left[:, 0]).any() == (weights is not None)
+        held.append(np.concatenate([view.success for view in views]).mean())
+    assert held[0] > held[1]
 
 
 def test_labels_of_two_engines_are_not_mixed(data: Path) -> None:
