@@ -21,7 +21,7 @@ from edgegrasp_model.results import Outcome, Ungraspable
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.support import Support
-from edgegrasp_model.unseen import unseen_space
+from edgegrasp_model.unseen import leaves_image, unseen_space
 from edgegrasp_results import DebugInfo, DetectedObject, FoundSupport, Grasp
 
 COLLIDING = 0.5  # factor on the score of a colliding grasp in the ranking
@@ -30,6 +30,7 @@ SURE_SCORE = 0.9  # score from which the order `highest` goes by height (the pap
 HIDDEN = 0.004  # metres of unseen space into which an object may extend
 FLAT = 0.012  # metres of visible height below which the support may block grasps
 DRAWBACK, FAR = 0.01, 0.1  # of a rating; metres from an object's middle
+OUTSIDE = 0.3  # of the rating of a hand that reaches out of the image
 # Hands that are judged together: metres and radians apart; weight of a hand's own logit; factor
 # that calibrates the average.
 ALIKE, ALIKE_ANGLE, OWN, SHARPER = 0.03, math.radians(30), 0.3, 1.3
@@ -76,6 +77,8 @@ def select(
     preferred = rating
     if options.order == "score":
         preferred = rating - drawbacks(scene, sample.candidates.contact_index, T_cloud_tcp)
+        if scene.P_image_cloud is not None:
+            preferred = preferred - OUTSIDE * leaves_image(scene.P_image_cloud, hands, gripper)
     order = ranked(preferred, free, options.order, T_cloud_tcp[:, :3, 3] @ UP, clearance)
 
     outcome = np.full(len(score), CODE[Outcome.BEYOND_TOP_K])

@@ -8,7 +8,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from edgegrasp_camera.arrays import Bools, Float32, Int64
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import distance_behind
 from edgegrasp_model.kernels import compiled
@@ -18,8 +18,10 @@ SPLAT = 2  # cells around its own that a point covers, up to the next point of t
 BEHIND = 0.004  # metres behind a surface that still count as the surface
 DEEP = 0.02  # metres farther behind at which space counts as fully unknown
 FAR = 0.10  # metres behind a surface; distances are clipped here
-UNKNOWN_SHARE = 0.25  # unseen share of palm or approach that counts as a collision
-WAY = 0.05  # metres of straight approach on which a finger sweeps space
+UNKNOWN_SHARE = 0.25  # unseen share of the way of a part of the hand that counts as a collision
+WAY = 0.05  # metres of straight approach on which the hand sweeps space
+SLICES = 9  # of the hand, along y
+OUTSIDE_SHARE = 0.5  # of the way of a slice, from which a hand reaches out of the image
 LINE = 27  # places on the closing line, from beyond one finger to beyond the other
 NOTHING = np.float32(np.inf)
 STEEP = 1e-3  # sine of the angle to up below which up cannot orient the map
@@ -74,10 +76,24 @@ def unseen_space(
 def enters_unseen(depths: Sequence["DepthMap"], T_cloud_hand: Float32, gripper: Gripper) -> Bools:
     """Which hands (E,) would enter unseen space with more than their finger ends."""
     entered = np.zeros(len(T_cloud_hand), dtype=np.bool_)
-    for places in (probes(gripper)[-1], *_ways(gripper)) if depths else ():
-        behind = _behind_all(depths, T_cloud_hand, places)
-        entered |= unseen(behind).mean(axis=1) > UNKNOWN_SHARE
+    for places in (*_palm_ways(gripper), *_ways(gripper)) if depths else ():
+        left = np.flatnonzero(~entered)
+        behind = _behind_all(depths, T_cloud_hand[left], places)
+        entered[left] = unseen(behind).mean(axis=1) > UNKNOWN_SHARE
     return entered
+
+
+def leaves_image(
+    P_image_cloud: Float64,  # (3, 4) as in `Scene`
+    T_cloud_hand: Float32,  # (E, 4, 4)
+    gripper: Gripper,
+) -> Bools:
+    """Which hands (E,) reach out of the image on the approach, where nobody knows what is there."""
+    places = np.stack(_palm_ways(gripper))  # (slices, S, 3)
+    P_image_hand = (P_image_cloud @ T_cloud_hand.astype(np.float64))[:, None]  # (E, 1, 3, 4)
+    seen = P_image_hand[..., :3] @ places.transpose(0, 2, 1) + P_image_hand[..., 3:]
+    outside = (np.abs(seen[..., :2, :]) > seen[..., 2:, :]).any(axis=2)  # (E, slices, S)
+    return np.asarray(outside.mean(axis=2).max(axis=1) > OUTSIDE_SHARE)
 
 
 def _behind_all(depths: Sequence["DepthMap"], T_cloud_hand: Float32, places: Float32) -> Float32:
@@ -130,6 +146,16 @@ def _ways(gripper: Gripper) -> list[Float32]:
     thick = max(high[1] for _, high in gripper.finger_boxes)
     x, z = [-0.7 * half, 0.7 * half], root - np.linspace(0.0, WAY, 5)[1:]
     return [_grid(x, side * (inner + np.array([0.15, 0.7]) * thick), z) for side in (1.0, -1.0)]
+
+
+@lru_cache(maxsize=16)
+def _palm_ways(gripper: Gripper) -> list[Float32]:
+    """Points of the space that slices of the hand sweep, from end to end: each (S, 3)."""
+    slices = []
+    for low, high in gripper.hand_boxes:
+        x, z = 0.6 * np.array([low[0], high[0]]), np.linspace(low[2] - WAY, high[2], 7)[:-1]
+        slices += [_grid(x, [y], z) for y in np.linspace(low[1], high[1], SLICES)]
+    return slices
 
 
 @lru_cache(maxsize=16)

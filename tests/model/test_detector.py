@@ -21,7 +21,7 @@ from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Detection
 
-from .rendered import FOCAL_LENGTH, HEIGHT, WIDTH, boxes_on_table, camera, render, table
+from .rendered import FOCAL_LENGTH, HEIGHT, SCENE, WIDTH, boxes_on_table, camera, render, table
 from .scenes import PANDA, TINY, box_on_table, detector, scene_of
 
 CLOUD = box_on_table()
@@ -273,23 +273,41 @@ def test_a_device_is_chosen_only_where_it_is(monkeypatch, gpus, name, device) ->
 
 
 @pytest.mark.parametrize(
-    ("camera", "blocked"),
-    [((-0.6, 0.0, 0.0), True), ((0.6, 0.0, 0.0), False), (None, False)],
-    ids=["in front of the plate", "behind it, with the hand", "unknown"],
+    ("camera", "edge", "blocked"),
+    [
+        ((-0.6, 0.0, 0.0), -0.2, True),
+        ((-0.6, 0.0, 0.0), 0.06, True),
+        ((-0.6, 0.0, 0.0), 0.1, False),
+        ((0.6, 0.0, 0.0), -0.2, False),
+        (None, -0.2, False),
+    ],
+    ids=["behind a plate", "an end of it", "beside a plate", "before a plate", "unknown"],
 )
-def test_a_palm_in_space_that_no_camera_saw_counts_as_colliding(camera, blocked) -> None:
-    y, z = np.meshgrid(np.arange(-0.2, 0.2, 0.004), np.arange(-0.2, 0.3, 0.004))
+def test_a_palm_in_space_that_no_camera_saw_counts_as_colliding(camera, edge, blocked) -> None:
+    y, z = np.meshgrid(np.arange(edge, 0.2, 0.004), np.arange(-0.2, 0.3, 0.004))
     plate = np.stack([np.full_like(y, -0.1), y, z], axis=-1).reshape(-1, 3).astype(np.float32)
     viewpoints = None if camera is None else np.array([camera], dtype=np.float32)
     behind, hand = scene_of(plate, viewpoints=viewpoints), np.eye(4, dtype=np.float32)[None]
     assert collides(behind, hand, PANDA, Collision()).tolist() == [blocked]
 
 
-def hopeless() -> GraspDetector:
-    """A detector to which no grasp seems any good."""
+def test_hands_that_reach_out_of_the_image_come_last() -> None:
+    left, right, top, bottom = 80, 250, 60, 200  # through the objects' surroundings
+    image = SCENE[top:bottom, left:right]
+    found = convinced(50.0).detect(image, DetectOptions(viewpoint=(0.0, 0.0, 0.0)))
+    assert len(found.objects) == 4
+    for grasp in found.grasps[:4]:
+        ends = grasp.T_cloud_hand @ np.array([[0, -0.1, 0, 1], [0, 0.1, 0, 1]]).T
+        column, row = ends[:2] / ends[2] * FOCAL_LENGTH
+        assert (abs(column + WIDTH / 2 - (left + right) / 2) < (right - left) / 2).all()
+        assert (abs(row + HEIGHT / 2 - (top + bottom) / 2) < (bottom - top) / 2).all()
+
+
+def convinced(logit: float) -> GraspDetector:
+    """A detector to which all grasps seem equally good."""
     network = build_network(TINY["hand"])
     with torch.no_grad():
-        list(network.parameters())[-1].fill_(-50.0)  # the bias of the last layer
+        list(network.parameters())[-1].fill_(logit)  # the bias of the last layer
     return GraspDetector(network, CheckpointMetadata("no", TINY["hand"], 0.0045, "panda"), PANDA)
 
 
@@ -310,7 +328,7 @@ def test_an_object_without_a_good_grasp_has_a_reason(size, options, reason) -> N
     floor = {"normal": (0, 0, 1), "offset": 0.0}
     known = {"viewpoint": (0.3, 0.2, 0.5), "support": floor, "objects": "off"}
     asked = parse_options(known | {"approach_direction": {"preset": "top-down"}} | options)
-    (single,) = hopeless().detect(box_on_table(3000, size=size), asked).objects
+    (single,) = convinced(-50.0).detect(box_on_table(3000, size=size), asked).objects
     assert single.reason == reason
 
 

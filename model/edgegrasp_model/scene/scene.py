@@ -75,6 +75,8 @@ class Scene:
     viewpoints: Float32 | None = None  # (W, 3) the cameras, if known
     confidence: dict[int, float] = field(default_factory=dict)  # probability of each, if found
     at_side: Bools | None = None  # (V,) where a side of the workspace cuts the cloud off
+    # (3, 4) point to place in the image that was sent, its sides at -1 and 1; None: not known
+    P_image_cloud: Float64 | None = None
 
     @cached_property
     def depths(self) -> list[DepthMap]:
@@ -277,7 +279,29 @@ def build_scene(
         viewpoints=None if viewpoints is None else frame.points(viewpoints).astype(np.float32),
         confidence=selected.confidence,
         obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
+        P_image_cloud=_projection(sent, viewpoints, frame),
     )
+
+
+def _projection(
+    sent: CheckedCloud, viewpoints: Float64 | None, frame: CanonicalFrame
+) -> Float64 | None:
+    """The projection (3, 4) of canonical points into the image of one camera that was sent.
+
+    By direct linear transformation. None without such an image.
+    """
+    if sent.image_size is None or viewpoints is None or len(viewpoints) > 1:
+        return None
+    some, (height, width) = thinned(len(sent.row), 1000), sent.image_size
+    x = (2 * (sent.row[some] % width) + 1)[:, None] / width - 1
+    y = (2 * (sent.row[some] // width) + 1)[:, None] / height - 1
+    eye = frame.points(viewpoints)[0].astype(np.float64)
+    sight = unit(frame.points(sent.points[some]) - eye)
+    none = np.zeros_like(sight)
+    equations = np.block([[sight, none, -x * sight], [none, sight, -y * sight]])
+    P = np.linalg.eigh(equations.T @ equations)[1][:, 0].reshape(3, 3)
+    P *= np.sign((sight @ P[2]).sum())
+    return np.column_stack([P, -P @ eye])
 
 
 def _point_of_row(sent: CheckedCloud, voxels: Voxels, kept: Bools) -> Int64:
