@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -187,7 +187,6 @@ def generate_scene(
     if streams[SCENE_STREAM].random() < OTHER_OBJECTS:
         other = PILE if source is PACKED else PACKED
         source = other if other in sets else source
-    views = []
     with TemporaryDirectory() as shapes:
         drawn = sets.get(source)
         if drawn is not None and streams[SHAPE_STREAM].random() < VARIED_SHARE:
@@ -209,32 +208,51 @@ def generate_scene(
             sizes = HOUSEHOLD_SCALE if household else sizes
             from_side = household and kind in (PACKED, PILE, TABLE)
             seen_from = SIDE_VIEWS if from_side else VIEWS[kind]
-            cleared = options.weights is not None and streams[SCENE_STREAM].random() < CLEARED_SHARE
-            guide = detector(options.weights) if cleared and options.weights else None
-            failures = FAILURES
-            for _ in range(options.views_per_scene):
-                if simulation.num_objects == 0 or failures == FAILURES:
-                    count = 1 + int(streams[SCENE_STREAM].poisson(FURTHER_OBJECTS[kind]))
-                    simulation.reset(kind, streams[SCENE_STREAM], count, sizes)
-                    failures = 0
-                models = [model.origin or model for model in simulation.object_models]
-                names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
-                made: dict[str, Any] = {"engine": simulation.world.name, "gripper": hand}
-                made |= {"objects": names, "object_digests": digests}
-                query = ask(simulation, kind, seen_from, streams, guided=guide is not None)
-                choice = streams[CHOICE_STREAM]
-                view, best = label(simulation, query, options, choice, guide)
-                views.append(replace(view, **made))
-                if guide is not None:
-                    success = best is not None and simulation.execute_grasp(best).success
-                    failures = 0 if success else failures + 1
-    return views
+            setting = Setting(kind, sizes, seen_from)
+            views = list(_views(simulation, setting, options, streams))
+    return [replace(view, gripper=hand) for view in views]
+
+
+class Setting(NamedTuple):
+    """How a scene is made, and from where it is seen."""
+
+    kind: SceneKind
+    sizes: tuple[float, float]  # range of the objects' scales
+    seen_from: ViewRange
+
+
+def _views(
+    simulation: ClutterSimulation,
+    setting: Setting,
+    options: GenerationOptions,
+    streams: list[np.random.Generator],
+) -> Iterator[LabelledView]:
+    """The views of one scene, which a network clears meanwhile, if one is given and drawn to."""
+    rng, guide, failures = streams[SCENE_STREAM], None, FAILURES
+    if options.weights is not None and rng.random() < CLEARED_SHARE:
+        guide = detector(options.weights)
+    for _ in range(options.views_per_scene):
+        if simulation.num_objects == 0 or failures == FAILURES:
+            count = 1 + int(rng.poisson(FURTHER_OBJECTS[setting.kind]))
+            simulation.reset(setting.kind, rng, count, setting.sizes)
+            failures = 0
+        models = [model.origin or model for model in simulation.object_models]
+        query = ask(simulation, setting, streams, guided=guide is not None)
+        view, best = label(simulation, query, options, streams[CHOICE_STREAM], guide)
+        yield replace(
+            view,
+            engine=simulation.world.name,
+            objects=tuple(model.name for model in models),
+            object_digests=tuple(model.digest for model in models),
+        )
+        if guide is not None:
+            success = best is not None and simulation.execute_grasp(best).success
+            failures = 0 if success else failures + 1
 
 
 def ask(
     simulation: ClutterSimulation,
-    kind: SceneKind,
-    seen_from: ViewRange,
+    setting: Setting,
     streams: list[np.random.Generator],
     *,
     guided: bool,  # whether a network clears the scene, and has to be asked as a robot asks it
@@ -245,6 +263,7 @@ def ask(
     support is given, not quite where it is, or has to be found.
     """
     noise, choice = streams[NOISE_STREAM], streams[CHOICE_STREAM]
+    kind, _, seen_from = setting
     open_table = kind in (PACKED, PILE)
     around = not open_table or noise.random() < AROUND_SHARE
     draw, seen = noise.random(), dict[str, Any](noise_std=NOISE_STD)
