@@ -76,9 +76,7 @@ def select(
     free = sample.collision_free | (options.collision.mode == "ignore")
     preferred = rating
     if options.order == "score":
-        preferred = rating - drawbacks(scene, sample.candidates.contact_index, T_cloud_tcp)
-        if scene.P_image_cloud is not None:
-            preferred = preferred - OUTSIDE * leaves_image(scene.P_image_cloud, hands, gripper)
+        preferred = rating - drawbacks(scene, sample.candidates.contact_index, hands, gripper)
     order = ranked(preferred, free, options.order, T_cloud_tcp[:, :3, 3] @ UP, clearance)
 
     outcome = np.full(len(score), CODE[Outcome.BEYOND_TOP_K])
@@ -98,12 +96,16 @@ def select(
     return order, outcome
 
 
-def drawbacks(scene: Scene, contact_index: Int64, T_cloud_tcp: Float32) -> Floats:
+def drawbacks(
+    scene: Scene, contact_index: Int64, T_cloud_hand: Float32, gripper: Gripper
+) -> Floats:
     """What is taken off ratings (E,), of which noise would else decide among equal ones.
 
     A hand should be vertical, near the middle of its object as seen from above, and close level and
-    across the line of sight, where both sides are seen; its object should be large.
+    across the line of sight, where both sides are seen; its object should be large. Above all it
+    should stay in the image.
     """
+    T_cloud_tcp = T_cloud_hand @ gripper.T_hand_tcp
     _, row, size = np.unique(scene.object_of_point, return_inverse=True, return_counts=True)
     x, y = (np.bincount(row, plan) / size for plan in scene.cloud.points.T[:2])
     mine = row[contact_index]
@@ -112,6 +114,8 @@ def drawbacks(scene: Scene, contact_index: Int64, T_cloud_tcp: Float32) -> Float
     along, _, tilt = np.abs(T_cloud_tcp[:, :3, 1].T)  # x points to the camera
     small = np.log(size[mine].max(initial=1) / size[mine]) / 3
     taken: Floats = DRAWBACK * (np.minimum(apart / FAR, 1.0) + lean + along + tilt + small)
+    if scene.P_image_cloud is not None:
+        taken = taken + OUTSIDE * leaves_image(scene.P_image_cloud, T_cloud_hand, gripper)
     return taken
 
 

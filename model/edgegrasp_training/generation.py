@@ -365,7 +365,7 @@ def choose_grasps(
     query: Query,
     options: GenerationOptions,
     rng: np.random.Generator,
-    guide: GraspDetector | None = None,
+    guide: GraspDetector | None,
 ) -> tuple[SelectedPoints, Scene, Candidates, int | None] | None:
     """Sample candidates of a view as the detector does and choose some; None without any.
 
@@ -382,6 +382,8 @@ def choose_grasps(
         gripper = choose_gripper(request, load_gripper(), {})
         radius = max(CROP_RADIUS, gripper.max_opening / 2)
         sample = Sampler(scene, request, gripper, radius, {}, sees_hands=True).all()
+        if len(sample.candidates) == 0:
+            return None
         rows, best = _any(sample, options.grasps_per_view, rng), None
     else:
         prepared = guide.prepare(observation.cloud, request)
@@ -393,8 +395,6 @@ def choose_grasps(
         number = scene.object_of_point[sample.candidates.contact_index]
         rows = _likely(number, scored.logits, rating, options.grasps_per_view, rng)
         best = int(np.searchsorted(rows, rating.argmax()))
-    if len(sample.candidates) == 0:
-        return None
     return selected, scene, sample.candidates.take(rows), best
 
 
@@ -417,9 +417,8 @@ def _likely(
 
     Of scores that are trained on grasps drawn at random the best ones are too high.
     """
-    firsts = [_in_object(number, value)[0] == 0 for value in (logit, rating)]
-    chosen = firsts[0] | firsts[1]
     place, size = _in_object(number, logit)
+    chosen = (place == 0) | (_in_object(number, rating)[0] == 0)
     likely = rng.permutation(np.flatnonzero(~chosen & (place < LIKELY * size)))
     other = rng.permutation(np.flatnonzero(~chosen & (place >= LIKELY * size)))
     left = max(total - int(chosen.sum()), 0)
