@@ -426,8 +426,12 @@ def _between_pads(
 @compiled("contract")
 def _likeness(one: Float32, other: Float32) -> np.float32:
     """Trace of the rotation between two (3, 3); half a turn about z counts as none."""
-    along = (one * other).sum(axis=0)  # cosines of matching axes
-    likeness: np.float32 = along[2] + abs(along[0] + along[1])
+    x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)  # cosines of matching axes
+    for d in range(3):
+        x += one[d, 0] * other[d, 0]
+        y += one[d, 1] * other[d, 1]
+        z += one[d, 2] * other[d, 2]
+    likeness: np.float32 = z + abs(x + y)
     return likeness
 
 

@@ -90,10 +90,18 @@ def leaves_image(
 ) -> Bools:
     """Which hands (E,) reach out of the image on the approach, where nobody knows what is there."""
     places = np.stack(_palm_ways(gripper))  # (slices, S, 3)
-    P_image_hand = (P_image_cloud @ T_cloud_hand.astype(np.float64))[:, None]  # (E, 1, 3, 4)
-    seen = P_image_hand[..., :3] @ places.transpose(0, 2, 1) + P_image_hand[..., 3:]
-    outside = (np.abs(seen[..., :2, :]) > seen[..., 2:, :]).any(axis=2)  # (E, slices, S)
-    return np.asarray(outside.mean(axis=2).max(axis=1) > OUTSIDE_SHARE)
+    low, high = places.min(axis=(0, 1)), places.max(axis=(0, 1))
+    P_image_hand = P_image_cloud @ T_cloud_hand.astype(np.float64)  # (E, 3, 4)
+
+    def outside(hands: Float64, points: Float32) -> Bools:
+        seen = hands[..., :3] @ points.swapaxes(-1, -2) + hands[..., 3:]
+        return np.asarray((np.abs(seen[..., :2, :]) > seen[..., 2:, :]).any(axis=-2))
+
+    # A hand whose box is within the image needs no closer look.
+    leaves = outside(P_image_hand, _grid(*zip(low, high, strict=True))).any(axis=1)
+    share = outside(P_image_hand[leaves, None], places).mean(axis=2).max(axis=1)  # of a slice
+    leaves[leaves] = share > OUTSIDE_SHARE
+    return leaves
 
 
 def _behind_all(depths: Sequence["DepthMap"], T_cloud_hand: Float32, places: Float32) -> Float32:
