@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_model.candidates.edge_grasps import Candidates, edge_grasps
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_description import Surroundings
-from edgegrasp_model.networks import layers
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import EDGEGRASP_SMALL, HAND, NetworkConfig
@@ -23,9 +22,6 @@ from edgegrasp_model.scene.cloud import Cloud
 from .scenes import PANDA, SEED, TINY, RandomScene
 
 architectures = pytest.mark.parametrize("architecture", ["edgegrasp", "vn-edgegrasp"])
-has_onednn = pytest.mark.skipif(
-    not hasattr(torch.ops.mkldnn, "_reorder_linear_weight"), reason="PyTorch has no oneDNN here"
-)
 
 
 def scores(network: torch.nn.Module, batch: BallBatch) -> torch.Tensor:
@@ -61,7 +57,6 @@ def test_scores_depend_neither_on_point_order_nor_on_other_balls(architecture, s
         torch.testing.assert_close(alone, here, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("onednn", [False, pytest.param(True, marks=has_onednn)])
 @pytest.mark.parametrize(
     "config",
     [
@@ -70,10 +65,7 @@ def test_scores_depend_neither_on_point_order_nor_on_other_balls(architecture, s
     ],
     ids=["edgegrasp", "vn-edgegrasp"],
 )
-def test_a_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it(
-    config, onednn, monkeypatch
-):
-    monkeypatch.setattr(layers, "onednn_is_faster", lambda: onednn)
+def test_a_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it(config):
     network, scene = build_network(config), RandomScene.of_seed(3)
     together = scores(network, scene.batch(torch.float32))
     for ball in range(len(scene.approach_index)):

@@ -41,7 +41,7 @@ from edgegrasp_model.scene.scene import Scene
 POINT_UNIT = 0.05  # metres; scale of the positions around the fingers
 DROPOUT = 0.1  # dropout of the classifier's inputs
 CONSTANT = 1e-6  # standard deviation below which a number of the description counts as constant
-CHUNK = 32  # hands at a time, so that the work stays in cache
+CHUNK = 64  # hands at a time, so that the work stays in cache
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,8 @@ is the same whatever else is scored with it.
 """
 
 from collections.abc import Callable, MutableMapping, Sequence
-from functools import cache
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -71,7 +70,7 @@ def row_linear(values: Tensor, weight: Tensor, bias: Tensor | None = None) -> Te
 
 
 class PackedLinear:
-    """A linear layer for many chunks of rows in one forward pass, by the faster library."""
+    """A linear layer for many chunks of rows in one forward pass, by oneDNN where it is there."""
 
     def __init__(
         self, weight: Tensor, bias: Tensor | None = None, *, rectified: bool = False
@@ -109,16 +108,6 @@ class PackedMlp:
         return values
 
 
-@cache
-def onednn_is_faster() -> bool:
-    """Whether oneDNN multiplies about twice as fast as MKL: on AMD with AVX-512."""
-    get: Any = getattr(torch.cpu, "get_capabilities", dict)  # newer PyTorch has it
-    amd = "AMD" in str(get().get("cpu_name", ""))
-    ours = torch.backends.cpu.get_cpu_capability() == "AVX512" and amd
-    there = torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
-    return ours and there and hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
-
-
 def float32_inference(values: Tensor) -> bool:
     """Whether this is float32 inference on a processor."""
     return (
@@ -131,7 +120,8 @@ def float32_inference(values: Tensor) -> bool:
 
 def _packed(weight: Tensor) -> Tensor | None:
     """A weight packed for oneDNN; None if the plain product is used."""
-    if len(weight) == 1 or not (float32_inference(weight) and onednn_is_faster()):
+    there = torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
+    if len(weight) == 1 or not (there and float32_inference(weight)):
         return None
     version = -1 if weight.is_inference() else weight._version  # their changes are not counted
     if version < 0 or _PACKED.get(weight, (-1, weight))[0] != version:
