@@ -15,7 +15,10 @@ class GenerationOptions(BaseModel, extra="forbid"):
     )
     views_per_scene: int = Field(2, ge=1, description="Cameras in each scene")
     grasps_per_view: int = Field(
-        100, ge=0, description="Grasps tried in each view; 0: a teacher labels the views"
+        100,
+        ge=0,
+        description="Grasps tried in each view, with weights at least two of each object; 0: a "
+        "teacher labels the views",
     )
     seed: int = Field(1, ge=0, description="Seed of everything random")
     weights: Path | None = Field(
