@@ -272,4 +272,6 @@ def relabelled(labels: Int64, named: Mapping[int, int]) -> Int64:
     table = np.full(labels.max(initial=0) + 1, OBSTACLE)
     for before, now in named.items():
         table[before] = now
-    return np.where(labels >= 0, table[np.maximum(labels, 0)], labels)
+    held, renamed = np.flatnonzero(labels >= 0), labels.copy()
+    renamed[held] = table[labels[held]]
+    return renamed

@@ -121,8 +121,9 @@ def choose_support(
         # A bin's floor is not measured by the table around it; a followed object's workspace is
         # no bin.
         around = np.inf if options.follows_only else BELOW_WORKSPACE * np.abs(request.normal)
-        over = inside_workspace(seen.points, options.workspace, around)
-        found = measured(Seen(seen.points[over], seen.viewpoint), request, GIVEN_MARGIN)
+        over = np.flatnonzero(inside_workspace(seen.points, options.workspace, around))
+        some = over[thinned(len(over))]
+        found = measured(Seen(seen.points[some], seen.viewpoint), request, GIVEN_MARGIN)
     else:
         rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
         if isinstance(request, RansacPlane):
