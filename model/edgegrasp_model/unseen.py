@@ -98,7 +98,8 @@ def leaves_image(
         return np.asarray((np.abs(seen[..., :2, :]) > seen[..., 2:, :]).any(axis=-2))
 
     # A hand whose box is within the image needs no closer look.
-    leaves = outside(P_image_hand, _grid(*zip(low, high, strict=True))).any(axis=1)
+    corners = _grid(*zip(low, high, strict=True))
+    leaves: Bools = np.asarray(outside(P_image_hand, corners).any(axis=1))
     share = outside(P_image_hand[leaves, None], places).mean(axis=2).max(axis=1)  # of a slice
     leaves[leaves] = share > OUTSIDE_SHARE
     return leaves
