@@ -25,7 +25,7 @@ class NetworkConfig:
     global_widths_2: tuple[Count, ...] = ()  # shared MLP before the second
     classifier_widths: tuple[Count, ...] = ()  # hidden layers
     hand_widths: tuple[Count, ...] = ()  # of `hand`: shared MLP before the maximum over the points
-    hand_points: Count = 64  # of `hand`: points around the fingers
+    hand_points: Count = 128  # of `hand`: points around the fingers
     # Of `hand`: numbers it reads of each hand description, the first.
     description_size: Annotated[Count, Field(le=HAND_DESCRIPTION_SIZE)] = 61
     k: Count = 16  # neighbours in the graph, the point itself included
