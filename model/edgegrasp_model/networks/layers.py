@@ -70,7 +70,7 @@ def row_linear(values: Tensor, weight: Tensor, bias: Tensor | None = None) -> Te
 
 
 class PackedLinear:
-    """A linear layer for many chunks of rows in one forward pass, by oneDNN where it is there."""
+    """A linear layer for many chunks of rows in one forward pass, by oneDNN on x86."""
 
     def __init__(
         self, weight: Tensor, bias: Tensor | None = None, *, rectified: bool = False
@@ -120,7 +120,8 @@ def float32_inference(values: Tensor) -> bool:
 
 def _packed(weight: Tensor) -> Tensor | None:
     """A weight packed for oneDNN; None if the plain product is used."""
-    there = torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
+    avx = torch.backends.cpu.get_cpu_capability().startswith("AVX")  # on others it is unmeasured
+    there = avx and torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
     if len(weight) == 1 or not (there and float32_inference(weight)):
         return None
     version = -1 if weight.is_inference() else weight._version  # their changes are not counted
