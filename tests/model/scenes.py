@@ -22,14 +22,9 @@ VIEW = (0.3, 0.2, 0.5)
 RADIUS = 0.05
 # Networks of the paper's shape, narrow enough for many examples.
 TINY = {
-    "edgegrasp": NetworkConfig(
-        "edgegrasp", (8, 12, 16), (16, 20, 24), (28, 32), (24, 16), crop_radius=0.04
-    ),
-    "vn-edgegrasp": NetworkConfig(
-        "vn-edgegrasp", (8, 12, 16), (16, 20, 24), (28, 32), (24, 16), crop_radius=0.04
-    ),
-    "hand": NetworkConfig("hand", hand_widths=(8, 8), classifier_widths=(8, 8), crop_radius=0.04),
-}
+    name: NetworkConfig(name, (8, 12, 16), (16, 20, 24), (28, 32), (24, 16), crop_radius=0.04)
+    for name in ("edgegrasp", "vn-edgegrasp")
+} | {"hand": NetworkConfig("hand", hand_widths=(8, 8), classifier_widths=(8, 8), crop_radius=0.04)}
 
 
 @cache

@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.candidates.edge_grasps import Candidates, edge_grasps
-from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.candidates.edge_grasps import edge_grasps
 from edgegrasp_model.hand_description import Surroundings
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network
@@ -98,35 +97,15 @@ def test_a_batch_without_grasps_has_no_scores(architecture):
 # What a hand sees of the cloud in its own frame, and the network that scores it by that.
 
 
-UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)
-CAMERA = np.array([0.3, 0.2, 0.5], dtype=np.float32)
-
-
-def scene(seed: int) -> tuple[Cloud, Candidates]:
-    """A cloud with edge grasps of 60 random pairs."""
+def look(seed: int) -> HandBatch:
+    """What the hands of 60 random pairs of a cloud see of it."""
     rng = np.random.default_rng(seed)
     points = (rng.uniform(-0.5, 0.5, (150, 3)) * (0.06, 0.05, 0.07)).astype(np.float32)
     cloud = Cloud(points, points / np.linalg.norm(points, axis=1, keepdims=True))
-    return cloud, edge_grasps(cloud, *rng.integers(150, size=(2, 60)), PANDA)
-
-
-def plane(up: np.ndarray, offset: float) -> SupportPlane:
-    return SupportPlane(normal=tuple(up.tolist()), offset=offset)
-
-
-def look(
-    cloud: Cloud,
-    candidates: Candidates,
-    camera: np.ndarray | None = CAMERA,
-    support: SupportPlane | None = None,
-    limit: int = 400,
-    gripper: Gripper = PANDA,
-) -> HandBatch:
-    support = support or plane(UP, -0.05)
-    up = np.array(support.normal, dtype=np.float32)
-    cameras = None if camera is None else camera[None]
-    around = Surroundings(cloud, up, support, cameras)
-    return HandBatch.of_hands(around, candidates, gripper, limit)
+    candidates = edge_grasps(cloud, *rng.integers(150, size=(2, 60)), PANDA)
+    up, camera = np.float32([0.0, 0.0, 1.0]), np.float32([[0.3, 0.2, 0.5]])
+    support = SupportPlane(normal=(0.0, 0.0, 1.0), offset=-0.05)
+    return HandBatch.of_hands(Surroundings(cloud, up, support, camera), candidates, PANDA, 400)
 
 
 def hand_scores(batch: HandBatch, config: NetworkConfig = TINY["hand"]) -> torch.Tensor:
@@ -135,7 +114,7 @@ def hand_scores(batch: HandBatch, config: NetworkConfig = TINY["hand"]) -> torch
 
 
 def test_the_order_of_the_points_and_what_follows_them_mean_nothing() -> None:
-    batch = look(*scene(3))
+    batch = look(3)
     draws = torch.rand(batch.points.shape[:2], generator=torch.Generator().manual_seed(1))
     order = draws.argsort(dim=1)
     there = torch.arange(400) < batch.point_count[:, None]
@@ -151,13 +130,13 @@ def test_the_order_of_the_points_and_what_follows_them_mean_nothing() -> None:
 
 
 def test_an_older_network_reads_the_numbers_that_it_knows() -> None:
-    batch, older = look(*scene(2)), replace(HAND, description_size=61)
+    batch, older = look(2), replace(HAND, description_size=61)
     fewer = replace(batch, description=batch.description[:, :61].contiguous())
     assert torch.equal(hand_scores(batch, older), hand_scores(fewer, older))
 
 
 def test_a_hand_s_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it() -> None:
-    batch = look(*scene(0))
+    batch = look(0)
     together = hand_scores(batch, HAND)
     for rows in (slice(1), slice(3), slice(20, 37), slice(None, None, 2)):
         parts = batch.description[rows], batch.points[rows], batch.point_count[rows]
@@ -165,7 +144,7 @@ def test_a_hand_s_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it()
 
 
 def test_weights_that_were_changed_are_those_that_score() -> None:
-    batch = look(*scene(5))
+    batch = look(5)
     changed, fresh = (build_network(TINY["hand"]).eval() for _ in range(2))
     with torch.inference_mode():
         before = changed(batch)
