@@ -76,7 +76,6 @@ def read(transport, body):
     return read_as(Detection, json.loads(body), operator.getitem)
 
 
-@pytest.mark.parametrize("transport", ["grpc", "http"])
 def test_the_client_reads_the_best_pick(robot, transport):
     given, catalogue = ask(robot, transport)
     assert given.error is None
@@ -92,7 +91,6 @@ def test_the_client_reads_the_best_pick(robot, transport):
     assert catalogue.options.gripper.name == robot.gripper.name  # for which grasps are
 
 
-@pytest.mark.parametrize("transport", ["grpc", "http"])
 def test_reach_alone_and_what_is_out_of_reach(robot, transport):
     far = TURNED.copy()
     far[0, 3] += 3.0
@@ -105,7 +103,6 @@ def test_reach_alone_and_what_is_out_of_reach(robot, transport):
     assert near.trajectory is None
 
 
-@pytest.mark.parametrize("transport", ["grpc", "http"])
 def test_the_client_reads_where_an_object_is_put(robot, transport):
     pose = np.eye(4)
     pose[:3, 3] = 0.4, -0.35, 0.1
@@ -136,7 +133,7 @@ def test_a_start_that_collides_is_refused_as_a_wrong_request(robot):
 def test_a_server_lists_its_robots(start_dummy, robot):
     joints = np.random.default_rng(0).uniform(robot.lower, robot.upper)
     with start_dummy("--robots", "fr3") as server:
-        for transport in ("grpc", "http"):
+        for transport in ("grpc", "rest"):
             with GraspClient(server.address(transport)) as client:
                 (listed,) = client.robots()
             for field, value in robot.describe().items():
