@@ -1,5 +1,6 @@
 """One API, either transport, synchronous or not: the same values and the same exceptions."""
 
+import asyncio
 import dataclasses
 import itertools
 import os
@@ -107,16 +108,12 @@ def test_models_and_readiness(client) -> None:
     client.wait_until_ready(5)
 
 
-async def test_concurrent_requests_of_the_async_client_get_their_own_answers(dummy_server, cloud):
-    import asyncio
-
-    for address in (dummy_server.grpc_address, dummy_server.http_url):
-        async with AsyncGraspClient(address) as client:
-            detections = await asyncio.gather(*(client.detect(cloud, seed=s) for s in range(8)))
-        assert len({tuple(d.grasps[0].contact_point) for d in detections}) > 1
-        with GraspClient(address) as sync:
-            for seed, detection in enumerate(detections):
-                assert_same(detection, sync.detect(cloud, seed=seed))
+async def test_concurrent_requests_get_their_own_answers(dummy_server, transport, client, cloud):
+    async with AsyncGraspClient(dummy_server.address(transport)) as asynchronous:
+        detections = await asyncio.gather(*(asynchronous.detect(cloud, seed=s) for s in range(8)))
+    assert len({tuple(d.grasps[0].contact_point) for d in detections}) > 1
+    for seed, detection in enumerate(detections):
+        assert_same(detection, client.detect(cloud, seed=seed))
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # of several threads
@@ -200,7 +197,7 @@ def test_what_cannot_be_sent_ends_the_stream_after_what_went_before(client, clou
         StreamRequest()
 
 
-def test_requests_are_read_as_they_are_sent(dummy_server, cloud) -> None:
+def test_requests_are_read_as_they_are_sent(client, cloud) -> None:
     """A controller's clouds have no end; leaving the answers ends the stream."""
     taken: list[int] = []
 
@@ -209,15 +206,12 @@ def test_requests_are_read_as_they_are_sent(dummy_server, cloud) -> None:
             taken.append(number)
             yield StreamRequest(cloud)
 
-    for address in (dummy_server.grpc_address, dummy_server.http_url):
-        taken.clear()
-        with GraspClient(address) as client:
-            answers = client.detect_stream(clouds())
-            assert [next(answers).request_id for _ in range(5)] == list("01234")
-            answers.close()
-            read = len(taken)
-            assert client.detect(cloud).grasps
-            assert len(taken) <= read + 1  # one may be under way
+    answers = client.detect_stream(clouds())
+    assert [next(answers).request_id for _ in range(5)] == list("01234")
+    answers.close()
+    read = len(taken)
+    assert client.detect(cloud).grasps
+    assert len(taken) <= read + 1  # one may be under way
 
 
 async def test_an_asynchronous_source(dummy_server, cloud, transport: str) -> None:
