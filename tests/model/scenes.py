@@ -28,13 +28,10 @@ TINY = {
 
 
 @cache
-def detector(architecture: str = "hand") -> GraspDetector:
+def detector() -> GraspDetector:
     """A quick detector; random weights whose scores the temperature spreads."""
-    config = TINY[architecture]
-    metadata = CheckpointMetadata(
-        "tiny", config, voxel_size=0.0045, gripper="panda", temperature=0.01
-    )
-    return GraspDetector(build_network(config), metadata, PANDA)
+    metadata = CheckpointMetadata("tiny", TINY["hand"], 0.0045, "panda", temperature=0.01)
+    return GraspDetector(build_network(TINY["hand"]), metadata, PANDA)
 
 
 @cache

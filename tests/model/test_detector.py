@@ -30,9 +30,8 @@ NOWHERE = {"min": (1, 1, 1), "max": (2, 2, 2)}
 WALL = {"kind": "box", "min": [-1, -1, -1], "max": [1, 1, 1]}  # holds every hand
 
 
-def detect(cloud: object = CLOUD, architecture: str = "hand", **fields: object) -> Detection:
-    options = DetectOptions.model_validate(ASKED | fields)
-    return detector(architecture).detect(cloud, options)
+def detect(cloud: object = CLOUD, **fields: object) -> Detection:
+    return detector().detect(cloud, DetectOptions.model_validate(ASKED | fields))
 
 
 def same(one: Detection, other: Detection) -> bool:
