@@ -1,6 +1,5 @@
 """Whatever comes in, a decoder gives arrays or a 4xx, within memory that the bytes explain."""
 
-import io
 import json
 import struct
 import zlib
@@ -10,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import strategies as st
-from PIL import Image
-from tests.cloud_files import npy
+from tests.cloud_files import npy, png
 from tests.service.worker.conftest import ask as ask_worker
 
 from edgegrasp.v1 import grasp_pb2
@@ -53,25 +51,23 @@ def test_mutated_files_decode_or_are_refused(file_format: str, data: st.DataObje
     decode(len(content), cloud=File(file_format, content))
 
 
-def chunk_places(png: bytes) -> Iterator[tuple[int, int]]:
+def chunk_places(image: bytes) -> Iterator[tuple[int, int]]:
     """Start and size of each chunk."""
     start = 8
-    while start < len(png):
-        size = int.from_bytes(png[start : start + 4])
+    while start < len(image):
+        size = int.from_bytes(image[start : start + 4])
         yield start, size
         start += 12 + size
 
 
-PNG = io.BytesIO()
-Image.fromarray(np.arange(400, 800, dtype=np.uint16).reshape(20, 20)).save(PNG, "png")
+PNG = png(np.arange(400, 800, dtype=np.uint16).reshape(20, 20))
+PNG_CHUNKS = [PNG[start : start + 12 + size] for start, size in chunk_places(PNG)]
+PNG_CHUNKS += [
+    b"\0\0\0\0" + kind + b"\0\0\0\0" for kind in (b"tRNS", b"iCCP", b"zTXt", b"acTL", b"gAMA")
+]
 
 
-PNG_CHUNKS = [
-    PNG.getvalue()[start : start + 12 + size] for start, size in chunk_places(PNG.getvalue())
-] + [b"\0\0\0\0" + kind + b"\0\0\0\0" for kind in (b"tRNS", b"iCCP", b"zTXt", b"acTL", b"gAMA")]
-
-
-@given(mutated([PNG.getvalue()]))
+@given(mutated([PNG]))
 def test_mutated_images_decode_or_are_refused(content: bytes) -> None:
     depth = File("png", content)
     decode(len(content), depth_images=[{"depth": depth, "intrinsics": [30.0, 30.0, 9.5, 9.5]}])
@@ -81,7 +77,7 @@ def test_mutated_images_decode_or_are_refused(content: bytes) -> None:
 @given(st.lists(st.tuples(st.sampled_from(PNG_CHUNKS), st.none() | st.binary(max_size=40))))
 def test_images_of_arbitrary_chunks_decode_or_are_refused(chunks) -> None:
     """Chunks whose sums are right, and which say what they like."""
-    content = PNG.getvalue()[:8]
+    content = PNG[:8]
     for original, data in chunks:
         body = original[4:8] + (original[8:-4] if data is None else data)
         content += struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))

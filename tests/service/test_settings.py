@@ -5,7 +5,6 @@ import os
 from pathlib import Path
 
 import pytest
-from click.testing import Result
 from typer.testing import CliRunner
 
 from edgegrasp_cli import main
@@ -25,10 +24,6 @@ def no_variables(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
     return tmp_path / "server.toml"
-
-
-def serve(*flags: str) -> Result:
-    return CliRunner().invoke(main.app, ["serve", *flags])
 
 
 def test_each_source_wins_over_the_one_before(monkeypatch, config) -> None:
@@ -121,7 +116,8 @@ def test_a_clients_variables_are_not_the_servers(monkeypatch: pytest.MonkeyPatch
 
 def test_the_settings_in_effect_are_printed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EDGEGRASP_GRPC_PORT", "7")
-    done = serve("--print-config", "--http-port", "9", "--weights", "/a", "--weights", "/b")
+    flags = ("--print-config", "--http-port", "9", "--weights", "/a", "--weights", "/b")
+    done = CliRunner().invoke(main.app, ["serve", *flags])
     assert done.exit_code == 0, done.output
     printed = json.loads(done.stdout)
     assert (printed["http_port"], printed["grpc_port"]) == (9, 7)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.checks import bounded_memory
-from tests.cloud_files import npy
+from tests.cloud_files import npy, point_cloud2
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client.over_grpc import fill
@@ -75,12 +75,7 @@ def image(**changes: Any) -> dict[str, Any]:
 
 def ros(**changes: Any) -> dict[str, Any]:
     """A good PointCloud2 of 60 points, with changes."""
-    fields = [
-        {"name": name, "offset": 4 * row, "datatype": 7, "count": 1}
-        for row, name in enumerate("xyz")
-    ]
-    layout = {"height": 1, "width": 60, "fields": fields, "is_bigendian": False}
-    return layout | {"point_step": 12, "row_step": 720, "data": POINTS.tobytes()} | changes
+    return point_cloud2(POINTS) | changes
 
 
 def option(name: str, value: Any, at: str, got: str, fix: str) -> Malformed:
