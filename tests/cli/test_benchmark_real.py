@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.model.rendered import FOCAL_LENGTH, HEIGHT, WIDTH, box, camera, render, seen_box, table
 
 from edgegrasp_cli.benchmark_tracking import MOTIONS, follow, simulated
 from edgegrasp_cli.detect import OwnDetector
@@ -13,33 +14,22 @@ from edgegrasp_cli.real_scenes import SceneFigures, compare_labels, judge, load_
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_results import Grasp
 
-SHAPE, INTRINSICS = (120, 160), (150.0, 150.0, 79.5, 59.5)
-NORMAL = np.array([0.0, -np.sqrt(0.75), -0.5])  # the camera looks down by 30 degrees
-OFFSET = -0.4
-ALONG = np.array([0.0, 0.5, -np.sqrt(0.75)])  # on the table, toward the camera
-TABLE = OFFSET * NORMAL - 0.35 * ALONG  # where the box stands
-HALF = np.array([0.02, 0.03, 0.06])  # half its size: across, along and up
+POSE = camera(0.7, -np.pi / 2, 0.5)  # T_world_camera
+HALF = np.array([0.02, 0.03, 0.06])  # half the size of a box: across, along and up
+BOXES = [table(), box((0, 0, HALF[2]), HALF)]
+SHAPE, INTRINSICS = (HEIGHT, WIDTH), (FOCAL_LENGTH, FOCAL_LENGTH, WIDTH / 2, HEIGHT / 2)
+# Of the table in the camera's frame; along it is toward the camera.
+NORMAL, ALONG, TABLE = POSE[2, :3], -POSE[1, :3], np.array([0.0, 0.0, 0.5])
 
 
-def seen_box() -> dict[str, Any]:
+def seen_scene() -> dict[str, Any]:
     """A scene: a depth camera's image of a box on a table."""
-    turn = np.stack([np.cross(ALONG, NORMAL), ALONG, NORMAL])  # camera to box axes
-    fx, fy, cx, cy = INTRINSICS
-    row, column = np.indices(SHAPE)
-    rays = np.stack([(column - cx) / fx, (row - cy) / fy, np.ones(SHAPE)], axis=-1)
-    with np.errstate(divide="ignore"):
-        table = OFFSET / (rays @ NORMAL)
-        start, way = -turn @ TABLE - (0, 0, HALF[2]), rays @ turn.T
-        sides = np.stack([(-HALF - start) / way, (HALF - start) / way])
-    enter, leave = sides.min(axis=0).max(axis=-1), sides.max(axis=0).min(axis=-1)
-    on_box = (enter < leave) & (enter > 0)
-    depth = np.where(on_box, enter, np.where((table > 0) & (table < 1.2), table, 0.0))
     return {
-        "depth": np.rint(1000 * depth).astype(np.uint16),
+        "depth": np.rint(1000 * np.nan_to_num(render(BOXES, POSE)[..., 2])).astype(np.uint16),
         "intrinsics": np.array(INTRINSICS, dtype=np.float32),
-        "labels": np.where(on_box, 2, depth > 0).astype(np.uint8),
+        "labels": (1 + seen_box(BOXES, POSE)).reshape(SHAPE).astype(np.uint8),
         "support_normal": NORMAL.astype(np.float32),
-        "support_offset": np.float32(OFFSET),
+        "support_offset": np.float32(NORMAL @ TABLE),
     }
 
 
@@ -55,7 +45,7 @@ def grasp(approach: np.ndarray, tip: np.ndarray, *, end: np.ndarray, score: floa
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    np.savez(tmp_path / "box.npz", **seen_box())
+    np.savez(tmp_path / "box.npz", **seen_scene())
     return tmp_path / "box.npz"
 
 
@@ -103,7 +93,7 @@ def test_a_plane_is_right_within_5_degrees_and_10_mm(scene, tilt, shift, right) 
 
 def test_clouds_show_the_same_scene_as_depth_images(scene: Path, tmp_path: Path) -> None:
     """Organised, with y up and z backward as OpenGL has it, and unorganised."""
-    arrays = seen_box()
+    arrays = seen_scene()
     image = load_scene(scene)
     turned = image.points * np.float32([1, -1, -1])
     organised = {"points": turned.reshape(*SHAPE, 3), "support_normal": NORMAL * (1, -1, -1)}
@@ -140,7 +130,7 @@ def test_results_page_and_pictures(scene: Path, run, tmp_path: Path) -> None:
 def test_of_a_heap_that_hides_its_support_no_plane_and_no_objects_are_judged(scene, run, tmp_path):
     heap = tmp_path / "heap" / "heap.npz"
     heap.parent.mkdir()
-    np.savez(heap, **{k: v for k, v in seen_box().items() if not k.startswith("support_")})
+    np.savez(heap, **{k: v for k, v in seen_scene().items() if not k.startswith("support_")})
     output = tmp_path / "results"
     folders = ("--scenes", scene.parent, "--scenes", heap.parent)
     run("benchmark-real", *folders, "--output", output)
@@ -151,7 +141,7 @@ def test_of_a_heap_that_hides_its_support_no_plane_and_no_objects_are_judged(sce
 
 
 def test_a_scene_that_is_refused_counts_as_one_without_grasps(scene, run, tmp_path) -> None:
-    arrays, whole = seen_box(), load_scene(scene)
+    arrays, whole = seen_scene(), load_scene(scene)
     row = np.flatnonzero(whole.labels == 2)[:10]  # fewer points than grasps are asked around
     few = {"points": whole.points[row], "labels": whole.labels[row]}
     beside = {name: arrays[name] for name in ("support_normal", "support_offset")}
@@ -177,7 +167,7 @@ def test_a_scene_that_is_refused_counts_as_one_without_grasps(scene, run, tmp_pa
     ],
 )
 def test_a_bad_file_is_named_with_field_and_fix(field, value, sentence, scene, refused) -> None:
-    arrays = seen_box() | {field: value}
+    arrays = seen_scene() | {field: value}
     np.savez(scene, **{name: array for name, array in arrays.items() if array is not None})
     assert sentence in refused("benchmark-real", "--scenes", scene.parent)
 
@@ -216,7 +206,7 @@ def test_labels_are_compared_object_by_object(answer, pixels, overlap, called, s
 
 
 def test_the_grasp_of_a_recorded_scene_stays_where_it_is(run, tmp_path: Path) -> None:
-    np.savez(tmp_path / "box.npz", **seen_box())
+    np.savez(tmp_path / "box.npz", **seen_scene())
     shown = run(
         "benchmark-tracking", "--scenes", tmp_path, "--seconds", 0.2, "--output", tmp_path / "out"
     )
