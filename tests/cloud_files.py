@@ -32,14 +32,13 @@ def png(pixels: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
-def ply(points: np.ndarray, encoding: str = "binary_little_endian", promised: int = -1) -> bytes:
+def ply(points: np.ndarray, encoding: str = "binary_little_endian") -> bytes:
     """Points (N, 3) float32 with black colours, and one face."""
     fields = {"x": "f4", "red": "u1", "y": "f4", "z": "f4", "green": "u1", "blue": "u1"}
     order = PLY.get(encoding, "<")
     rows = np.zeros(len(points), [(name, order + kind) for name, kind in fields.items()])
     rows["x"], rows["y"], rows["z"] = points.T
-    count = promised if promised >= 0 else len(points)
-    header = f"ply\nformat {encoding} 1.0\ncomment none\nelement vertex {count}\n"
+    header = f"ply\nformat {encoding} 1.0\ncomment none\nelement vertex {len(points)}\n"
     for name, kind in fields.items():
         header += f"property {'float' if kind == 'f4' else 'uchar'} {name}\n"
     header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
