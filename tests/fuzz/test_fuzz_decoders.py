@@ -11,6 +11,7 @@ import pytest
 from hypothesis import strategies as st
 from tests.cloud_files import npy, png
 from tests.service.worker.conftest import ask as ask_worker
+from tests.service.worker.conftest import form, part
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.options import DetectOptions
@@ -113,14 +114,11 @@ OPTIONS = {
 }  # fmt: skip
 
 
-FORM = b"".join(
-    b'--b\r\nContent-Disposition: form-data; name="%s"%s\r\n\r\n%s\r\n' % part
-    for part in [
-        (b"cloud", b'; filename="c.npy"\r\nContent-Type: application/x-npy', FILES["npy"][0]),
-        (b"options", b"\r\nContent-Type: application/json", b'{"seed": 3}'),
-        (b"segment_ids", b"", b"[%s0]" % (b"0, " * 39)),
-    ]
-) + (b"--b--\r\n")
+FORM = form(
+    part("cloud", FILES["npy"][0], '; filename="c.npy"\r\nContent-Type: application/x-npy'),
+    part("options", b'{"seed": 3}', "\r\nContent-Type: application/json"),
+    part("segment_ids", b"[%s0]" % (b"0, " * 39)),
+)
 
 
 # Whole requests
@@ -180,15 +178,12 @@ def test_mutated_forms_decode_or_are_refused(content: bytes, boundary: str, scor
 @pytest.mark.parametrize("file_format", FILES)
 @given(data=st.data())
 def test_mutated_arrays_to_score_decode_or_are_refused(file_format, data) -> None:
-    part = b'--b\r\nContent-Disposition: form-data; name="%s"; filename="a.%s"\r\n\r\n%s\r\n'
-    cloud = part % (b"cloud", file_format.encode(), FILES[file_format][0])
+    cloud = part("cloud", FILES[file_format][0], f'; filename="a.{file_format}"')
     arrays = [*FILES["npy"], npy(np.array(3)), npy(np.array([[0, 1]])), npy(np.eye(4)[None])]
-    given_grasps = part % (
-        data.draw(st.sampled_from([b"edges", b"hand_poses"])),
-        b"npy",
-        data.draw(mutated(arrays) | st.sampled_from(arrays)),
-    )
-    ask("http", cloud + given_grasps + b"--b--\r\n", True, "multipart/form-data; boundary=b")
+    name = data.draw(st.sampled_from(["edges", "hand_poses"]))
+    array = data.draw(mutated(arrays) | st.sampled_from(arrays))
+    body = form(cloud, part(name, array, '; filename="a.npy"'))
+    ask("http", body, True, "multipart/form-data; boundary=b")
 
 
 WORDS = st.text(max_size=12) | st.sampled_from(["[" * 5000, "1,,2", "{", "1e999,0,0", "%F0"])

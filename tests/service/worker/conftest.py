@@ -45,3 +45,14 @@ def problem(*asked: Any, **more: Any) -> Problem:
         assert part
         assert part in error.detail
     return error
+
+
+def form(*parts: tuple[str, bytes], end: bytes = b"--b--\r\n") -> bytes:
+    """A form of parts, whose boundary is b."""
+    return (
+        b"".join(b"--b\r\n%s\r\n\r\n%s\r\n" % (head.encode(), data) for head, data in parts) + end
+    )
+
+
+def part(name: str, data: bytes, more: str = "") -> tuple[str, bytes]:
+    return f'Content-Disposition: form-data; name="{name}"{more}', data

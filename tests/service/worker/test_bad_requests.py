@@ -13,7 +13,7 @@ from tests.cloud_files import npy, point_cloud2
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client.over_grpc import fill
 
-from .conftest import ask, problem
+from .conftest import ask, form, part, problem
 
 POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (60, 3)).astype(np.float32)
 NAN = float("nan")
@@ -273,16 +273,6 @@ def test_unread_media_type(media_type: str) -> None:
 )
 def test_bad_queries(query: str, field: str) -> None:
     assert problem("http", npy(POINTS), "application/x-npy", query).field == field
-
-
-def form(*parts: tuple[str, bytes], end: bytes = b"--b--\r\n") -> bytes:
-    return (
-        b"".join(b"--b\r\n%s\r\n\r\n%s\r\n" % (head.encode(), data) for head, data in parts) + end
-    )
-
-
-def part(name: str, data: bytes, more: str = "") -> tuple[str, bytes]:
-    return f'Content-Disposition: form-data; name="{name}"{more}', data
 
 
 CLOUD = part("cloud", npy(POINTS), '; filename="a.npy"')
