@@ -26,6 +26,7 @@ image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
 
 PROGRAM = [*EDGEGRASP[1:], "mcp"]
 CAMERA = [60.0, 60.0, 15.5, 11.5]
+IMAGE = {"depth_file": "depth.png", "intrinsics": CAMERA}
 CLOUD, DEPTH = "generate_grasps_from_point_cloud", "generate_grasps_from_depth"
 
 
@@ -74,10 +75,9 @@ async def test_an_agent_gets_grasps_and_sees_them(dummy_server, folder: Path) ->
         assert {"objects", "near", "workspace"} <= set(options)
         jsonschema.Draft202012Validator.check_schema(schema)
         validator = jsonschema.Draft202012Validator(schema)
-        given = {"depth_file": "depth.png", "intrinsics": CAMERA}
-        validator.validate(given | {"options": {"workspace": {"min": [0, 0, 0], "max": [1, 1, 1]}}})
+        validator.validate(IMAGE | {"options": {"workspace": {"min": [0, 0, 0], "max": [1, 1, 1]}}})
         for wrong in ({"object": "bottle"}, {"options": {"workspace": 3}}, {"num_grasps": -3}):
-            assert not validator.is_valid(given | wrong)
+            assert not validator.is_valid(IMAGE | wrong)
         assert client.server_info.version == importlib.metadata.version("edgegrasp")
         health = await client.call_tool("edgegrasp_health_check", {})
         assert health.content[0].text == "ready"
@@ -107,8 +107,7 @@ async def test_a_camera_pose_puts_answers_into_the_base_frame(dummy_server, fold
     T_base_camera = np.eye(4)
     T_base_camera[:3, :3] = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
     T_base_camera[:3, 3] = 0.4, 0.1, 0.9
-    asked = {"depth_file": "depth.png", "intrinsics": CAMERA}
-    asked |= {"T_base_camera": T_base_camera.tolist()}
+    asked = IMAGE | {"T_base_camera": T_base_camera.tolist()}
     depth = np.asarray(image.open(folder / "depth.png"))
     view = {"depth": depth, "intrinsics": CAMERA, "T_cloud_camera": T_base_camera}
     with GraspClient(dummy_server.grpc_address) as client:
@@ -126,15 +125,12 @@ def test_a_folder_that_is_not_there_is_refused() -> None:
 
 async def test_a_mask_is_sent_and_most_grasps_fit_a_context(dummy_server, folder: Path) -> None:
     async with agent(dummy_server.http_url, folder) as client:
-        asked = {"depth_file": "depth.png", "intrinsics": CAMERA, "num_grasps": 20}
+        asked = IMAGE | {"num_grasps": 20}
         result = await client.call_tool(DEPTH, asked)
         assert 1 <= len(answer(result)["grasps"]) <= 20
         assert len(result.content[0].text) < 300 * 20
         shown = await client.call_tool("visualize_grasps", asked | {"mask_file": "mask.png"})
         assert shown.content[1].type == "image"
-
-
-NO_BASE = {"depth_file": "depth.png", "intrinsics": CAMERA, "robot": {"name": "fr3"}}
 
 
 @pytest.mark.parametrize(
@@ -149,7 +145,7 @@ NO_BASE = {"depth_file": "depth.png", "intrinsics": CAMERA, "robot": {"name": "f
         (CLOUD, {"robot": {"name": "fr3"}}, "options.robot.joints"),
         (CLOUD, {"options": {"tok_k": 1}}, "options.tok_k"),
         (DEPTH, {"depth_file": "depth.png", "intrinsics": [1]}, "fx, fy"),
-        (DEPTH, NO_BASE, "give T_base_camera"),
+        (DEPTH, IMAGE | {"robot": {"name": "fr3"}}, "give T_base_camera"),
         ("visualize_grasps", {}, "Give point_cloud_file, or depth_file"),
     ],
 )
@@ -184,8 +180,7 @@ class Planning:
 
 @pytest.mark.parametrize("reaches", [True, False])
 async def test_an_agent_gets_the_joints_of_a_robot(dummy_server, folder, reaches) -> None:
-    T_base_camera = np.diag([1.0, -1.0, -1.0, 1.0]).tolist()
-    asked = {"depth_file": "depth.png", "intrinsics": CAMERA, "T_base_camera": T_base_camera}
+    asked = IMAGE | {"T_base_camera": np.diag([1.0, -1.0, -1.0, 1.0]).tolist()}
     robot = {"name": "arm", "joints": [0.0, 0.0]}
     with GraspClient(dummy_server.grpc_address) as client:
         planning = Planning(client, reaches)

@@ -197,12 +197,11 @@ def test_a_proxy_says_when_to_come_again(make_client, answers_with, cloud) -> No
     assert caught.value.retry_after == 7
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def hasty_retries(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "FIRST_DELAY", 0.001)
 
 
-@pytest.mark.usefixtures("hasty_retries")
 @pytest.mark.parametrize("problems", [[AWAY, BUSY, LOST], [BUSY] * 8], ids=["mixed", "busy"])
 def test_a_server_that_is_away_or_busy_is_asked_again(problems: Any, failing, cloud) -> None:
     client, server = failing(problems)
@@ -210,7 +209,6 @@ def test_a_server_that_is_away_or_busy_is_asked_again(problems: Any, failing, cl
     assert server.calls == len(problems) + 1
 
 
-@pytest.mark.usefixtures("hasty_retries")
 @pytest.mark.parametrize(
     ("problem", "arguments", "calls"),
     [
@@ -238,7 +236,6 @@ def test_requests_of_a_stream_are_sent_once(failing, cloud) -> None:
     assert server.calls == 1
 
 
-@pytest.mark.usefixtures("hasty_retries")
 @pytest.mark.parametrize("scheme", ["", "http://"])
 def test_without_a_server_calls_fail_and_waiting_ends(scheme: str, make_client, cloud) -> None:
     client = make_client(f"{scheme}127.0.0.1:{free_ports(1)[0]}")
@@ -250,23 +247,17 @@ def test_without_a_server_calls_fail_and_waiting_ends(scheme: str, make_client, 
         client.wait_until_ready(0.2)
 
 
-@pytest.fixture(scope="module")
-def slow_server(start_dummy):
+def test_a_deadline_ends_a_call_or_one_request_of_a_stream(start_dummy, make_client, cloud) -> None:
     with start_dummy(seconds=0.5) as server:
-        yield server
-
-
-def test_a_deadline_ends_a_call_or_one_request_of_a_stream(
-    transport: str, slow_server, make_client, cloud
-) -> None:
-    client = make_client(slow_server.address(transport), timeout=0.1)
-    with pytest.raises(DeadlineError):
-        client.detect(cloud)
-    assert client.detect(cloud, timeout=20).grasps
-    requests = [StreamRequest(cloud, timeout=0.1), StreamRequest(cloud)]
-    hasty, patient = client.detect_stream(requests, timeout=20.0)
-    assert isinstance(hasty.error, DeadlineError)
-    assert patient.error is None
+        for address in (server.grpc_address, server.http_url):
+            client = make_client(address, timeout=0.1)
+            with pytest.raises(DeadlineError):
+                client.detect(cloud)
+            assert client.detect(cloud, timeout=20).grasps
+            requests = [StreamRequest(cloud, timeout=0.1), StreamRequest(cloud)]
+            hasty, patient = client.detect_stream(requests, timeout=20.0)
+            assert isinstance(hasty.error, DeadlineError)
+            assert patient.error is None
 
 
 @pytest.mark.parametrize("size", [4_200_000, 9_000_000])  # the latter is over what gRPC reads
