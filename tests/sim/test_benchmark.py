@@ -3,7 +3,7 @@ import json
 import multiprocessing
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -186,13 +186,6 @@ def run(simulation: ClutterSimulation) -> Callable[..., Round]:
     return run
 
 
-@pytest.fixture(scope="module")
-def cubes(engine: str) -> Iterator[ClutterSimulation]:
-    cube = ObjectModel("cube", Path(__file__).parent / "cube.urdf", 1.2)
-    with ClutterSimulation({PACKED: ObjectSet("cubes", (cube,))}, engine=engine) as simulation:
-        yield simulation
-
-
 def test_two_failures_in_a_row_end_a_round(run: Callable[..., Round]) -> None:
     done = run(lambda seen, seed: PlannedGrasp(IN_THE_AIR, 1.0, 0.04), PACKED, 2)
     assert done.end is RoundEnd.FAILURES
@@ -215,16 +208,18 @@ def test_no_grasp_is_no_attempt_and_the_third_ends_a_round(run: Callable[..., Ro
     assert len(set(clouds)) == 3  # a new view every time
 
 
-def test_cubes_are_cleared_though_the_first_view_shows_nothing(cubes, monkeypatch) -> None:
+def test_cubes_are_cleared_though_the_first_view_shows_nothing(engine: str, monkeypatch) -> None:
     views: list[Observation] = []
-    observe_from = cubes.observe_from
+    cube = ObjectModel("cube", Path(__file__).parent / "cube.urdf", 1.2)
+    observe_from = ClutterSimulation.observe_from
 
     def hidden_at_first(*args: object, **rules: object) -> Observation:
         views.append(observe_from(*args, **rules))
         return views[-1] if len(views) > 1 else replace(views[0], cloud=views[0].cloud[:0])
 
-    monkeypatch.setattr(cubes, "observe_from", hidden_at_first)
-    done = RoundDriver(cubes, PACKED, paper_with(3), seed=0, index=0).run(plan)
+    monkeypatch.setattr(ClutterSimulation, "observe_from", hidden_at_first)
+    with ClutterSimulation({PACKED: ObjectSet("cubes", (cube,))}, engine=engine) as cubes:
+        done = RoundDriver(cubes, PACKED, paper_with(3), seed=0, index=0).run(plan)
     assert (done.end, done.no_grasp, done.successes) == (RoundEnd.CLEARED, 1, 3)
     for attempt in done.attempts:
         assert attempt.object == ("cube" if attempt.success else None)

@@ -109,18 +109,13 @@ def test_weights_of_another_network_are_no_start(make_trainer, tmp_path) -> None
 
 
 @pytest.fixture(scope="module")
-def weights(make_trainer, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def teacher(make_trainer, tmp_path_factory: pytest.TempPathFactory) -> Teacher:
     """A hand network that learned which grasps of the made-up views hold."""
     folder = tmp_path_factory.mktemp("guide")
     trainer = make_trainer(folder, name="guide")
     trainer.run(ignore)
     trainer.finish({}, "")
-    return folder / "guide.safetensors"
-
-
-@pytest.fixture(scope="module")
-def teacher(weights: Path) -> Teacher:
-    return Teacher(weights, 0.04)
+    return Teacher(folder / "guide.safetensors", 0.04)
 
 
 def test_a_teacher_scores_candidates_above_the_table(views, teacher) -> None:
