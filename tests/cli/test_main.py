@@ -18,6 +18,8 @@ from edgegrasp.v1 import grasp_pb2
 from edgegrasp_cli import main
 from edgegrasp_service.worker.process import Answer, Facts, Job
 
+from .conftest import invoke
+
 HEAVY = {"torch", "open3d", "grpc", "pybullet", "mujoco", "fastapi", "uvicorn", "httpx"}
 HEAVY |= {"matplotlib"}
 
@@ -49,12 +51,10 @@ def test_help_of_every_command_loads_nothing_heavy() -> None:
     assert not loaded & HEAVY
 
 
-def test_version_short_help_and_completion() -> None:
+def test_version_short_help_and_completion(run) -> None:
     assert loaded_by(["--version"])[0] == f"edgegrasp {importlib.metadata.version('edgegrasp')}\n"
     for words in (["-h"], ["detect", "-h"]):
-        shown = CliRunner().invoke(main.app, words)
-        assert shown.exit_code == 0
-        assert "edgegrasp detect cloud.ply" in " ".join(shown.output.split())
+        assert "edgegrasp detect cloud.ply" in " ".join(run(*words).split())
     bash = {"_EDGEGRASP_COMPLETE": "source_bash"}
     script = CliRunner().invoke(main.app, [], prog_name="edgegrasp", env=bash)
     assert "complete" in script.output
@@ -65,9 +65,7 @@ def test_version_short_help_and_completion() -> None:
 
 
 def test_unknown_command() -> None:
-    result = CliRunner().invoke(main.app, ["detec"])
-    assert result.exit_code == 2
-    assert "Did you mean 'detect'?" in result.output
+    assert "Did you mean 'detect'?" in invoke(2, "detec")
 
 
 @pytest.mark.parametrize(
