@@ -224,13 +224,9 @@ def test_debug_returns_the_cloud_and_every_candidate_with_what_became_of_it() ->
     assert detect().debug is None
 
 
-def write_weights(folder: Path, name: str) -> None:
-    metadata = replace(detector().metadata, name=name)
-    save_checkpoint(folder / f"{name}.safetensors", detector().network, metadata)
-
-
 def test_a_catalogue_finds_weights_by_their_file_name(tmp_path: Path) -> None:
-    write_weights(tmp_path, "mine")
+    metadata = replace(detector().metadata, name="mine")
+    save_checkpoint(tmp_path / "mine.safetensors", detector().network, metadata)
     catalogue = ModelCatalogue.load([tmp_path], default="mine")
     assert {"mine", "edgegrasp-plus"} <= set(catalogue.names())
     assert catalogue.get("").metadata.name == "mine"
