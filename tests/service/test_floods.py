@@ -410,9 +410,7 @@ def test_without_file_descriptors_left_the_log_stays_short(start_dummy, tmp_path
             time.sleep(0.05)
         for connection in held:
             connection.close()
-        assert httpx.get(f"{server.http_url}/health/live", timeout=PATIENCE).status_code == 200
-        with GraspClient(server.grpc_address, timeout=PATIENCE) as client:
-            assert len(client.detect(cloud).grasps) == 10
+        check_alive(server, cloud)
         assert server.stop() == 0
     lines = file.read_text().splitlines()
     assert len(lines) < 20

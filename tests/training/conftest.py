@@ -13,6 +13,7 @@ from edgegrasp_training.options import TrainingOptions
 from edgegrasp_training.training import Trainer
 from edgegrasp_training.views import LabelledView, find_views, split_by_scene
 
+SAMPLE = Path(__file__).parents[2] / "examples" / "labelled_views"
 MakeTrainer = Callable[..., Trainer]
 FAST = {
     "steps": 40,

@@ -23,9 +23,7 @@ from edgegrasp_training.recipes import RECIPES
 from edgegrasp_training.training import Trainer
 from edgegrasp_training.views import find_views, split_by_scene
 
-from .conftest import NETWORKS, made_up_view
-
-SAMPLE = Path(__file__).parents[2] / "examples" / "labelled_views"
+from .conftest import NETWORKS, SAMPLE, made_up_view
 
 
 def ignore(step: int, loss: float) -> None:

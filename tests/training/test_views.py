@@ -28,9 +28,7 @@ from edgegrasp_training.views import (
     split_by_scene,
 )
 
-from .conftest import NETWORKS, made_up_view
-
-SAMPLE = Path(__file__).parents[2] / "examples" / "labelled_views"
+from .conftest import NETWORKS, SAMPLE, made_up_view
 
 
 def test_a_view_comes_back_with_the_hand_that_tried_its_grasps(tmp_path) -> None:
