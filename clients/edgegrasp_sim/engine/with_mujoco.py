@@ -146,8 +146,7 @@ class MujocoWorld(World):
         solid = np.arange(6) == _SOLID
         hits, geom = [], np.empty(1, np.int32)
         for start, end in zip(starts, ends, strict=True):
-            way = end - start
-            share = mujoco.mj_ray(model, data, start, way, solid, 1, -1, geom)
+            share = mujoco.mj_ray(model, data, start, end - start, solid, 1, -1, geom)
             hits.append(self._uid_of_geom[geom[0]] if 0 <= share <= 1 else -1)
         return hits
 
@@ -199,29 +198,20 @@ class MujocoWorld(World):
     def add_box(
         self, size: Vector, centre: Vector, *, friction: float, yaw: float = 0.0
     ) -> "MujocoBody":
-        half = 0.5 * np.asarray(size)
+        kind, half = mujoco.mjtGeom.mjGEOM_BOX, 0.5 * np.asarray(size)
         body = self._add(np.asarray(centre), about_z(yaw))
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=half,
-            friction=(friction, 0, 0),
-            priority=1,  # its friction counts, not the object's
-            group=_SOLID,
-        )
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX, size=half, contype=0, conaffinity=0, group=_VISIBLE
-        )
+        # Its friction counts, not the object's.
+        body.add_geom(type=kind, size=half, friction=(friction, 0, 0), priority=1, group=_SOLID)
+        body.add_geom(type=kind, size=half, contype=0, conaffinity=0, group=_VISIBLE)
         signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
         return MujocoBody(self, body, signs * half)
 
     def add_hand(self, model: HandModel, position: Matrix) -> "MujocoHand":
         body = self._add(np.asarray(position), (0.0, 0.0, 0.0, 1.0))
-        joint = body.add_freejoint()
-        joint.armature = ARM_INERTIA
+        body.add_freejoint().armature = ARM_INERTIA
         palm = self._build_hand(body, model)
         # Springs of limited force along all six axes pull it to the pose of a target.
-        target = self.spec.worldbody.add_body(name="-1 target", mocap=True)
-        target.add_site(name="target")
+        self.spec.worldbody.add_body(name="-1 target", mocap=True).add_site(name="target")
         body.add_site(name="hand")
         damping = 2.0 * (ARM_STIFFNESS * (ARM_INERTIA + body.mass)) ** 0.5
         for axis in range(6):
@@ -276,6 +266,8 @@ class MujocoWorld(World):
         for number, part in enumerate(palm):
             name = f"{body.name} palm {number}"
             self._add_hull(body, name, part, friction=friction, contype=_HAND)
+        pads = (model.finger_friction, FINGER_SPINNING_FRICTION, 0)
+        contact = {"friction": pads, "condim": 4, "priority": 2, "contype": _HAND}
         carrier = body
         if model.advance is not None:  # swinging fingers are on a carriage that slides along z
             carrier = body.add_body(name=f"{body.name} slide", gravcomp=1.0)
@@ -299,17 +291,8 @@ class MujocoWorld(World):
                 solimp_limit=IMPEDANCE,
             )
             for number, part in enumerate(parts):
-                self._add_hull(
-                    finger,
-                    f"{finger.name} {number}",
-                    part,
-                    friction=(model.finger_friction, FINGER_SPINNING_FRICTION, 0),
-                    condim=4,
-                    priority=2,
-                    contype=_HAND,
-                )
-            drive = self._drive(finger.name, model.finger_force)
-            drive.set_to_velocity(FINGER_DAMPING)
+                self._add_hull(finger, f"{finger.name} {number}", part, **contact)
+            self._drive(finger.name, model.finger_force).set_to_velocity(FINGER_DAMPING)
         *slide, one, other = (joint.name for joint in body.find_all("joint") if joint.name)
         self._couple(one, other, (0.0, 1.0))
         if model.advance is not None:
@@ -362,13 +345,11 @@ class MujocoWorld(World):
     def _add_hull(self, body: Any, name: str, points: Matrix, **contact: Any) -> None:
         """Add the convex hull of points (P, 3) for contacts."""
         self.spec.add_mesh(name=name, uservert=points.ravel())
-        kind = mujoco.mjtGeom.mjGEOM_MESH
-        body.add_geom(type=kind, meshname=name, group=_SOLID, **contact)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, group=_SOLID, **contact)
 
     def _drive(self, joint: str, force: float | None = None) -> Any:
         """Add a drive of a joint; it exerts at most a force."""
-        kind = mujoco.mjtTrn.mjTRN_JOINT
-        drive = self.spec.add_actuator(name=joint, trntype=kind, target=joint)
+        drive = self.spec.add_actuator(name=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint)
         if force is not None:
             drive.forcelimited, drive.forcerange = True, (-force, force)
         return drive

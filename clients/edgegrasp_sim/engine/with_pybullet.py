@@ -69,8 +69,7 @@ class PybulletWorld(World):
             self.client.stepSimulation()
 
     def first_hits(self, starts: Matrix, ends: Matrix) -> list[int]:
-        hits = self.client.rayTestBatch(starts.tolist(), ends.tolist())
-        return [hit[0] for hit in hits]
+        return [hit[0] for hit in self.client.rayTestBatch(starts.tolist(), ends.tolist())]
 
     def detect_collisions(self) -> None:
         self.client.performCollisionDetection()
@@ -170,13 +169,11 @@ class PybulletBody(Body):
 
     @property
     def position(self) -> Matrix:
-        pose = self.client.getBasePositionAndOrientation(self.uid)
-        return np.asarray(pose[0], dtype=np.float64)
+        return np.asarray(self.client.getBasePositionAndOrientation(self.uid)[0], dtype=np.float64)
 
     @property
     def quaternion_xyzw(self) -> tuple[float, float, float, float]:
-        pose = self.client.getBasePositionAndOrientation(self.uid)
-        x, y, z, w = pose[1]
+        x, y, z, w = self.client.getBasePositionAndOrientation(self.uid)[1]
         return x, y, z, w
 
     def set_pose(self, position: Vector, quaternion_xyzw: Vector) -> None:
@@ -244,16 +241,9 @@ class PybulletHand(PybulletBody, Hand):
         self._anchor = self.client.createConstraint(
             self.uid, -1, -1, -1, pybullet.JOINT_FIXED, none, none, position
         )
-        along = [1.0, 0.0, 0.0]
+        one, other = self._fingers
         gear = self.client.createConstraint(
-            self.uid,
-            self._fingers[0],
-            self.uid,
-            self._fingers[1],
-            pybullet.JOINT_GEAR,
-            along,
-            none,
-            none,
+            self.uid, one, self.uid, other, pybullet.JOINT_GEAR, [1.0, 0.0, 0.0], none, none
         )
         self.client.changeConstraint(gear, gearRatio=-1.0, erp=GEAR_ERP, maxForce=GEAR_FORCE)
 
@@ -270,7 +260,7 @@ class PybulletHand(PybulletBody, Hand):
             self.client.resetJointState(self.uid, 0, 0.0)
         for finger in self._fingers:
             self.client.resetJointState(self.uid, finger, half)
-            self._drive(finger, half)
+            self._drive(finger, half, self.model.finger_force)
 
     def move(self, position: Vector, quaternion_xyzw: Vector) -> None:
         self.client.changeConstraint(
@@ -282,7 +272,7 @@ class PybulletHand(PybulletBody, Hand):
 
     def close_fingers(self) -> None:
         for finger in self._fingers:
-            self._drive(finger, 0.0)
+            self._drive(finger, 0.0, self.model.finger_force)
 
     def swing(self) -> None:
         """Move the fingers forward in the next step by as much as their closing requires."""
@@ -290,24 +280,13 @@ class PybulletHand(PybulletBody, Hand):
             return
         finger = self.client.getJointState(self.uid, self._fingers[0])
         half = finger[0] + engine.TIME_STEP * finger[1]
-        self.client.setJointMotorControl2(
-            self.uid,
-            0,
-            pybullet.POSITION_CONTROL,
-            targetPosition=float(np.polynomial.polynomial.polyval(half, self.model.advance)),
-            force=self.model.tool_force,
-            positionGain=1.0,
-        )
+        ahead = float(np.polynomial.polynomial.polyval(half, self.model.advance))
+        self._drive(0, ahead, self.model.tool_force, positionGain=1.0)
 
-    def _drive(self, finger: int, position: float) -> None:
-        """Drive a finger's motor toward a position, metres from the middle."""
-        self.client.setJointMotorControl2(
-            self.uid,
-            finger,
-            pybullet.POSITION_CONTROL,
-            targetPosition=position,
-            force=self.model.finger_force,
-        )
+    def _drive(self, link: int, position: float, force: float, **gain: float) -> None:
+        """Drive a link's motor toward a position, metres."""
+        mode, goal = pybullet.POSITION_CONTROL, {"targetPosition": position, "force": force}
+        self.client.setJointMotorControl2(self.uid, link, mode, **goal, **gain)
 
 
 def _hull(client: _Client, mesh: str, quaternion_xyzw: Vector) -> int:
