@@ -17,7 +17,6 @@ from edgegrasp_sim.scene import SceneObject
 SHAPES = Path(__file__).parent / "panda_hand.obj"
 FINGERTIP = 0.1122  # metres ahead of the panda_hand link, of the Panda
 CENTRE = 0.04  # of mass
-
 CLOSE_SECONDS = 0.5
 
 # Far above the table and out of the cameras' sight.
@@ -125,8 +124,7 @@ def run_grasp(
 
 def retreat_pose(T_world_hand: Matrix) -> Matrix:
     """Where the hand goes after closing: back along the approach, or up after a side grasp."""
-    approach = T_world_hand[:3, 2]
-    if -approach[2] < np.cos(SIDE_GRASP_ANGLE):
+    if -T_world_hand[2, 2] < np.cos(SIDE_GRASP_ANGLE):
         return translation(0.0, 0.0, RETREAT_DISTANCE) @ T_world_hand
     return T_world_hand @ translation(0.0, 0.0, -RETREAT_DISTANCE)
 
@@ -137,13 +135,10 @@ class Gripper:
     body: Hand
     on_the_way = False  # whether it is on an arm that has not come to its pregrasp
 
-    def __init__(
-        self, world: World, model: HandModel | None = None, min_opening: float = MIN_OPENING
-    ) -> None:
-        self.world, self.min_opening = world, min_opening
-        self.model = model or panda()
-        self._T_hand_com = translation(*self.model.centre)  # the engine moves bodies by it
-        self.body = world.add_hand(self.model, _PARKED[:3, 3])
+    def __init__(self, world: World, model: HandModel, min_opening: float) -> None:
+        self.world, self.model, self.min_opening = world, model, min_opening
+        self._T_hand_com = translation(*model.centre)  # the engine moves bodies by it
+        self.body = world.add_hand(model, _PARKED[:3, 3])
         self.park()
 
     @property
@@ -285,10 +280,7 @@ class _Watch:
 
 
 def _holds_when_shaken(
-    gripper: Gripper,
-    T_world_hand: Matrix,
-    held: SceneObject,
-    objects: Mapping[int, SceneObject],
+    gripper: Gripper, T_world_hand: Matrix, held: SceneObject, objects: Mapping[int, SceneObject]
 ) -> bool:
     """Shake the lifted hand; returns whether it still holds the object."""
     world = gripper.world
@@ -320,8 +312,6 @@ def _object_between_fingers(
     """The object between the fingers of a hand at the grasp: the first that rays across hit."""
     half, depths = 0.5 * gripper.model.max_opening, [gripper.model.tip - d for d in _TARGET_DEPTHS]
     ends = np.array([[0.0, side * half, z, 1.0] for z in depths for side in (1, -1)])
-    across = np.array([[0.0, -side * half, z, 1.0] for z in depths for side in (1, -1)])
-    hits = gripper.world.first_hits(
-        (ends @ T_world_hand.T)[:, :3], (across @ T_world_hand.T)[:, :3]
-    )
+    rays = ((each @ T_world_hand.T)[:, :3] for each in (ends, ends * (1.0, -1.0, 1.0, 1.0)))
+    hits = gripper.world.first_hits(*rays)
     return next((objects[uid] for uid in hits if uid in objects), None)
