@@ -28,6 +28,7 @@ from edgegrasp_sim.objects import CLUTTER, SceneKind
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trial import RoundDriver
+from edgegrasp_training import views
 
 WEIGHTS = ("edgegrasp-plus", "edgegrasp-small", "edgegrasp", "vn-edgegrasp")
 LABELLED_GRASPS = 240  # candidates in each scene; some hundred differ and are tried
@@ -209,49 +210,41 @@ def write_table(page: Path, written: str) -> None:
 
 def camera_table(results: dict[str, Any]) -> str:
     """The times of camera images."""
-    rows = [
-        "| `edgegrasp-plus`, what a camera sends to ranked grasps | one thread |",
-        "| --- | --- |",
-    ]
+    rows = []
     for size in ("the demo's scene", "640 x 480", "1280 x 720"):
         of = [1000 * time for name, time in results["camera"].items() if name.startswith(size)]
         if of:
             spread = f", {min(of):.0f} to {max(of):.0f} in {len(of)} real scenes"
-            rows.append(
-                f"| {size} | {statistics.median(of):.0f} ms{spread if len(of) > 1 else ''} |"
-            )
-    return "\n".join(rows)
+            rows.append((size, f"{statistics.median(of):.0f} ms{spread if len(of) > 1 else ''}"))
+    head = "`edgegrasp-plus`, what a camera sends to ranked grasps", "one thread"
+    return "\n".join(views.table(head, rows))
 
 
 def table(results: dict[str, Any]) -> str:
     """The table of all other times, and the machine."""
-    rows = ["| the table given | scene | one thread | two threads |", "| --- | --- | --- | --- |"]
+    rows = []
     for name, scenes in results["shipped"].items():
         for scene, of in scenes.items():
-            one, two = 1000 * of["seconds_1"], 1000 * of["seconds_2"]
-            rows.append(
-                f"| `{name}`, cloud to ranked grasps | {scene} | {one:.0f} ms | {two:.0f} ms |"
-            )
+            times = (f"{1000 * of[key]:.0f} ms" for key in ("seconds_1", "seconds_2"))
+            rows.append((f"`{name}`, cloud to ranked grasps", scene, *times))
+    lines = views.table(("the table given", "scene", "one thread", "two threads"), rows)
     machine, server = results["machine"], results["server"]
-    rows += ["", "| simulator | scene | labels a second and core | rounds a minute and core |"]
-    rows += ["| --- | --- | --- | --- |"]
+    rows = []
     for kind, engines in results["simulator"].items():
         for engine, of in engines.items():
             cells = (f"{of[name]:.0f}" for name in ("labels_per_second", "rounds_per_minute"))
-            rows.append(f"| {engine} | {kind} | {' | '.join(cells)} |")
-    return "\n".join(
-        [
-            *rows,
-            "",
-            f"Processor seconds on one thread of an {machine['processor']} with "
-            f"{machine['capability']} ({machine['gflops']:.0f} GFLOP/s in float32), on two "
-            f"threads seconds of the clock; medians of {RUNS} interleaved runs, 32 approach "
-            f"points, at most 2,000 candidates, one view. "
-            f"The server is ready after {server['ready_seconds']:.1f} s and takes "
-            f"{server['rest_mb']:.0f} MB at rest, {server['used_mb']:.0f} MB after ten "
-            f"requests. A label or a round of the simulator includes its scene and images.",
-        ]
+            rows.append((engine, kind, *cells))
+    head = "simulator", "scene", "labels a second and core", "rounds a minute and core"
+    text = (
+        f"Processor seconds on one thread of an {machine['processor']} with "
+        f"{machine['capability']} ({machine['gflops']:.0f} GFLOP/s in float32), on two "
+        f"threads seconds of the clock; medians of {RUNS} interleaved runs, 32 approach "
+        f"points, at most 2,000 candidates, one view. "
+        f"The server is ready after {server['ready_seconds']:.1f} s and takes "
+        f"{server['rest_mb']:.0f} MB at rest, {server['used_mb']:.0f} MB after ten "
+        f"requests. A label or a round of the simulator includes its scene and images."
     )
+    return "\n".join([*lines, "", *views.table(head, rows), "", text])
 
 
 if __name__ == "__main__":
