@@ -68,11 +68,9 @@ class AsyncGraspClient:
     ) -> None:
         self._timeout = timeout
         self._retry = retry
-        self._transport: GrpcTransport | RestTransport
-        if is_rest(address):
-            self._transport = RestTransport(address, token, tls)
-        else:
-            self._transport = GrpcTransport(address, token, tls)
+        kind: type[GrpcTransport | RestTransport]
+        kind = RestTransport if is_rest(address) else GrpcTransport
+        self._transport = kind(address, token, tls)
 
     async def detect(
         self,
@@ -272,14 +270,11 @@ class GraspClient:
         async def following() -> StreamAnswer | None:
             return await anext(answers, None)
 
-        async def end() -> None:
-            await answers.aclose()
-
         try:
             while (answer := _run(following())) is not None:
                 yield answer
         finally:  # not awaited, since the garbage collector may call this in the loop's own thread
-            asyncio.run_coroutine_threadsafe(end(), _loop())
+            asyncio.run_coroutine_threadsafe(answers.aclose(), _loop())
 
     def __enter__(self) -> Self:
         return self

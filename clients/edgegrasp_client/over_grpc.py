@@ -9,19 +9,9 @@ from google.protobuf.message import DecodeError, Message
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_camera.arrays import Array
+from edgegrasp_client import errors
 from edgegrasp_client.connection import Tls, read_pem, token_metadata
-from edgegrasp_client.errors import (
-    AccessDeniedError,
-    DeadlineError,
-    GraspClientError,
-    InvalidRequestError,
-    PayloadTooLargeError,
-    ProtocolError,
-    ServerFailedError,
-    ServerUnavailableError,
-    error_of_kind,
-    invalid,
-)
+from edgegrasp_client.errors import GraspClientError, error_of_kind, invalid
 from edgegrasp_client.requests import (
     Request,
     StreamRequest,
@@ -56,15 +46,15 @@ SERVING = b"\x08\x01"
 ERROR_METADATA = "edgegrasp-error-bin"
 
 _BY_CODE: dict[grpc.StatusCode, type[GraspClientError]] = {
-    grpc.StatusCode.DEADLINE_EXCEEDED: DeadlineError,
-    grpc.StatusCode.INVALID_ARGUMENT: InvalidRequestError,
-    grpc.StatusCode.RESOURCE_EXHAUSTED: PayloadTooLargeError,
-    grpc.StatusCode.UNAUTHENTICATED: AccessDeniedError,
-    grpc.StatusCode.PERMISSION_DENIED: AccessDeniedError,
-    grpc.StatusCode.UNAVAILABLE: ServerUnavailableError,
-    grpc.StatusCode.CANCELLED: ServerUnavailableError,
-    grpc.StatusCode.INTERNAL: ServerUnavailableError,  # from a proxy; our servers send more detail
-    grpc.StatusCode.UNKNOWN: ServerFailedError,
+    grpc.StatusCode.DEADLINE_EXCEEDED: errors.DeadlineError,
+    grpc.StatusCode.INVALID_ARGUMENT: errors.InvalidRequestError,
+    grpc.StatusCode.RESOURCE_EXHAUSTED: errors.PayloadTooLargeError,
+    grpc.StatusCode.UNAUTHENTICATED: errors.AccessDeniedError,
+    grpc.StatusCode.PERMISSION_DENIED: errors.AccessDeniedError,
+    grpc.StatusCode.UNAVAILABLE: errors.ServerUnavailableError,
+    grpc.StatusCode.CANCELLED: errors.ServerUnavailableError,
+    grpc.StatusCode.INTERNAL: errors.ServerUnavailableError,  # of a proxy; ours send more detail
+    grpc.StatusCode.UNKNOWN: errors.ServerFailedError,
 }
 
 
@@ -176,7 +166,7 @@ def _error_of(error: Any) -> GraspClientError:
     try:
         detail = grasp_pb2.ErrorDetail.FromString(metadata[ERROR_METADATA])
     except (DecodeError, KeyError):
-        return _BY_CODE.get(code, ProtocolError)(f"{code.name}: {message}")
+        return _BY_CODE.get(code, errors.ProtocolError)(f"{code.name}: {message}")
     return _described(message, detail)
 
 

@@ -12,17 +12,9 @@ import httpx
 import numpy as np
 
 from edgegrasp_camera.depth import ENCODINGS
+from edgegrasp_client import errors
 from edgegrasp_client.connection import HTTP_OVER_UNIX, Tls, read_pem, token_metadata
-from edgegrasp_client.errors import (
-    DeadlineError,
-    GraspClientError,
-    OverloadedError,
-    PayloadTooLargeError,
-    ProtocolError,
-    ServerUnavailableError,
-    error_of_kind,
-    invalid,
-)
+from edgegrasp_client.errors import GraspClientError, error_of_kind, invalid
 from edgegrasp_client.requests import (
     Request,
     StreamRequest,
@@ -65,11 +57,10 @@ class RestTransport:
     async def listed(self, kind: type[Answer], timeout: float) -> list[Answer]:
         """The server's models or robots."""
         name = f"{kind.__name__.lower()}s"
-
-        def read(body: Any) -> list[Answer]:
-            return [read_json_as(kind, each) for each in body[name]]
-
-        return await self._call(read, {"method": "GET", "url": f"/v1/{name}"}, timeout)
+        call = {"method": "GET", "url": f"/v1/{name}"}
+        return await self._call(
+            lambda body: [read_json_as(kind, each) for each in body[name]], call, timeout
+        )
 
     async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
         """Report to the server whether a grasp held."""
@@ -105,10 +96,10 @@ class RestTransport:
         try:
             response = await self._http.request(**call | {"headers": headers}, timeout=timeout)
         except httpx.TimeoutException as error:
-            raise DeadlineError(f"No answer in time ({type(error).__name__}).") from None
+            raise errors.DeadlineError(f"No answer in time ({type(error).__name__}).") from None
         except httpx.HTTPError as error:
             why = f"No connection: {error or type(error).__name__}"
-            raise ServerUnavailableError(why) from None
+            raise errors.ServerUnavailableError(why) from None
         try:
             body = response.json()
         except ValueError:
@@ -206,13 +197,14 @@ def _foreign(response: httpx.Response) -> GraspClientError:
     status = response.status_code
     what = f"{response.request.url} answered {status} {response.reason_phrase}"
     if status == httpx.codes.REQUEST_ENTITY_TOO_LARGE:
-        return PayloadTooLargeError(f"{what}.")
+        return errors.PayloadTooLargeError(f"{what}.")
     retry_after = response.headers.get("retry-after", "")  # may also be a date, which is ignored
     if status == httpx.codes.TOO_MANY_REQUESTS or (status == 503 and retry_after.isdecimal()):
-        return OverloadedError(f"{what}.", float(retry_after) if retry_after.isdecimal() else 1.0)
+        seconds = float(retry_after) if retry_after.isdecimal() else 1.0
+        return errors.OverloadedError(f"{what}.", seconds)
     if status in (500, 502, 503, 504):
-        return ServerUnavailableError(f"{what}.")
-    return ProtocolError(f"{what}, which is not the answer of a grasp service.")
+        return errors.ServerUnavailableError(f"{what}.")
+    return errors.ProtocolError(f"{what}, which is not the answer of a grasp service.")
 
 
 def _ssl_context(tls: Tls | None) -> ssl.SSLContext | bool:

@@ -287,11 +287,8 @@ def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
     except (TypeError, ValueError):
         fix = "Give fx, fy, cx, cy in pixels, or the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."
         raise invalid(f"{path}.intrinsics", repr(image["intrinsics"])[:80], fix) from None
-    fields = {
-        "depth": depth,
-        "intrinsics": intrinsics,
-        "T_cloud_camera": pose.astype(float).tolist(),
-    }
+    fields = {"depth": depth, "intrinsics": intrinsics}
+    fields["T_cloud_camera"] = pose.astype(float).tolist()
     return fields | ({"depth_scale": image["depth_scale"]} if "depth_scale" in image else {})
 
 
