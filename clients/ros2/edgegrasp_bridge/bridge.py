@@ -16,18 +16,11 @@ from edgegrasp_camera.arrays import Array, Float32, Float64
 from edgegrasp_camera.clouds import read_point_cloud2
 from edgegrasp_camera.depth import intrinsics_of, metres, unproject
 from edgegrasp_camera.picture import fork
-from edgegrasp_client import Detection, Grasp, GraspClient, GraspTracker, object_in_scene, on_mask
-from edgegrasp_client.conversions import (
-    PANDA_JOINTS,
-    FingerJoints,
-    joint_trajectories,
-    matrix_from_quaternion,
-    moveit_grasp,
-    pose_fields,
-    xyz_fields,
-)
+from edgegrasp_client import GraspClient, GraspTracker, conversions, object_in_scene, on_mask
+from edgegrasp_client.conversions import pose_fields, xyz_fields
 from edgegrasp_client.options import DetectOptions
 from edgegrasp_client.requests import option_of_text
+from edgegrasp_results import Detection, Grasp
 
 Message = dict[str, Any]
 Lookup = Callable[[str, str, Any], Float64]
@@ -62,20 +55,20 @@ class Settings:
     gravity_frame: str = ""  # whose z is up; empty: target_frame; "none": found from the support
     hand_frame: str = ""  # the gripper's hand frame, such as panda_hand; beside parent_link
     parent_link: str = ""  # of the end effector, such as panda_link8; empty: the hand frame
-    joint_names: tuple[str, ...] = PANDA_JOINTS.names
+    joint_names: tuple[str, ...] = conversions.PANDA_JOINTS.names
     joint_closed: float = 0.0  # position of each joint in the closed hand
     joint_per_metre: float = 0.5  # what each joint moves for a metre of opening
     approach_distance: float = 0.05  # metres of straight way in, from the pregrasp pose
     retreat_distance: float = 0.1  # metres of straight way out, back along the approach
 
     @property
-    def joints(self) -> FingerJoints:
+    def joints(self) -> conversions.FingerJoints:
         """The gripper's joints."""
 
         def at(opening: float) -> tuple[float, ...]:
             return (self.joint_closed + self.joint_per_metre * opening,) * len(self.joint_names)
 
-        return FingerJoints(self.joint_names, at)
+        return conversions.FingerJoints(self.joint_names, at)
 
 
 def parameters() -> dict[str, Any]:
@@ -270,7 +263,7 @@ def trajectories(found: Found) -> list[Message]:
     """The motion to the best pick and on, as trajectory_msgs/JointTrajectory; empty without one."""
     pick = found.detection.best_pick
     motion = None if pick is None or pick.arm is None else pick.arm.trajectory
-    return [] if motion is None else joint_trajectories(motion)
+    return [] if motion is None else conversions.joint_trajectories(motion)
 
 
 def moveit_grasps(found: Found, settings: Settings, lookup: Lookup) -> Message:
@@ -278,7 +271,7 @@ def moveit_grasps(found: Found, settings: Settings, lookup: Lookup) -> Message:
     link = settings.parent_link
     T_hand_link = lookup(settings.hand_frame or link, link, None) if link else None
     grasps = [
-        moveit_grasp(
+        conversions.moveit_grasp(
             grasp,
             found.header["frame_id"],
             name=f"grasp_{number}",
@@ -376,7 +369,7 @@ def matrix_of(transform: Any) -> Float64:
     """(4, 4) of a geometry_msgs/Transform."""
     turn, shift = transform.rotation, transform.translation
     T = np.eye(4)
-    T[:3, :3] = matrix_from_quaternion([turn.x, turn.y, turn.z, turn.w])
+    T[:3, :3] = conversions.matrix_from_quaternion([turn.x, turn.y, turn.z, turn.w])
     T[:3, 3] = shift.x, shift.y, shift.z
     return T
 
