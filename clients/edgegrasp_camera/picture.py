@@ -17,8 +17,6 @@ from typing_extensions import Self
 from edgegrasp_camera.arrays import Array, Bools, Float64, Floats, Int64
 from edgegrasp_camera.clouds import CloudInput
 
-Points = Float64
-
 PANDA = (0.0658, 0.1122)  # metres along the hand's z: the palm's surface and the fingertips
 STEM_LENGTH = 0.03  # metres drawn behind the palm, to show the approach
 BAR = 0.005  # metres, thickness of a fork
@@ -87,7 +85,7 @@ class View:
         fx, cx, fy, cy = numbers
         return cls((points.shape[0], points.shape[1]), fx, fy, cx, cy) if worst < 1.0 else None
 
-    def project(self, points: ArrayLike) -> tuple[Points, Points]:
+    def project(self, points: ArrayLike) -> tuple[Float64, Float64]:
         """Columns and rows (..., 2), and distances along the line of sight (...), metres."""
         turn, position = self.T_cloud_camera[:3, :3], self.T_cloud_camera[:3, 3]
         x, y, z = np.moveaxis((np.asarray(points, dtype=np.float64) - position) @ turn, -1, 0)
@@ -155,7 +153,7 @@ class Picture:
         self._point = 72 * WIDTH / columns  # points that a pixel is wide
         self._figure.text(0.015, self._foot / 2, title, fontsize=10, va="center")
 
-    def _shaded(self) -> Points:
+    def _shaded(self) -> Float64:
         """(H, W, 3) the cloud in greys."""
         rows, columns = self.view.shape
         depth = self._depth
@@ -217,7 +215,7 @@ class Picture:
             bar.set_label("score: probability that the grasp holds", fontsize=8, labelpad=1)
             bar.ax.tick_params(labelsize=8, length=2, pad=1)
 
-    def _fork(self, pieces: Points, color: Any) -> None:
+    def _fork(self, pieces: Float64, color: Any) -> None:
         """Draw a fork, (4, 2, 3), faintly where the cloud hides it."""
         _, depth = self.view.project(pieces)
         bar = float(np.clip(BAR * self.view.fy / np.median(depth) * self._point, *BARS))
@@ -233,7 +231,7 @@ class Picture:
                         *part.T, color=shade, linewidth=width, alpha=alpha, solid_capstyle=cap
                     )
 
-    def _depth_at(self, pixels: Points) -> Points:
+    def _depth_at(self, pixels: Float64) -> Float64:
         """Distance of the cloud at pixels (K, 2); NaN where there is no point."""
         column, row = np.rint(pixels).astype(int).T
         rows, columns = self.view.shape
@@ -301,7 +299,7 @@ def draw_detection(
     picture.save(path)
 
 
-def lit(depth: Floats, fx: float, fy: float) -> Points:
+def lit(depth: Floats, fx: float, fy: float) -> Float64:
     """Brightness (H, W), 0 to 1, of a depth image lit by a lamp over the camera.
 
     `depth` is (H, W) metres along the line of sight, NaN where there is nothing; fx and fy pixels.
@@ -310,13 +308,13 @@ def lit(depth: Floats, fx: float, fy: float) -> Points:
     x, y = right * fx / depth, down * fy / depth
     # The surface's normal is (x, y, -1), not of unit length.
     facing = (LAMP[0] * x + LAMP[1] * y - LAMP[2]) / np.sqrt(x**2 + y**2 + 1)
-    light: Points = np.clip(np.nan_to_num(facing), 0.0, 1.0)
+    light: Float64 = np.clip(np.nan_to_num(facing), 0.0, 1.0)
     return light
 
 
 def fork(
     T_cloud_hand: ArrayLike, width: float, palm_and_tip: tuple[float, float] = PANDA
-) -> Points:
+) -> Float64:
     """A gripper's outline as four line pieces (4, 2, 3), cloud frame: stem, palm, both fingers.
 
     `width` is metres between the fingers' inner faces; `palm_and_tip` are metres along the hand's z
@@ -332,11 +330,11 @@ def fork(
         ]
     )
     transform = np.asarray(T_cloud_hand, dtype=np.float64)
-    in_cloud: Points = in_hand @ transform[:3, :3].T + transform[:3, 3]
+    in_cloud: Float64 = in_hand @ transform[:3, :3].T + transform[:3, 3]
     return in_cloud
 
 
-def _lines_of(shape: Mapping[str, Any]) -> Iterator[Points]:
+def _lines_of(shape: Mapping[str, Any]) -> Iterator[Float64]:
     """Edges of a box, or circles of a ball, as lines (K, 3); nothing of other shapes."""
     kind = shape.get("kind")
     if kind == "sphere":
