@@ -22,10 +22,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from edgegrasp.oip import open_inference_pb2 as messages
-from edgegrasp.oip.open_inference_pb2_grpc import (
-    GRPCInferenceServiceServicer,
-    add_GRPCInferenceServiceServicer_to_server,
-)
+from edgegrasp.oip import open_inference_pb2_grpc as service
 from edgegrasp_camera.arrays import Array
 from edgegrasp_cli.flags import Server, takes_flags
 from edgegrasp_client import GraspClient, errors
@@ -196,7 +193,7 @@ def grpc_server(models: Models, address: str) -> Iterator[int]:
     """Serve `inference.GRPCInferenceService` while the context lasts; gives its port."""
     options = [("grpc.max_receive_message_length", MAX_BODY_BYTES)]
     server = grpc.server(ThreadPoolExecutor(PARALLEL_CALLS), options=options)
-    add_GRPCInferenceServiceServicer_to_server(_Servicer(models), server)
+    service.add_GRPCInferenceServiceServicer_to_server(_Servicer(models), server)
     port = server.add_insecure_port(address)
     server.start()
     try:
@@ -205,7 +202,7 @@ def grpc_server(models: Models, address: str) -> Iterator[int]:
         server.stop(grace=5.0).wait()
 
 
-class _Servicer(GRPCInferenceServiceServicer):
+class _Servicer(service.GRPCInferenceServiceServicer):
     def __init__(self, models: Models) -> None:
         self._models = models
 
@@ -338,7 +335,17 @@ def _http_infer(models: Models, name: str, body: bytearray, header: str | None) 
             raise ValueError(f"{lists} lists in {head} bytes")
         request = json.loads(body[:head])
         str(request.get("id", "")).encode()  # otherwise it could not be sent back
-        tensors, parameters = _http_inputs(request, bytes(body[head:]))
+        tensors: Tensors = {}
+        binary, start = bytes(body[head:]), 0  # tensors without `data`, one behind the other
+        for each in request["inputs"]:
+            data = each.get("data")
+            if data is None:
+                end = start + int(each["parameters"]["binary_data_size"])
+                data, start = binary[start:end], end
+            if not isinstance(each["name"], str):
+                raise TypeError("a name that is no text")
+            tensors[each["name"]] = tensor(each["name"], each["datatype"], each["shape"], data)
+        parameters = dict((request.get("parameters") or {}).items())
         wanted = [str(each["name"]) for each in request.get("outputs") or ()]
     except errors.InvalidRequestError:
         raise
@@ -348,17 +355,3 @@ def _http_infer(models: Models, name: str, body: bytearray, header: str | None) 
     outputs = [described | {"data": array.ravel().tolist()} for described, array in found]
     named = {"model_name": name, "model_version": VERSION, "id": request.get("id", "")}
     return {**named, "parameters": said, "outputs": outputs}
-
-
-def _http_inputs(request: dict[str, Any], binary: bytes) -> tuple[Tensors, dict[str, Any]]:
-    """Tensors and parameters; tensors without `data` lie in `binary`, one behind the other."""
-    tensors, start = {}, 0
-    for each in request["inputs"]:
-        data = each.get("data")
-        if data is None:
-            end = start + int(each["parameters"]["binary_data_size"])
-            data, start = binary[start:end], end
-        if not isinstance(each["name"], str):
-            raise TypeError("a name that is no text")
-        tensors[each["name"]] = tensor(each["name"], each["datatype"], each["shape"], data)
-    return tensors, dict((request.get("parameters") or {}).items())

@@ -63,14 +63,12 @@ def check(
     found = load_robot(file)
     for name, value in found.describe().items():
         print(f"{name}: {value}")
-    x, y, z = found.hand_pose(found.home)[:3, 3]
+    hand = found.hand_pose(found.home)
+    x, y, z = hand[:3, 3]
     print(f"hand at home: {x:.3f} {y:.3f} {z:.3f} m from {found.base_frame}")
-    if picture is not None:
-        _draw(found, picture)
-
-
-def _draw(found: Any, file: Path) -> None:
-    """Draw the links as a line and the hand's axes at home: x red, y green (closing), z blue."""
+    if picture is None:
+        return
+    # The links as a line, and the hand's axes: x red, y green (closing), z blue.
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6, 6), dpi=100)
@@ -80,9 +78,8 @@ def _draw(found: Any, file: Path) -> None:
         for link in found.model.links
     ]
     axes.plot(*zip(*(pose[:3, 3] for pose in poses), strict=True), "o-", color="0.3", linewidth=4)
-    hand = found.hand_pose(found.home)
     for axis, color in zip(hand[:3, :3].T, ("red", "green", "blue"), strict=True):
         axes.plot(*zip(hand[:3, 3], hand[:3, 3] + 0.15 * axis, strict=True), color=color)
     axes.set(xlabel="x", ylabel="y", zlabel="z", title=f"{found.name} at home")
     axes.set_aspect("equal")
-    figure.savefig(file)
+    figure.savefig(picture)
