@@ -5,6 +5,7 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
@@ -13,6 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 from pydantic import Field
+from rich import box
+from rich.console import Console
+from rich.table import Column, Table
 
 from edgegrasp_camera.files import pixels, sent_cloud
 from edgegrasp_camera.picture import draw_detection
@@ -26,10 +30,6 @@ if TYPE_CHECKING:
 
 Option = typer.Option
 PICTURES = (".png", ".jpg", ".jpeg")
-
-Cloud = Annotated[
-    Path | None, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
-]
 
 
 class DetectorFlags(Connection):
@@ -91,7 +91,9 @@ class DetectFlags(DetectorFlags):
 
 @takes_flags(options=option_flags("robot", "previous"))
 def detect(
-    file: Cloud = None,
+    file: Annotated[
+        Path | None, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
+    ] = None,
     as_document: Annotated[bool, Option("--json", help="Print JSON, as the HTTP API.")] = False,
     options_file: Annotated[
         Path | None, Option("--options", help="JSON file with options; flags beside it win.")
@@ -112,8 +114,6 @@ def detect(
 
     edgegrasp detect --depth a.png --depth b.png --intrinsics 615,615,320,240 --pose A --pose B
     """
-    from rich.console import Console
-
     fields = _options(options_file, options) | _robot_option(asked)
     _check_outputs(asked, fields)
     images = _depth_images(file, asked)
@@ -140,10 +140,6 @@ def detect(
 @takes_flags()
 def models(*, asked: DetectorFlags) -> None:
     """List the weights that can be used, here or on a server."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Column, Table
-
     names = (Column(name, no_wrap=True) for name in ("model", "architecture"))
     table = Table(*names, "parameters", "gripper", "device", box=box.SIMPLE)
     waiting = Console(stderr=True).status("Loading weights…")
@@ -167,15 +163,14 @@ def open_client(asked: DetectorFlags) -> AbstractContextManager[Any]:
     return nullcontext(OwnDetector(asked.weights, asked.grippers, asked.device))
 
 
+@dataclass(eq=False)
 class OwnDetector:
     """A detector in this process, with the interface of `GraspClient`."""
 
+    weights: Sequence[Path] = ()
+    grippers: Sequence[Path] = ()
+    device: str = "cpu"
     robot: str | None = None  # a name or file, in place of the name in a request
-
-    def __init__(
-        self, weights: Sequence[Path] = (), grippers: Sequence[Path] = (), device: str = "cpu"
-    ) -> None:
-        self._load = weights, grippers, device
 
     def detect(
         self,
@@ -224,8 +219,8 @@ class OwnDetector:
     def _catalogue(self) -> "ModelCatalogue":
         from edgegrasp_model.detector import ModelCatalogue, choose_device
 
-        weights, grippers, device = self._load
-        return ModelCatalogue.load(weights, "", choose_device(device), grippers)
+        device = choose_device(self.device)
+        return ModelCatalogue.load(self.weights, "", device, self.grippers)
 
 
 def _check_outputs(asked: DetectFlags, fields: Mapping[str, Any]) -> None:
@@ -303,9 +298,6 @@ def _depth_images(file: Path | None, asked: DetectFlags) -> "list[DepthImage] | 
 
 def _print_detection(detection: Any) -> None:
     """Print the ranked grasps, then counts and warnings."""
-    from rich.console import Console
-    from rich.table import Table
-
     names = "#", "score", "TCP x y z (m)", "approach x y z", "width (m)", "clearance (m)", "free"
     table = Table(*names, box=None, pad_edge=False, collapse_padding=True)  # in 80 columns
     for rank, grasp in enumerate(detection.grasps, start=1):

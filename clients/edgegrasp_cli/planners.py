@@ -108,8 +108,7 @@ class _OneThread(OwnDetector):
     """A detector on one thread, whose sums do not depend on the number of threads."""
 
     def __init__(self, weights: Sequence[Path], robot: str | None, timeout: float) -> None:
-        super().__init__(weights)
-        self.robot = robot
+        super().__init__(weights, robot=robot)
 
     def detect(self, cloud: Any = None, **options: Any) -> Any:
         import torch
