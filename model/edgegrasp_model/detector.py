@@ -162,8 +162,9 @@ class GraspDetector:
         self, cloud: object, options: DetectOptions, max_voxels: int | None = None
     ) -> Prepared:
         """First stage: choose the gripper, and build the scene if enough of the cloud is left."""
+        start = time.perf_counter()
         sent = check_cloud(cloud, options.num_approach_points or 1)
-        return self._with_scene(sent, options, max_voxels)
+        return self._with_scene(sent, options, start, max_voxels)
 
     def evaluate(self, prepared: Prepared) -> Scored | None:
         """Second stage: sample candidates and score them; None if there is no scene.
@@ -234,7 +235,8 @@ class GraspDetector:
                 score_poses = partial(self._score_poses, prepared, scene)
                 up = prepared.selected.up
                 grasps, tracking = merged(grasps, prepared.followed, options, up, score_poses)
-            objects = detected_objects(scene, grasps, sample, score, gripper)
+            with prepared.timed("ranking"):
+                objects = detected_objects(scene, grasps, sample, score, gripper)
             if prepared.followed is not None:
                 objects = with_surfaces(objects, prepared.followed)
         counts["returned"] = len(grasps)
@@ -269,12 +271,13 @@ class GraspDetector:
         if (edges is None) == (hand_poses is None):
             value = "neither edges nor hand_poses" if edges is None else "edges and hand_poses"
             raise InvalidRequest("edges", value, "Send one of the two.")
+        start = time.perf_counter()
         sent, options = check_cloud(cloud), options or DetectOptions()
         asked: Array = (
             check_hand_poses(hand_poses) if edges is None else check_edges(edges, sent.rows_sent)
         )
         no_region = {"approach_region": None, "contact_region": None}
-        prepared = self._with_scene(sent, options.model_copy(update=no_region))
+        prepared = self._with_scene(sent, options.model_copy(update=no_region), start)
         evaluations = [Evaluation(None, NoGrasp.NO_POINT)] * len(asked)
         if prepared.scene is not None:
             scene, gripper = prepared.scene, prepared.gripper
@@ -316,7 +319,11 @@ class GraspDetector:
         )
 
     def _with_scene(
-        self, sent: CheckedCloud, options: DetectOptions, max_voxels: int | None = None
+        self,
+        sent: CheckedCloud,
+        options: DetectOptions,
+        start: float,  # of the stage, by time.perf_counter
+        max_voxels: int | None = None,
     ) -> Prepared:
         """Choose the gripper and the crop radius, and build the scene."""
         counts: dict[str, int] = {}
@@ -334,7 +341,6 @@ class GraspDetector:
         previous, followed = options.previous, None
         if previous is not None:
             options = narrowed(options, gripper.name, sent.points)
-        start = time.perf_counter()
         selected = select_points(sent, options, counts, warnings)
         voxel_size = self.metadata.voxel_size
         scene = build_scene(
