@@ -266,7 +266,9 @@ class Neighbors(NamedTuple):
     def within(cls, points: Float32) -> Self:
         """Of points (N, 3); K is NORMAL_NEIGHBORS, or N where there are fewer."""
         k = min(NORMAL_NEIGHBORS, len(points))
-        distance, row = cKDTree(points).query(points, k=range(1, k + 1))
+        # For a single round of queries a tree that is quickly built is faster.
+        tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+        distance, row = tree.query(points, k=range(1, k + 1))
         return cls(np.asarray(distance), np.asarray(row))
 
 
