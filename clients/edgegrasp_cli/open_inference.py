@@ -34,7 +34,7 @@ VERSION = "1"  # of the tensors' names and meaning
 DTYPES = {"FP32": "<f4", "FP64": "<f8", "UINT16": "<u2", "INT32": "<i4"}
 CONTENTS = {"FP32": "fp32_contents", "FP64": "fp64_contents", "UINT16": "uint_contents"}
 INPUTS = {"points": ("FP32", [-1, 3]), "depth": ("FP32", [-1, -1]), "intrinsics": ("FP32", [4])}
-OUTPUTS = {
+OUTPUTS = {  # fields of a Grasp
     "T_cloud_hand": ("FP32", [-1, 4, 4]),  # best first, like all outputs
     "score": ("FP32", [-1]),
     "width": ("FP32", [-1]),  # metres
@@ -113,6 +113,17 @@ class Models:
         if version not in ("", VERSION):
             raise errors.UnknownModelError(f"No version {version!r}. Use {VERSION}.")
 
+    def metadata(self, name: str, version: str = "") -> dict[str, Any]:
+        """The inputs and outputs of a model, as the protocol describes them."""
+        self.check(name, version)
+        described: dict[str, Any] = {"name": name, "versions": [VERSION], "platform": PLATFORM}
+        for side, table in (("inputs", INPUTS), ("outputs", OUTPUTS)):
+            described[side] = [
+                {"name": each, "datatype": kind, "shape": shape}
+                for each, (kind, shape) in table.items()
+            ]
+        return described
+
     def infer(
         self,
         name: str,
@@ -150,18 +161,12 @@ class Models:
         if isinstance(micro, int | float) and micro > 0:
             seconds = min(seconds, micro / 1e6)
         found = self._client.detect(**cloud, **options, timeout=seconds)
-        grasps = found.grasps
-        poses = np.array([grasp.T_cloud_hand for grasp in grasps], "<f4").reshape(-1, 4, 4)
-        made = {
-            "T_cloud_hand": poses,
-            "score": np.array([grasp.score for grasp in grasps], "<f4"),
-            "width": np.array([grasp.width for grasp in grasps], "<f4"),
-            "object": np.array([-1 if g.object is None else g.object for g in grasps], "<i4"),
-        }
-        outputs = [
-            ({"name": each, "datatype": OUTPUTS[each][0], "shape": made[each].shape}, made[each])
-            for each in dict.fromkeys(wanted or OUTPUTS)
-        ]
+        outputs = []
+        for each in dict.fromkeys(wanted or OUTPUTS):
+            kind, shape = OUTPUTS[each]
+            values = [getattr(grasp, each) for grasp in found.grasps]
+            array = tensor(each, kind, shape, [-1 if value is None else value for value in values])
+            outputs.append(({"name": each, "datatype": kind, "shape": array.shape}, array))
         return outputs, {"model": found.model, "warnings": " ".join(found.warnings)}
 
 
@@ -176,16 +181,6 @@ def tensor(name: str, datatype: str, shape: Any, data: Any) -> Array:
         why = f"a datatype {datatype}" if isinstance(error, KeyError) else str(error)
         fix = f"Give {', '.join(DTYPES)}, as many values as the shape has."
         raise invalid(f"inputs.{name}", why, fix) from None
-
-
-def _metadata(name: str) -> dict[str, Any]:
-    described: dict[str, Any] = {"name": name, "versions": [VERSION], "platform": PLATFORM}
-    for side, table in (("inputs", INPUTS), ("outputs", OUTPUTS)):
-        described[side] = [
-            {"name": each, "datatype": kind, "shape": shape}
-            for each, (kind, shape) in table.items()
-        ]
-    return described
 
 
 @contextmanager
@@ -222,8 +217,8 @@ class _Servicer(service.GRPCInferenceServiceServicer):
 
     def ModelMetadata(self, request: Any, context: Any) -> Any:  # noqa: N802
         with _aborting(context):
-            self._models.check(request.name, request.version)
-        return messages.ModelMetadataResponse(**_metadata(request.name))
+            described = self._models.metadata(request.name, request.version)
+        return messages.ModelMetadataResponse(**described)
 
     def ModelInfer(self, request: Any, context: Any) -> Any:  # noqa: N802
         name, wanted = request.model_name, [each.name for each in request.outputs]
@@ -285,10 +280,6 @@ def http_app(models: Models) -> Starlette:
         state = {"version": VERSION, "state": "READY", "reason": ""}
         return [{"name": name, **state} for name in models.names()]
 
-    def model(name: str, version: str = "") -> dict[str, Any]:
-        models.check(name, version)
-        return _metadata(name)
-
     def model_ready(name: str, version: str = "") -> dict[str, Any]:
         models.check(name, version)
         return {"name": name, "ready": True}
@@ -319,7 +310,7 @@ def http_app(models: Models) -> Starlette:
     ]
     for path in ("/v2/models/{name}", "/v2/models/{name}/versions/{version}"):
         routes += [
-            Route(path, answers(model)),
+            Route(path, answers(models.metadata)),
             Route(f"{path}/ready", answers(model_ready)),
             Route(f"{path}/infer", infer, methods=["POST"]),
         ]
