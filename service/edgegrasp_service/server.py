@@ -30,8 +30,8 @@ from edgegrasp_service.front.grpc import GrpcServer
 from edgegrasp_service.front.http import HttpMiddleware, create_router
 from edgegrasp_service.front.service import GraspService
 from edgegrasp_service.observability import LogQueue, Metrics, start_logging, write_line
-from edgegrasp_service.recording import Recorder, check_outcomes
-from edgegrasp_service.security import ServerTls, Tokens
+from edgegrasp_service.recording import check_outcomes
+from edgegrasp_service.security import Tokens
 from edgegrasp_service.settings import UNIX, Settings
 from edgegrasp_service.worker.pool import Launched, WorkerPool
 from edgegrasp_service.worker.process import PIECE
@@ -54,15 +54,9 @@ class Server:
         self, settings: Settings, nursery: Sequence[str] = (), launched: Launched | None = None
     ) -> None:
         self._settings = settings
-        self._tls = ServerTls(settings) if settings.tls_certificate else None
         self.metrics = Metrics(lambda: self.pool.models)
         self.pool = WorkerPool(settings, nursery, self.metrics.workers_replaced.inc, launched)
-        self._recorder: Recorder | None = None
-        self.service = GraspService(settings, self.pool, self._tls, self.metrics)
-        if settings.record_folder is not None:
-            hold = self.service.admission.hold
-            self._recorder = Recorder(settings.record_folder, settings.record_bytes, hold)
-            self.service.record = self._recorder.record
+        self.service = GraspService(settings, self.pool, self.metrics)
         if settings.outcomes_file is not None:
             check_outcomes(settings.outcomes_file)
         service, admission, pool = self.service, self.service.admission, self.pool
@@ -94,14 +88,14 @@ class Server:
         settings = self._settings
         asyncio.get_running_loop().set_exception_handler(_LoopErrors())
         with _listen(settings.host, settings.http_port) as http_socket:
-            credentials = None if self._tls is None else self._tls.grpc
             http_connections = Places(settings.max_connections, spare=HEALTH_PLACES)
-            grpc_server = GrpcServer(self.service, credentials)
+            grpc_server = GrpcServer(self.service)
             http_server = self._http_server(http_connections)
-            scheme = "http" if self._tls is None else "https"
+            scheme = "http" if self.service.tls is None else "https"
             self.http_url = _url(scheme, http_socket)
             self.grpc_address = grpc_server.address
-            await grpc_server.start()
+            await grpc_server.set_serving(False)
+            await grpc_server.server.start()
             trimming = asyncio.create_task(
                 trim_grpc(grpc_server.port, settings.max_connections, http_connections.taken)
             )
@@ -126,8 +120,8 @@ class Server:
                 stopped.cancel()
                 trimming.cancel()
                 self.pool.close()
-                if self._recorder is not None:
-                    self._recorder.close()
+                if self.service.recorder is not None:
+                    self.service.recorder.close()
 
     async def _load(self, grpc_server: GrpcServer, ready: Callable[[], None]) -> None:
         await self.pool.start()
@@ -137,7 +131,7 @@ class Server:
             ready()
 
     def _http_server(self, places: Places) -> "_HttpServer":
-        tls = self._tls
+        tls = self.service.tls
         router = create_router(self.service, self.metrics)
         config = uvicorn.Config(
             HttpMiddleware(router, self.service),

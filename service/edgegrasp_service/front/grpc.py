@@ -88,7 +88,7 @@ class GrpcServer:
         AddressInUse: The port cannot be bound.
     """
 
-    def __init__(self, service: GraspService, credentials: grpc.ServerCredentials | None) -> None:
+    def __init__(self, service: GraspService) -> None:
         settings = service.settings
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
         self.server = aio.server(options=grpc_bounds(settings))
@@ -105,19 +105,14 @@ class GrpcServer:
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
         place = f"{settings.host}/grpc.sock" if sockets else f"{host}:{settings.grpc_port}"
         try:
-            if credentials is None:
+            if service.tls is None:
                 port = self.server.add_insecure_port(place)
             else:
-                port = self.server.add_secure_port(place, credentials)
+                port = self.server.add_secure_port(place, service.tls.grpc)
         except RuntimeError as error:
             raise AddressInUse("gRPC", place, str(error)) from None
         self.address = place if sockets else f"{host}:{port}"
         self.port = 0 if sockets else port
-
-    async def start(self) -> None:
-        """Open the port; health checks report NOT_SERVING."""
-        await self.set_serving(False)
-        await self.server.start()
 
     async def set_serving(self, serving: bool) -> None:
         """Set the status that health checks report."""

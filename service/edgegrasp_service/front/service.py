@@ -31,6 +31,7 @@ from edgegrasp_service.errors import (
     report,
 )
 from edgegrasp_service.observability import CALL, Call, Metrics, log_call
+from edgegrasp_service.recording import Recorder
 from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.pool import CRASH_FIX, CRASHED, WORKER_LOST, WorkerPool
@@ -48,21 +49,20 @@ MARGIN = 1.5  # the wait is estimated from a median, and half of the requests ta
 class GraspService:
     """The front process without its transports."""
 
-    def __init__(
-        self, settings: Settings, pool: WorkerPool, tls: ServerTls | None, metrics: Metrics
-    ) -> None:
+    def __init__(self, settings: Settings, pool: WorkerPool, metrics: Metrics) -> None:
         self.settings = settings
         self.pool = pool
         self.tokens = Tokens(settings)  # replaced on reload
+        self.tls = ServerTls(settings) if settings.tls_certificate else None
         self.stopping = asyncio.Event()  # when set, new requests are refused
         self.in_flight = 0  # number of calls in progress
         self.admission = Admission(pool.size, settings.max_queue_length, settings.max_held_bytes)
-        # Called with each call that has ended; with each job and its answer.
+        # Called with each call that has ended.
         self.observers: list[Callable[[Call], None]] = [metrics.count_call, log_call]
-        self.record: Callable[[Job, Answer], None] | None = None
+        folder, most = settings.record_folder, settings.record_bytes
+        self.recorder = None if folder is None else Recorder(folder, most, self.admission.hold)
         # Requests that killed workers, by digest: until when they are remembered, dead workers.
         self._deaths: dict[bytes, tuple[float, int]] = {}
-        self._tls = tls
         self._reloads = metrics.reloads
         self._reloading = asyncio.Lock()
         self._tasks: set[asyncio.Task[Any]] = set()
@@ -166,8 +166,8 @@ class GraspService:
         call.stages |= answer.facts.seconds
         call.bytes_out = len(answer.body)
         self.admission.resize(ticket, call.bytes_out)
-        if self.record is not None:
-            self.record(job, answer)
+        if self.recorder is not None:
+            self.recorder.record(job, answer)
         return answer
 
     async def _note_deaths(self, job: Job, deaths: int) -> None:
@@ -225,7 +225,7 @@ class GraspService:
         async with self._reloading:
             try:
                 tokens = Tokens(self.settings)
-                certificates = self._tls and self._tls.read()
+                certificates = self.tls and self.tls.read()
                 await self.pool.start()
             except Exception as error:
                 self._reloads.labels("failed").inc()
@@ -234,8 +234,8 @@ class GraspService:
                 why = error if known else "The log says why."
                 raise ReloadFailed(f"The old weights still serve. {why}") from None
             self.tokens = tokens
-            if self._tls and certificates:
-                self._tls.use(certificates)
+            if self.tls and certificates:
+                self.tls.use(certificates)
             self._reloads.labels("succeeded").inc()
             digests = {model["name"]: model["digest"] for model in self.pool.models}
             logger.info("reloaded", extra={"fields": {"digests": digests}})
