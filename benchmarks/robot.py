@@ -38,8 +38,7 @@ def beside(detection: Detection) -> Float64:
     T_cloud_base = np.eye(4)
     T_cloud_base[:3, :3] = np.stack([-ahead, np.cross(up, -ahead), up], axis=1)
     T_cloud_base[:3, 3] = middle + FAR * ahead
-    found: Float64 = np.linalg.inv(T_cloud_base)
-    return found
+    return np.linalg.inv(T_cloud_base)
 
 
 def measure(detector: GraspDetector, robot: Robot, cloud: Any, fields: dict[str, Any]) -> str:

@@ -98,8 +98,7 @@ def points_of(
     right, down = right[seen] / camera.focal_length, down[seen] / camera.focal_length
     in_camera = np.stack((right, down, depth[seen]))
     in_world = T_world_camera[:3, :3] @ in_camera + T_world_camera[:3, 3:]
-    points: NDArray[np.float64] = in_world.T
-    return points
+    return in_world.T
 
 
 def crop(points: NDArray[Float], box: NDArray[np.floating], margin: float = 0.0) -> NDArray[Float]:

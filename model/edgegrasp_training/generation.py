@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -32,6 +32,7 @@ from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_model.scene.scene import Scene, SelectedPoints, build_scene, select_points
 from edgegrasp_sim.camera import Observation, TableView, ViewRange
 from edgegrasp_sim.engine import choose_engine
+from edgegrasp_sim.hand import FINGERTIP
 from edgegrasp_sim.objects import CLUTTER, ObjectSet, SceneKind
 from edgegrasp_sim.poses import about_z
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
@@ -42,6 +43,7 @@ from edgegrasp_sim.workers import run_tasks
 from edgegrasp_training.options import GenerationOptions
 from edgegrasp_training.recipes import CROP_RADIUS, VOXEL_SIZE
 from edgegrasp_training.shapes import household_objects, varied_objects
+from edgegrasp_training.views import TABLE as TABLE_PLANE
 from edgegrasp_training.views import LabelledView, different
 
 SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM, HAND_STREAM = range(6)
@@ -64,8 +66,8 @@ VIEWS[TABLE] = ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET)
 VIEWS[SHELF] = ViewRange((0.45, 1.0), (np.radians(45), np.radians(90)), _FRONT, _LOW_TARGET)
 # Of household objects, more from one side: a tall or wide one hides its back there.
 SIDE_VIEWS = ViewRange((0.5, 1.2), (np.radians(40), np.radians(80)), _ANY_SIDE, _LOW_TARGET)
-KEPT_DISTANCE = 0.18  # metres from the nearest hand that was tried: from its axis there,
-BEHIND_TIPS = 0.1122  # metres behind the fingertips, where the Panda's frame is
+# Metres from the nearest hand that was tried: from where the frame of a Panda's hand would be.
+KEPT_DISTANCE = 0.18
 AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
 # Of the views that are not cut off, where support and workspace are given.
 GIVEN_SHARE = {
@@ -91,7 +93,6 @@ FAILURES = 2  # in a row, after which it gets another scene
 SENSOR_SHARE = 0.4  # of the views, with the faults of a depth camera
 OTHER_NOISE = 0.3  # of the views, with another noise than the benchmark's
 MAX_NOISE = 0.004  # metres
-EXACT_PLANE = SupportPlane(normal=(0.0, 0.0, 1.0), offset=TABLE_HEIGHT)
 
 FREE_SHARE = 0.75  # of the grasps chosen at random, those that are collision-free
 LIKELY, LIKELY_SHARE = 1 / 3, 0.7  # best part of an object's grasps, most of which are tried there
@@ -208,22 +209,15 @@ def generate_scene(
             sizes = HOUSEHOLD_SCALE if household else sizes
             from_side = household and kind in (PACKED, PILE, TABLE)
             seen_from = SIDE_VIEWS if from_side else VIEWS[kind]
-            setting = Setting(kind, sizes, seen_from)
-            views = list(_views(simulation, setting, options, streams))
+            views = list(_views(simulation, kind, sizes, seen_from, options, streams))
     return [replace(view, gripper=hand) for view in views]
-
-
-class Setting(NamedTuple):
-    """How a scene is made, and from where it is seen."""
-
-    kind: SceneKind
-    sizes: tuple[float, float]  # range of the objects' scales
-    seen_from: ViewRange
 
 
 def _views(
     simulation: ClutterSimulation,
-    setting: Setting,
+    kind: SceneKind,
+    sizes: tuple[float, float],  # range of the objects' scales
+    seen_from: ViewRange,
     options: GenerationOptions,
     streams: list[np.random.Generator],
 ) -> Iterator[LabelledView]:
@@ -233,11 +227,11 @@ def _views(
         guide = detector(options.weights)
     for _ in range(options.views_per_scene):
         if simulation.num_objects == 0 or failures == FAILURES:
-            count = 1 + int(rng.poisson(FURTHER_OBJECTS[setting.kind]))
-            simulation.reset(setting.kind, rng, count, setting.sizes)
+            count = 1 + int(rng.poisson(FURTHER_OBJECTS[kind]))
+            simulation.reset(kind, rng, count, sizes)
             failures = 0
         models = [model.origin or model for model in simulation.object_models]
-        query = ask(simulation, setting, streams, guided=guide is not None)
+        query = ask(simulation, kind, seen_from, streams, guided=guide is not None)
         view, best = label(simulation, query, options, streams[CHOICE_STREAM], guide)
         yield replace(
             view,
@@ -252,7 +246,8 @@ def _views(
 
 def ask(
     simulation: ClutterSimulation,
-    setting: Setting,
+    kind: SceneKind,
+    seen_from: ViewRange,
     streams: list[np.random.Generator],
     *,
     guided: bool,  # whether a network clears the scene, and has to be asked as a robot asks it
@@ -263,7 +258,6 @@ def ask(
     support is given, not quite where it is, or has to be found.
     """
     noise, choice = streams[NOISE_STREAM], streams[CHOICE_STREAM]
-    kind, _, seen_from = setting
     open_table = kind in (PACKED, PILE)
     around = not open_table or noise.random() < AROUND_SHARE
     draw, seen = noise.random(), dict[str, Any](noise_std=NOISE_STD)
@@ -274,7 +268,7 @@ def ask(
     cameras = seen_from.sample(streams[CAMERA_STREAM])
     table: TableView = "around" if around else "known"
     observation = simulation.observe_from(cameras, noise, table=table, **seen)
-    support: SupportPlane | AutoPlane = _plane(noise) if around else EXACT_PLANE
+    support: SupportPlane | AutoPlane = _plane(noise) if around else TABLE_PLANE
     low, high = map(tuple, observation.workspace.tolist())
     workspace: Workspace | None = Workspace(min=low, max=high)
     if around and choice.random() >= GIVEN_SHARE[kind]:
@@ -338,13 +332,12 @@ def label(
     T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
     # Points far from every grasp carry no information.
-    behind = choose_gripper(request, load_gripper(), {}).tip_z - BEHIND_TIPS
+    behind = choose_gripper(request, load_gripper(), {}).tip_z - FINGERTIP
     places = T_world_hand[:, :3, 3] + np.float32(behind) * T_world_hand[:, :3, 2]
     if len(places) == 0:  # a teacher's grasps are on the objects
         places = scene.points_in_cloud[scene.approach_allowed]
     plane = None if selected.support is None else selected.support.plane
-    far = cKDTree(places).query(scene.points_in_cloud)[0] > KEPT_DISTANCE
-    kept = np.flatnonzero(~far)
+    kept = np.flatnonzero(cKDTree(places).query(scene.points_in_cloud)[0] <= KEPT_DISTANCE)
     view = LabelledView(
         points=scene.points_in_cloud[kept],
         normals=scene.frame.directions_in_cloud(scene.cloud.normals)[kept],
