@@ -48,15 +48,15 @@ class ViewRange:
     """Where a camera may stand: ranges of spherical coordinates around `target`."""
 
     radius: tuple[float, float]  # metres
-    polar_angle: tuple[float, float]  # radians from world z
-    azimuth: tuple[float, float]  # radians from world x
-    target: tuple[float, float, float] = (0.15, 0.15, 0.25)  # looked at, world frame, metres
+    polar_degrees: tuple[float, float]  # from world z
+    azimuth_degrees: tuple[float, float]  # from world x
+    target: tuple[float, float, float]  # the point looked at, world frame, metres
 
     def sample(self, rng: np.random.Generator, views: int = 1) -> list[Matrix]:
         """Draw a pose `T_world_camera` (4, 4), and others evenly spread over a full turn."""
         radius = rng.uniform(*self.radius)
-        polar = rng.uniform(*self.polar_angle)
-        first = rng.uniform(*self.azimuth)
+        polar = rng.uniform(*np.deg2rad(self.polar_degrees))
+        first = rng.uniform(*np.deg2rad(self.azimuth_degrees))
         target = np.asarray(self.target)
         poses = []
         for azimuth in first + 2 * np.pi * np.arange(views) / views:
@@ -68,7 +68,7 @@ class ViewRange:
 
 
 # The views of the reference evaluation.
-EVALUATION_VIEWS = ViewRange((0.6, 0.75), (np.pi / 4, np.pi / 3), (0.0, np.pi))
+EVALUATION_VIEWS = ViewRange((0.6, 0.75), (45.0, 60.0), (0.0, 180.0), (0.15, 0.15, 0.25))
 
 
 def look_at(eye: Matrix, target: Matrix) -> Matrix:

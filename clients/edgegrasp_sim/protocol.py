@@ -46,19 +46,10 @@ class RoundRules:
 
 
 @dataclass(frozen=True, config=STRICT)
-class CameraRules:
+class CameraRules(ViewRange):
     """Where the camera stands; ranges are drawn from uniformly before every grasp."""
 
     views: int  # images before every grasp, spread evenly over a full turn from the first
-    radius: Range  # metres from `target`
-    polar_degrees: Range  # from world z
-    azimuth_degrees: Range  # from world x
-    target: tuple[float, float, float]  # the point looked at, world frame, metres
-
-    def view_range(self) -> ViewRange:
-        """The same in radians, to sample from."""
-        polar, azimuth = np.deg2rad([self.polar_degrees, self.azimuth_degrees]).tolist()
-        return ViewRange(self.radius, tuple(polar), tuple(azimuth), self.target)
 
 
 @dataclass(frozen=True, config=STRICT)

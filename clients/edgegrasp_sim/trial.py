@@ -144,7 +144,7 @@ class RoundDriver:
         """Take the next view."""
         rules = self.protocol
         self._seen = self.simulation.observe_from(
-            rules.camera.view_range().sample(self._camera, rules.camera.views),
+            rules.camera.sample(self._camera, rules.camera.views),
             self._noise,
             noise_std=rules.noise.point_std,
             depth_noise=rules.noise,

@@ -57,15 +57,16 @@ BINS = BIN, DEEP_BIN, FULL_BIN  # seen from above only
 MIXTURE = (PACKED, PILE, BIN, TABLE, BIN, PACKED, TABLE, PILE, BIN, TABLE)
 # A scene holds one object and Poisson(this) more.
 FURTHER_OBJECTS = {PACKED: 4, PILE: 4, BIN: 7, DEEP_BIN: 9, FULL_BIN: 24, TABLE: 5, SHELF: 3}
-_ABOVE, _STEEP = (0.0, np.radians(40)), (np.radians(20), np.radians(75))
-_ANY_SIDE, _FRONT = (0.0, 2 * np.pi), (np.radians(230), np.radians(310))
+_ABOVE, _STEEP = (0.0, 40.0), (20.0, 75.0)  # degrees, as the other angles
+_ANY_SIDE, _FRONT = (0.0, 360.0), (230.0, 310.0)
 _LOW_TARGET = (MIDDLE, MIDDLE, 0.1)  # metres
-VIEWS = dict.fromkeys((PACKED, PILE), ViewRange((0.45, 0.75), (0.0, np.radians(75)), _ANY_SIDE))
+_OPEN = ViewRange((0.45, 0.75), (0.0, 75.0), _ANY_SIDE, (MIDDLE, MIDDLE, 0.25))
+VIEWS = dict.fromkeys((PACKED, PILE), _OPEN)
 VIEWS |= dict.fromkeys(BINS, ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET))
 VIEWS[TABLE] = ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET)
-VIEWS[SHELF] = ViewRange((0.45, 1.0), (np.radians(45), np.radians(90)), _FRONT, _LOW_TARGET)
+VIEWS[SHELF] = ViewRange((0.45, 1.0), (45.0, 90.0), _FRONT, _LOW_TARGET)
 # Of household objects, more from one side: a tall or wide one hides its back there.
-SIDE_VIEWS = ViewRange((0.5, 1.2), (np.radians(40), np.radians(80)), _ANY_SIDE, _LOW_TARGET)
+SIDE_VIEWS = ViewRange((0.5, 1.2), (40.0, 80.0), _ANY_SIDE, _LOW_TARGET)
 # Metres from the nearest hand that was tried: from where the frame of a Panda's hand would be.
 KEPT_DISTANCE = 0.18
 AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
