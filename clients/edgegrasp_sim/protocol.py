@@ -56,7 +56,7 @@ class CameraRules(ViewRange):
 class NoiseRules(DepthNoise):
     """Noise of the depth image, see `DepthNoise`, and of the points made from it."""
 
-    point_std: float  # standard deviation of each coordinate of each point, metres
+    point_std: float = 0.0  # standard deviation of each coordinate of each point, metres
     # Kind of camera whose faults the images have besides; `random`: another before every grasp.
     sensor: Literal["", "random", "structured-light", "stereo", "time-of-flight"] = ""
 

@@ -25,11 +25,11 @@ PATCH_PIXELS = 12  # between those of what is missing
 class DepthNoise:
     """Noise of depth images: a random factor on each, and smooth Gaussian noise on some."""
 
-    gamma_shape: float  # shape of the gamma distribution of the factor; 0: no factor
-    gamma_scale: float  # its scale
-    correlated_std: float  # standard deviation of the smooth noise, metres
-    correlated_pixels: int  # pixels between its independent values, interpolated in between
-    correlated_share: float  # share of the images that have it
+    gamma_shape: float = 0.0  # shape of the gamma distribution of the factor; 0: no factor
+    gamma_scale: float = 0.0  # its scale
+    correlated_std: float = 0.0  # standard deviation of the smooth noise, metres
+    correlated_pixels: int = 4  # pixels between its independent values, interpolated in between
+    correlated_share: float = 0.0  # share of the images that have it
 
     def apply(self, depth: Float64, rng: np.random.Generator) -> Float64:
         """A noisy copy of a depth image: (height, width) metres."""
