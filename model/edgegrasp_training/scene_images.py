@@ -9,7 +9,7 @@ One command makes the whole data set again: `edgegrasp generate-scenes FOLDER --
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import open3d as o3d
@@ -260,38 +260,36 @@ def make_arms(rng: np.random.Generator) -> list[Mesh]:
     import pybullet_data
     import trimesh
 
+    from edgegrasp_sim.engine.with_pybullet import PybulletWorld
+
     folder, arms = Path(pybullet_data.getDataPath()), []
-    client = pybullet.connect(pybullet.DIRECT)
-    for name in ARMS:
-        body = pybullet.loadURDF(str(folder / name), physicsClientId=client)
-        links: list[tuple[int, Mesh]] = []
-        for shape in pybullet.getVisualShapeData(body, physicsClientId=client):
-            path = Path(shape[4].decode())
-            if shape[2] == pybullet.GEOM_MESH and path.is_file():
-                surface = trimesh.load_mesh(path, process=False)
-                points = np.asarray(surface.vertices) * np.asarray(shape[3])
-                points = points @ Rotation.from_quat(shape[6]).as_matrix().T + shape[5]
-                links.append((shape[1], simplified((points, np.asarray(surface.faces)), 800)))
-        arms += [_posed(rng, body, links, client) for _ in range(NUM_ARMS // len(ARMS))]
-    pybullet.disconnect(client)
+    with PybulletWorld() as world:
+        for name in ARMS:
+            body = world.client.loadURDF(str(folder / name))
+            links: list[tuple[int, Mesh]] = []
+            for shape in world.client.getVisualShapeData(body):
+                path = Path(shape[4].decode())
+                if shape[2] == pybullet.GEOM_MESH and path.is_file():
+                    surface = trimesh.load_mesh(path, process=False)
+                    points = np.asarray(surface.vertices) * np.asarray(shape[3])
+                    points = points @ Rotation.from_quat(shape[6]).as_matrix().T + shape[5]
+                    links.append((shape[1], simplified((points, np.asarray(surface.faces)), 800)))
+            arms += [_posed(rng, world.client, body, links) for _ in range(NUM_ARMS // len(ARMS))]
     return arms
 
 
 def _posed(
-    rng: np.random.Generator, body: int, links: Sequence[tuple[int, Mesh]], client: int
+    rng: np.random.Generator, client: Any, body: int, links: Sequence[tuple[int, Mesh]]
 ) -> Mesh:
-    import pybullet
-
-    for joint in range(pybullet.getNumJoints(body, physicsClientId=client)):
-        low, high = pybullet.getJointInfo(body, joint, physicsClientId=client)[8:10]
+    for joint in range(client.getNumJoints(body)):
+        low, high = client.getJointInfo(body, joint)[8:10]
         low, high = (low, high) if low < high else (-1.0, 1.0)
-        pybullet.resetJointState(body, joint, rng.uniform(low, high), physicsClientId=client)
+        client.resetJointState(body, joint, rng.uniform(low, high))
     placed = []
     for link, (points, faces) in links:
-        place, turn = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
+        place, turn = client.getBasePositionAndOrientation(body)
         if link >= 0:
-            state = pybullet.getLinkState(body, link, 0, 1, physicsClientId=client)
-            place, turn = state[4:6]
+            place, turn = client.getLinkState(body, link, 0, 1)[4:6]
         placed.append((points @ Rotation.from_quat(turn).as_matrix().T + place, faces))
     points, faces = merged(placed)
     return points - placed[-1][0].mean(axis=0), faces
