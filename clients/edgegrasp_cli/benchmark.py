@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 from pydantic import BaseModel, Field
+from rich.console import Console
+from rich.progress import Progress, TimeElapsedColumn
+from rich.table import Table
 
 from edgegrasp_cli.flags import PlannerFlags, option_flags, parse_option_flags, takes_flags
 
@@ -186,9 +189,6 @@ def compare(
     output: Annotated[Path | None, Option(help="JSON file for the figures as well.")] = None,
 ) -> None:
     """Compare two benchmarks scene by scene, with 95 % confidence intervals."""
-    from rich.console import Console
-    from rich.table import Table
-
     from edgegrasp_sim.results import RATE_LABELS, ResultFolder, percent
     from edgegrasp_sim.results import compare as figures_of
 
@@ -229,9 +229,6 @@ def run_rounds(
     folder: "ResultFolder | None",
 ) -> "tuple[list[Round], dict[str, Any]]":
     """Run the remaining rounds, with a progress bar; returns all, and `run` of the manifest."""
-    from rich.console import Console
-    from rich.progress import Progress, TimeElapsedColumn
-
     from edgegrasp_cli.planners import open_planner
     from edgegrasp_sim.benchmark import manifest, run_benchmark
     from edgegrasp_sim.results import count
@@ -267,8 +264,6 @@ def run_rounds(
 
 
 def _print_summary(summary: dict[str, Any], planner: str) -> None:
-    from rich.console import Console
-
     from edgegrasp_sim.results import RATE_LABELS, over_seeds, percent
 
     console = Console(highlight=False, markup=False, soft_wrap=True)

@@ -5,19 +5,23 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
 
+from edgegrasp_camera.arrays import Int64
+from edgegrasp_camera.picture import Picture
 from edgegrasp_cli.detect import DetectorFlags, open_client
 from edgegrasp_cli.flags import option_flags, parse_option_flags, takes_flags
+from edgegrasp_cli.real_scenes import BEST, RealScene, SceneFigures, judge, load_scenes, renumbered
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.gripper import choose_gripper, load_gripper
+from edgegrasp_model.options import parse_options
 from edgegrasp_model.results import SUPPORT, UNLABELLED
-
-if TYPE_CHECKING:
-    from edgegrasp_camera.arrays import Int64
-    from edgegrasp_camera.picture import Picture
-    from edgegrasp_cli.real_scenes import RealScene, SceneFigures
 
 Option = typer.Option
 Rows = list[tuple[str, ...]]
@@ -46,13 +50,7 @@ def benchmark_real(
     A request contains the image and its intrinsics, or the cloud with the camera at its origin, and
     the options given as flags; nothing else about the scene.
     """
-    from rich.console import Console
-    from rich.progress import track
-
     from edgegrasp_cli.planners import model_used
-    from edgegrasp_cli.real_scenes import BEST, judge, load_scenes
-    from edgegrasp_model.gripper import choose_gripper, load_gripper
-    from edgegrasp_model.options import parse_options
 
     fields, loaded = parse_option_flags(options), load_scenes(scenes)
     output.mkdir(parents=True, exist_ok=True)
@@ -79,10 +77,9 @@ def benchmark_real(
     _write(output, model.name, fields, done)
 
 
-def _ask(client: Any, scene: "RealScene", fields: Mapping[str, Any]) -> tuple[Any | None, str]:
+def _ask(client: Any, scene: RealScene, fields: Mapping[str, Any]) -> tuple[Any | None, str]:
     """The answer for a scene, or None and the reason if the request is refused."""
     from edgegrasp_client import InvalidRequestError
-    from edgegrasp_model.errors import InvalidRequest
 
     try:
         return client.detect(**scene.request, **fields), ""
@@ -90,9 +87,7 @@ def _ask(client: Any, scene: "RealScene", fields: Mapping[str, Any]) -> tuple[An
         return None, str(error)
 
 
-def _labels(
-    client: Any, scene: "RealScene", fields: Mapping[str, Any], found: Any | None
-) -> "Int64":
+def _labels(client: Any, scene: RealScene, fields: Mapping[str, Any], found: Any | None) -> Int64:
     """The detector's label of each point (R,), as in `DebugInfo`, from an untimed request.
 
     Everything is unlabelled if the detector refuses or finds no object.
@@ -105,12 +100,9 @@ def _labels(
 
 
 def _write(
-    output: Path, model: str, options: Mapping[str, Any], done: "dict[str, SceneFigures]"
+    output: Path, model: str, options: Mapping[str, Any], done: dict[str, SceneFigures]
 ) -> None:
     """Write results.json and the page, and print the table."""
-    from rich.console import Console
-    from rich.table import Table
-
     from edgegrasp_sim.report import image, page, table
 
     total = summary(list(done.values()))
@@ -132,7 +124,7 @@ def _write(
     print(f"report: {output / 'index.html'}")
 
 
-def summary(done: "Sequence[SceneFigures]") -> dict[str, Any]:
+def summary(done: Sequence[SceneFigures]) -> dict[str, Any]:
     """Figures over all scenes; shares are of the judged grasps, None if there are none."""
     best = sum(figures.best for figures in done)
 
@@ -142,7 +134,7 @@ def summary(done: "Sequence[SceneFigures]") -> dict[str, Any]:
     # For a heap that is labelled as one object, neither plane nor objects are known.
     apart = [figures for figures in done if figures.plane_labelled]
 
-    def mean(name: str, judged: "Sequence[SceneFigures]") -> float | None:
+    def mean(name: str, judged: Sequence[SceneFigures]) -> float | None:
         shares = [getattr(figures.segmentation, name) for figures in judged]
         return float(np.mean(shares)) if shares else None
 
@@ -167,7 +159,7 @@ def summary(done: "Sequence[SceneFigures]") -> dict[str, Any]:
 # The tables
 
 
-def _grasp_table(done: "Mapping[str, SceneFigures]", total: Mapping[str, Any]) -> Rows:
+def _grasp_table(done: Mapping[str, SceneFigures], total: Mapping[str, Any]) -> Rows:
     """Table of the best grasps."""
     head = ("scene", "best", "on an object", "from below", "through points", "objects held", "ms")
     rows: Rows = [head]
@@ -181,7 +173,7 @@ def _grasp_table(done: "Mapping[str, SceneFigures]", total: Mapping[str, Any]) -
     return rows
 
 
-def _segmentation_table(done: "Mapping[str, SceneFigures]", total: Mapping[str, Any]) -> Rows:
+def _segmentation_table(done: Mapping[str, SceneFigures], total: Mapping[str, Any]) -> Rows:
     """Table of segmentation and plane."""
     head = ("scene", "object pixels P/R", "overlap P/R/F", "objects found", "called", "plane")
     rows: Rows = [head]
@@ -205,7 +197,7 @@ def _shares(*shares: float | None) -> str:
     return "/".join("-" if share is None else f"{100 * share:.0f}" for share in shares)
 
 
-def _plane_text(figures: "SceneFigures") -> str:
+def _plane_text(figures: SceneFigures) -> str:
     plane = figures.plane
     if not figures.plane_labelled:
         return "-"
@@ -215,7 +207,7 @@ def _plane_text(figures: "SceneFigures") -> str:
     return f"{verdict}: {plane.angle:.1f}°, {1000 * plane.offset:.0f} mm"
 
 
-def _sentence(figures: "SceneFigures") -> str:
+def _sentence(figures: SceneFigures) -> str:
     if figures.refused:
         return f"refused: {figures.refused}"
     return (
@@ -229,7 +221,7 @@ def _sentence(figures: "SceneFigures") -> str:
 
 def draw(
     path: Path,
-    scene: "RealScene",
+    scene: RealScene,
     grasps: Sequence[Any],
     plane: tuple[Any, float] | None,
     title: str,
@@ -238,8 +230,6 @@ def draw(
 
     Grasps are best first; the found plane is given by its normal (3,) and offset; camera frame.
     """
-    from edgegrasp_camera.picture import Picture
-
     picture = Picture(scene.camera, scene.points, image=scene.rgb, title=title + CAPTION)
     row = picture.row_of_pixel
     for label in scene.objects:
@@ -252,7 +242,7 @@ def draw(
     picture.save(path)
 
 
-def draw_labels(path: Path, scene: "RealScene", labels: "Int64") -> None:
+def draw_labels(path: Path, scene: RealScene, labels: Int64) -> None:
     """Write three pictures side by side: the camera's image, its labels, the detector's (R,).
 
     Support and obstacles are grey, objects coloured; a labelled object and the detected one that
@@ -261,13 +251,11 @@ def draw_labels(path: Path, scene: "RealScene", labels: "Int64") -> None:
     from matplotlib import colormaps
     from matplotlib.image import imsave
 
-    from edgegrasp_cli.real_scenes import renumbered
-
     truth, paints = scene.object_of_point, colormaps["tab20"](np.arange(20))[:, :3]
     found = renumbered(truth, np.maximum(labels + 1, 0))
     row = scene.camera.rows_of_pixels(scene.points)
 
-    def painted(number: "Int64", support: Any) -> Any:
+    def painted(number: Int64, support: Any) -> Any:
         color = 255 * paints[(2 * number - 2 + (number > 10)) % len(paints)]
         color[number == 0] = BACKGROUND
         color[(number == 0) & support] = ON_SUPPORT
@@ -283,7 +271,7 @@ def draw_labels(path: Path, scene: "RealScene", labels: "Int64") -> None:
 
 
 def _draw_plane(
-    picture: "Picture", scene: "RealScene", normal: Any, offset: float, color: str, *, width: float
+    picture: Picture, scene: RealScene, normal: Any, offset: float, color: str, *, width: float
 ) -> None:
     """A square of a plane at the foot of each object, and the way up from it."""
     across = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])

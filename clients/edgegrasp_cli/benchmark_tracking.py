@@ -6,19 +6,22 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
+from rich.console import Console
+from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from edgegrasp_camera.arrays import Float64
 from edgegrasp_cli.detect import DetectorFlags, open_client
 from edgegrasp_cli.flags import takes_flags
-
-if TYPE_CHECKING:
-    from edgegrasp_camera.arrays import Float64
-    from edgegrasp_cli.real_scenes import RealScene
-    from edgegrasp_sim.simulation import ClutterSimulation
+from edgegrasp_cli.real_scenes import RealScene, load_scenes
+from edgegrasp_sim.camera import look_at
+from edgegrasp_sim.objects import ObjectSet, SceneKind
+from edgegrasp_sim.sensor import STRUCTURED_LIGHT
+from edgegrasp_sim.simulation import ClutterSimulation
 
 Option = typer.Option
 RATE = 30.0  # images a second
@@ -70,7 +73,7 @@ class Followed:
 class RecordedScene:
     """A recorded scene that stands still, in each image with new noise of a depth camera."""
 
-    def __init__(self, scene: "RealScene") -> None:
+    def __init__(self, scene: RealScene) -> None:
         self.points = scene.points
 
     def look(self, seconds: float) -> dict[str, Any]:
@@ -81,10 +84,10 @@ class RecordedScene:
         seen = np.isfinite(noisy[:, 0]) & (rng.random(len(depth)) > MISSING)
         return {"cloud": noisy[seen], "viewpoint": (0.0, 0.0, 0.0)}
 
-    def hold(self, T_cloud_tcp: "Float64") -> None:
+    def hold(self, T_cloud_tcp: Float64) -> None:
         """Choose the object that moves from now on: the one nearest to a grasp; here none does."""
 
-    def moved(self, seconds: float) -> "Float64":
+    def moved(self, seconds: float) -> Float64:
         """(4, 4) T_now_start of that object, cloud frame."""
         return np.eye(4)
 
@@ -97,7 +100,7 @@ class SimulatedScene:
     """Objects on a table, one of which moves, under a structured-light camera; world frame."""
 
     def __init__(
-        self, simulation: "ClutterSimulation", motion: Motion, rng: np.random.Generator
+        self, simulation: ClutterSimulation, motion: Motion, rng: np.random.Generator
     ) -> None:
         self.simulation, self.motion, self.rng = simulation, motion, rng
         self.start, self.held = simulation.placements, 0
@@ -108,9 +111,6 @@ class SimulatedScene:
 
     def look(self, seconds: float) -> dict[str, Any]:
         """The points (H, W, 3)."""
-        from edgegrasp_sim.camera import look_at
-        from edgegrasp_sim.sensor import STRUCTURED_LIGHT
-
         self._place(seconds)
         nearer = self.motion.camera * seconds / np.linalg.norm(TARGET - EYE)
         eye = EYE + nearer * (TARGET - EYE)
@@ -119,11 +119,11 @@ class SimulatedScene:
         )
         return {"cloud": seen.image, "viewpoint": tuple(eye.tolist())}
 
-    def hold(self, T_cloud_tcp: "Float64") -> None:
+    def hold(self, T_cloud_tcp: Float64) -> None:
         """Choose the object whose centre is nearest."""
         self.held = int(np.linalg.norm(self.places - T_cloud_tcp[:3, 3], axis=1).argmin())
 
-    def moved(self, seconds: float) -> "Float64":
+    def moved(self, seconds: float) -> Float64:
         """A translation, and a rotation about the object's centre."""
         motion, place, T = self.motion, self.places[self.held], np.eye(4)
         gone = min(motion.speed * seconds, motion.shift)
@@ -177,8 +177,6 @@ def benchmark_tracking(
     The scene moves on while an answer is computed, and images that come meanwhile are dropped. An
     answer takes the processor's time of this process; with --server, the time until it is there.
     """
-    from edgegrasp_cli.real_scenes import load_scenes
-
     names = motion or (["still"] if scenes else list(MOTIONS))
     if unknown := [name for name in names if name not in MOTIONS]:
         raise ValueError(f"--motion: got {unknown[0]!r}. Choose one of {', '.join(MOTIONS)}.")
@@ -247,12 +245,12 @@ def found_again(client: Any, scene: Scene) -> float:
     return sum(alike) / len(alike)
 
 
-def _alike(one: "Float64", other: "Float64") -> bool:
+def _alike(one: Float64, other: Float64) -> bool:
     near = np.linalg.norm(one[:3, 3] - other[:3, 3]) <= ALIKE[0]
     return bool(near and min(_degrees(one, other), _degrees(one @ HALF_TURN, other)) <= ALIKE[1])
 
 
-def _degrees(one: "Float64", other: "Float64") -> float:
+def _degrees(one: Float64, other: Float64) -> float:
     """The angle between the rotations of two poses (4, 4), degrees."""
     turn = Rotation.from_matrix(one[:3, :3].T @ other[:3, :3])
     return float(np.degrees(turn.magnitude()))
@@ -282,9 +280,6 @@ def summary(done: list[Followed]) -> dict[str, Any]:
 
 def simulated(objects: Path | None, motion: Motion, rounds: int) -> Iterator[SimulatedScene]:
     """Simulated scenes; each is valid until the next one."""
-    from edgegrasp_sim.objects import ObjectSet, SceneKind
-    from edgegrasp_sim.simulation import ClutterSimulation
-
     kind = SceneKind.PACKED
     sets = None if objects is None else {kind: ObjectSet.from_folder(objects, kind, "test")}
     with ClutterSimulation(sets, engine="mujoco") as simulation:
@@ -296,9 +291,6 @@ def simulated(objects: Path | None, motion: Motion, rounds: int) -> Iterator[Sim
 
 def _print(rows: dict[str, dict[str, Any]]) -> None:
     """A row for each motion or recorded scene; medians and 95 % in one column."""
-    from rich.console import Console
-    from rich.table import Table
-
     held = [name for name in next(iter(rows.values()), {}) if name in SUCCESSES]
     counts, measured = ("scenes", "images", "switches"), ("mm", "degrees", "ms")
     table = Table("", *counts, *measured, *held, "alike", box=None)

@@ -14,6 +14,7 @@ from edgegrasp_cli.detect import OwnDetector
 from edgegrasp_cli.flags import PlannerFlags
 from edgegrasp_client import GraspClientError, Model, ServerUnavailableError, StartCollisionError
 from edgegrasp_client.connection import local_server
+from edgegrasp_model.errors import StartCollision
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.protocol import PlanningRules
 from edgegrasp_sim.trial import PlannedGrasp, Planner, StartCollides
@@ -137,8 +138,6 @@ class ClientPlanner:
             GraspClientError: the server refuses the request, or is away for REQUEST_SECONDS.
             EdgeGraspError: the detector in this process refuses it.
         """
-        from edgegrasp_model.errors import StartCollision
-
         if self._client is None:
             self._client = self.open_client(REQUEST_SECONDS)
         options = request_options(observation, seed, self.rules, self.options)

@@ -6,7 +6,7 @@ A scene is an .npz file: docs/benchmark.md has its arrays.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +14,9 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Int64
+from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
 from edgegrasp_camera.picture import View
-
-if TYPE_CHECKING:  # Numba is loaded where grasps are judged
-    from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.gripper import Gripper
 
 BEST = 10  # grasps of each scene that are judged
 GOOD_SCORE = 0.5
@@ -224,7 +223,7 @@ def judge(
     # Normal (3,) and offset of the support plane that was found, camera frame.
     plane: tuple[Array, float] | None,
     answer: Int64,  # (R,) number of the object that each point is on, from 1; 0: on no object
-    gripper: "Gripper",  # that the grasps are for
+    gripper: Gripper,  # that the grasps are for
     milliseconds: float,  # from the request to the answer
     refused: str = "",  # the reason, if the request was refused
 ) -> SceneFigures:
@@ -253,9 +252,9 @@ def judge(
     )
 
 
-def _meet_points(scene: RealScene, grasps: Sequence[Any], gripper: "Gripper") -> Bools:
+def _meet_points(scene: RealScene, grasps: Sequence[Any], gripper: Gripper) -> Bools:
     """Which open hands (E,) contain a measured point, before any cleaning, deeper than NOISE."""
-    from edgegrasp_model.hand_kernels import any_point_in_boxes
+    from edgegrasp_model.hand_kernels import any_point_in_boxes  # loads Numba
 
     seen = scene.points[np.isfinite(scene.points).all(axis=1)]
     hands = np.reshape([grasp.T_cloud_hand for grasp in grasps], (-1, 4, 4)).astype(np.float32)
@@ -318,8 +317,6 @@ def _plane(arrays: _Arrays) -> tuple[Float64 | None, float]:
 
 def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32]:
     """The detector's input, and the points (H, W, 3) or (N, 3), NaN without a reading."""
-    from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
-
     if "depth" in arrays.arrays:
         depth = arrays.get("depth", "u", "(H, W) uint16 millimetres")
         values = arrays.get("intrinsics", "f", "fx, fy, cx, cy beside depth", (4,)).tolist()

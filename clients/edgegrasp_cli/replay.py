@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
 
 if TYPE_CHECKING:
     from edgegrasp_service.settings import Settings
@@ -37,8 +38,6 @@ def attempt(
     ] = None,
 ) -> None:
     """Repeat one recorded attempt, in its scene and view."""
-    from rich.console import Console
-
     from edgegrasp_camera.picture import draw_grasps
     from edgegrasp_sim.report import Replay, attempt_title
     from edgegrasp_sim.results import ResultFolder

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 from pydantic import Field
+from rich.progress import Progress, track
 
 from edgegrasp_cli.benchmark import Cluster, interruptible
 from edgegrasp_cli.flags import takes_flags
@@ -36,8 +37,6 @@ def generate_data(
 
     Views that are there already are kept, so that the same command continues where it stopped.
     """
-    from rich.progress import track
-
     from edgegrasp_sim.engine import choose_engine
     from edgegrasp_training.generation import generate, missing_scenes
     from edgegrasp_training.views import find_views, write_data_card
@@ -91,8 +90,6 @@ def train(
     The run folder gets log.csv, the weights with the least validation loss, and when training is
     done a model card. Running the same command again continues from the last state.
     """
-    from rich.progress import Progress
-
     from edgegrasp_training.evaluation import recalibrate
     from edgegrasp_training.examples import Teacher
     from edgegrasp_training.recipes import recipe
