@@ -127,27 +127,79 @@ class Sampler:
         return reduce(Sample.and_further, [one for one in samples if one is not None])
 
     def _around(self, approach_index: Int64, *, last_resort: bool) -> Sample:
-        scene, options, gripper, counts = self.scene, self.options, self.gripper, self.counts
-        crop = crop_balls(scene.cloud.points, approach_index, self.crop_radius)
-        drawn, outcome = _constrained(
-            scene,
-            approach_index,
-            crop,
-            options,
-            gripper,
-            counts,
-            sees_hands=self.sees_hands,
-            last_resort=last_resort,
-        )
-        row, free = _checked(drawn, outcome, scene, options, gripper, counts, self._rng)
+        options, gripper = self.options, self.gripper
+        crop = crop_balls(self.scene.cloud.points, approach_index, self.crop_radius)
+        drawn, outcome = self._constrained(approach_index, crop, last_resort=last_resort)
+        row, free = self._checked(drawn, outcome)
         new = free | (options.collision.mode != "avoid")
         new[new] = different(drawn.T_cloud_hand[row[new]], free[new], gripper, options)
-        most = options.num_candidates - counts.get("scored", 0)
+        most = options.num_candidates - self.counts.get("scored", 0)
         scored = rows_to_score(free, new, options, most, self._rng)
         row, free = row[scored], free[scored]
         outcome[row] = CODE[Outcome.RETURNED]
-        add_count(counts, "scored", len(row))
+        self._count("scored", len(row))
         return Sample(approach_index, crop, drawn.take(row), free, drawn, outcome, row)
+
+    def _constrained(
+        self, approach_index: Int64, crop: BallCrop, *, last_resort: bool
+    ) -> tuple[Candidates, NDArray[np.int8]]:
+        """The candidates of some balls; RETURNED: all constraints hold except collision.
+
+        A network that sees hands gets centred hands, and hands across outlines: as a last resort
+        tilted ones too. To one that sees edges a hand across an outline is a last resort.
+        """
+        scene, options, gripper = self.scene, self.options, self.gripper
+        points, margin = scene.cloud.points, options.collision.margin
+        self._count("approach_points", len(approach_index))
+        self._count("pairs", len(crop.ball_rows))
+        pair = np.flatnonzero(scene.contact_allowed[crop.ball_rows])
+        self._count("in_contact_region", len(pair))
+        pairs = approach_index[crop.ball_of_point[pair]], crop.ball_rows[pair]
+        candidates = edge_grasps(scene.cloud, *pairs, gripper)
+        candidates = replace(candidates, pair=pair[candidates.pair])
+        if self.sees_hands:
+            centred = centred_grasps(points, crop, candidates, gripper)
+            candidates = Candidates.concatenate([candidates, centred])
+        if self.sees_hands or last_resort:
+            contacts = np.flatnonzero(np.bincount(pairs[1]))
+            leaning = self.sees_hands and last_resort
+            across = [
+                outline_grasps(
+                    points, crop, approach_index, pair, each, scene.support, gripper, margin
+                )
+                for each in outlines(points, scene.viewpoints, contacts, leaning=leaning)
+            ]
+            candidates = Candidates.concatenate([candidates, *across])
+        self._count("candidates", len(candidates))
+        outcome = np.full(len(candidates), CODE[Outcome.RETURNED])
+        if scene.support is not None:
+            candidates, clear = retract(candidates, scene.support, gripper, margin)
+            outcome[~clear] = CODE[Outcome.SUPPORT]
+        asked, in_frame = options.approach_direction, scene.frame.directions
+        allowed = allowed_directions(-candidates.approach, asked, in_frame)
+        outcome[~allowed] = CODE[Outcome.DIRECTION]
+        self._count("in_direction", int(allowed.sum()))
+        self._count("clear_of_support", int((outcome == CODE[Outcome.RETURNED]).sum()))
+        return candidates, outcome
+
+    def _checked(self, candidates: Candidates, outcome: NDArray[np.int8]) -> tuple[Int64, Bools]:
+        """Some of the remaining candidates (K,), and a mask (K,) of those that do not collide."""
+        rule = self.options.collision
+        passed = np.flatnonzero(outcome == CODE[Outcome.RETURNED])
+        most = OVERSAMPLING * self.options.num_candidates
+        row = passed[random_rows(len(passed), most, self._rng)]
+        outcome[passed] = CODE[Outcome.NOT_CHECKED]
+        free = ~collides(self.scene, candidates.T_cloud_hand[row], self.gripper, rule)
+        outcome[row] = CODE[Outcome.NOT_SCORED]
+        if rule.mode != "ignore":
+            outcome[row[~free]] = CODE[Outcome.COLLISION]
+        self._count("checked", len(row))
+        self._count("collision_free", int(free.sum()))
+        return row, free
+
+    def _count(self, name: str, number: int) -> None:
+        """Add to a count, which starts at 0."""
+        self.counts[name] = self.counts.get(name, 0) + number
 
     def _spread(self, counts: Int64) -> Int64:
         """Further approach points, `counts` (O,) on each of the objects; rows of the cloud."""
@@ -160,28 +212,6 @@ class Sampler:
             )
             chosen.append(mine[rows])
         return np.concatenate(chosen)
-
-
-def _checked(
-    candidates: Candidates,
-    outcome: NDArray[np.int8],
-    scene: Scene,
-    options: DetectOptions,
-    gripper: Gripper,
-    counts: dict[str, int],
-    rng: np.random.Generator,
-) -> tuple[Int64, Bools]:
-    """Some of the remaining candidates (K,), and a mask (K,) of those that do not collide."""
-    passed = np.flatnonzero(outcome == CODE[Outcome.RETURNED])
-    row = passed[random_rows(len(passed), OVERSAMPLING * options.num_candidates, rng)]
-    outcome[passed] = CODE[Outcome.NOT_CHECKED]
-    free = ~collides(scene, candidates.T_cloud_hand[row], gripper, options.collision)
-    outcome[row] = CODE[Outcome.NOT_SCORED]
-    if options.collision.mode != "ignore":
-        outcome[row[~free]] = CODE[Outcome.COLLISION]
-    add_count(counts, "checked", len(row))
-    add_count(counts, "collision_free", int(free.sum()))
-    return row, free
 
 
 def share_approach_points(scene: Scene, rows: Int64, options: DetectOptions) -> tuple[Int64, Int64]:
@@ -200,55 +230,6 @@ def share_approach_points(scene: Scene, rows: Int64, options: DetectOptions) -> 
     wanted = np.floor(share).astype(np.int64)
     wanted[np.argsort(wanted - share, kind="stable")[: most - wanted.sum()]] += 1
     return objects, wanted
-
-
-def _constrained(
-    scene: Scene,
-    approach_index: Int64,
-    crop: BallCrop,
-    options: DetectOptions,
-    gripper: Gripper,
-    counts: dict[str, int],
-    *,
-    sees_hands: bool,
-    last_resort: bool,
-) -> tuple[Candidates, NDArray[np.int8]]:
-    """The candidates of some balls; RETURNED: all constraints hold except collision.
-
-    A network that sees hands gets centred hands, and hands across outlines: as a last resort tilted
-    ones too. To one that sees edges a hand across an outline is a last resort.
-    """
-    add_count(counts, "approach_points", len(approach_index))
-    add_count(counts, "pairs", len(crop.ball_rows))
-    pair = np.flatnonzero(scene.contact_allowed[crop.ball_rows])
-    add_count(counts, "in_contact_region", len(pair))
-    pairs = approach_index[crop.ball_of_point[pair]], crop.ball_rows[pair]
-    candidates = edge_grasps(scene.cloud, *pairs, gripper)
-    candidates = replace(candidates, pair=pair[candidates.pair])
-    if sees_hands:
-        centred = centred_grasps(scene.cloud.points, crop, candidates, gripper)
-        candidates = Candidates.concatenate([candidates, centred])
-    points, margin = scene.cloud.points, options.collision.margin
-    is_contact = np.zeros(len(points), dtype=bool)
-    is_contact[pairs[1]] = True
-    if sees_hands or last_resort:
-        contacts, leaning = np.flatnonzero(is_contact), sees_hands and last_resort
-        across = [
-            outline_grasps(points, crop, approach_index, pair, each, scene.support, gripper, margin)
-            for each in outlines(points, scene.viewpoints, contacts, leaning=leaning)
-        ]
-        candidates = Candidates.concatenate([candidates, *across])
-    add_count(counts, "candidates", len(candidates))
-    outcome = np.full(len(candidates), CODE[Outcome.RETURNED])
-    if scene.support is not None:
-        candidates, clear = retract(candidates, scene.support, gripper, margin)
-        outcome[~clear] = CODE[Outcome.SUPPORT]
-    direction = -candidates.approach
-    allowed = allowed_directions(direction, options.approach_direction, UP, scene.frame.directions)
-    outcome[~allowed] = CODE[Outcome.DIRECTION]
-    add_count(counts, "in_direction", int(allowed.sum()))
-    add_count(counts, "clear_of_support", int((outcome == CODE[Outcome.RETURNED]).sum()))
-    return candidates, outcome
 
 
 def different(
@@ -286,19 +267,13 @@ def random_rows(size: int, limit: int, rng: np.random.Generator) -> Int64:
     return np.sort(rng.choice(size, limit, replace=False)).astype(np.int64)
 
 
-def add_count(counts: dict[str, int], name: str, number: int) -> None:
-    """Add to a count, which starts at 0."""
-    counts[name] = counts.get(name, 0) + number
-
-
 def allowed_directions(
-    direction: Floats,  # (E, 3) unit, the hands' +z
+    direction: Floats,  # (E, 3) unit, the hands' +z, canonical frame
     constraint: ApproachDirection | None,
-    up: ArrayLike,  # (3,) unit, in the frame of `direction`
-    in_frame: Callable[[ArrayLike], Floats] = np.asarray,  # of the cones
+    in_frame: Callable[[ArrayLike], Floats],  # turns the cones' directions into that frame
 ) -> Bools:
     """Which directions (E,) the hand may move in."""
-    rise = direction @ np.asarray(up)
+    rise = direction @ UP
     if constraint is None:
         return np.asarray(-rise > MIN_APPROACH_UP)
     allowed = np.zeros(len(direction), dtype=bool)
