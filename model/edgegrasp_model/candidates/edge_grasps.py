@@ -1,7 +1,7 @@
 """Approach points, the edge grasps around them, and their centred variants."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -108,21 +108,12 @@ class Candidates:
     @staticmethod
     def concatenate(parts: Sequence["Candidates"]) -> "Candidates":
         """All candidates of several sets, in order."""
-        arrays = [
-            np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(parts[0])
-        ]
-        return Candidates(*arrays)
+        arrays = zip(*(vars(part).values() for part in parts), strict=True)
+        return Candidates(*map(np.concatenate, arrays))
 
     def take(self, rows: NDArray[np.integer] | Bools) -> "Candidates":
         """The candidates of the given rows, in their order."""
-        return Candidates(
-            self.pair[rows],
-            self.approach_index[rows],
-            self.contact_index[rows],
-            self.approach[rows],
-            self.depth[rows],
-            self.T_cloud_hand[rows],
-        )
+        return Candidates(*(array[rows] for array in vars(self).values()))
 
 
 def edge_grasps(
