@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.networks.balls import BallBatch, nearest_in_ball
+from edgegrasp_model.kernels import nearest_in_groups
+from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
@@ -125,10 +126,12 @@ class RandomScene:
         ahead = edge - (edge * normal).sum(axis=1, keepdims=True) * normal
         depth = np.linalg.norm(ahead, axis=1)
         centre = self.points[self.approach_index][crop.ball_of_point]
+        centred = self.points[crop.ball_rows] - centre
+        bounds = np.searchsorted(crop.ball_of_point, np.arange(len(self.approach_index) + 1))
         return BallBatch(
-            points=torch.from_numpy(self.points[crop.ball_rows] - centre).to(dtype),
+            points=torch.from_numpy(centred).to(dtype),
             normals=torch.from_numpy(self.normals[crop.ball_rows]).to(dtype),
-            neighbors=torch.from_numpy(nearest_in_ball(self.points, self.approach_index, crop)),
+            neighbors=torch.from_numpy(nearest_in_groups(centred, bounds, 16)),
             ball_of_point=torch.from_numpy(crop.ball_of_point),
             num_balls=len(self.approach_index),
             contact=torch.from_numpy(row),

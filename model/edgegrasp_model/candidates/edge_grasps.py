@@ -63,7 +63,6 @@ class BallCrop(NamedTuple):
 
     ball_rows: Int64  # (P,) rows of the cloud, ascending within each ball
     ball_of_point: Int64  # (P,) ascending, 0..A-1
-    radius: float  # metres
 
     def bounds(self, ball: Int64) -> tuple[Int64, Int64]:
         """Places in `ball_rows` where the points of balls (M,) begin, and where they end."""
@@ -81,7 +80,7 @@ def crop_balls(
     members = cKDTree(points).query_ball_point(points[approach_index], radius, return_sorted=True)
     ball_of_point = np.repeat(np.arange(len(members)), [len(rows) for rows in members])
     ball_rows = np.concatenate([np.empty(0), *members]).astype(np.int64)
-    return BallCrop(ball_rows, ball_of_point, radius)
+    return BallCrop(ball_rows, ball_of_point)
 
 
 @dataclass(frozen=True)

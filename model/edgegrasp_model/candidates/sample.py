@@ -62,7 +62,6 @@ class Sample:
         crop = BallCrop(
             np.concatenate([self.crop.ball_rows, other.crop.ball_rows]),
             np.concatenate([self.crop.ball_of_point, ball]),
-            self.crop.radius,
         )
         further, drawn = (
             replace(candidates, pair=candidates.pair + len(self.crop.ball_rows))

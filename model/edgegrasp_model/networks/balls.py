@@ -9,23 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from edgegrasp_camera.arrays import Float32, Floats, Int64
+from edgegrasp_camera.arrays import Float32, Floats
 from edgegrasp_model.candidates.edge_grasps import BallCrop, crop_balls
 from edgegrasp_model.kernels import nearest_in_groups
 from edgegrasp_model.networks.config import NetworkConfig
-
-
-def nearest_in_ball(
-    points: Float32,  # (N, 3)
-    approach_index: NDArray[np.integer],  # (A,)
-    crop: BallCrop,
-    k: int = 16,
-) -> Int64:
-    """Rows (P, k) of `crop.ball_rows`: the k nearest in the same ball, itself first (paper, IV)."""
-    centre = points[np.asarray(approach_index, dtype=np.int64)[crop.ball_of_point]]
-    centred = points[crop.ball_rows] - centre
-    bounds = np.searchsorted(crop.ball_of_point, np.arange(len(approach_index) + 1))
-    return nearest_in_groups(centred, bounds, k)
 
 
 @dataclass(frozen=True)
@@ -51,14 +38,15 @@ class BallBatch:
         contact: NDArray[np.integer],  # (E,)
         approach: Float32,  # (E, 3)
         depth: Float32,  # (E,)
-        k: int = 16,
+        k: int = 16,  # neighbours of each point (paper, section IV)
     ) -> Self:
         """Pack a cloud and its balls; contacts are rows of the crop, as each belongs to a ball."""
-        centre = points[approach_index][crop.ball_of_point]
+        centred = points[crop.ball_rows] - points[approach_index][crop.ball_of_point]
+        bounds = np.searchsorted(crop.ball_of_point, np.arange(len(approach_index) + 1))
         return cls(
-            points=_float_tensor(points[crop.ball_rows] - centre),
+            points=_float_tensor(centred),
             normals=_float_tensor(normals[crop.ball_rows]),
-            neighbors=torch.from_numpy(nearest_in_ball(points, approach_index, crop, k)),
+            neighbors=torch.from_numpy(nearest_in_groups(centred, bounds, k)),
             ball_of_point=torch.from_numpy(crop.ball_of_point),
             num_balls=len(approach_index),
             contact=torch.from_numpy(np.asarray(contact, dtype=np.int64)),
