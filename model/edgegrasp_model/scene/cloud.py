@@ -1,7 +1,7 @@
 """From the caller's array to the small, clean cloud with normals that the network sees."""
 
 from dataclasses import dataclass
-from typing import NamedTuple, Self, TypeVar, cast
+from typing import Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Floats, Int64
 from edgegrasp_camera.clouds import CloudInput as CloudInput
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.kernels import least_spread
 
 MAX_EXTENT = 20.0  # metres; if most of a cloud is wider, it is probably in millimetres
 MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
@@ -256,35 +255,25 @@ def voxelise(points: Floats, voxel_size: float) -> Voxels:
     return Voxels(voxel, count)
 
 
-class Neighbors(NamedTuple):
-    """The nearest points of each of N points, the point itself first."""
+def nearest_points(points: Float32) -> tuple[Float64, Int64]:
+    """Metres (N, K) to the nearest of points (N, 3), and their rows; the point itself first.
 
-    distance: Float64  # (N, K) metres
-    row: Int64  # (N, K)
-
-    @classmethod
-    def within(cls, points: Float32) -> Self:
-        """Of points (N, 3); K is NORMAL_NEIGHBORS, or N where there are fewer."""
-        k = min(NORMAL_NEIGHBORS, len(points))
-        # For a single round of queries a tree that is quickly built is faster.
-        tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
-        distance, row = tree.query(points, k=range(1, k + 1))
-        return cls(np.asarray(distance), np.asarray(row))
+    K is NORMAL_NEIGHBORS, or N where there are fewer.
+    """
+    k = min(NORMAL_NEIGHBORS, len(points))
+    # For a single round of queries a tree that is quickly built is faster.
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+    distance, row = tree.query(points, k=range(1, k + 1))
+    return np.asarray(distance), np.asarray(row)
 
 
-def statistical_outlier_removal(near: Neighbors) -> Bools:
-    """A mask (N,) of points whose distance to their neighbours is not unusual for the cloud."""
-    if len(near.row) <= OUTLIER_NEIGHBORS:
-        return np.ones(len(near.row), dtype=bool)
-    mean = near.distance[:, 1 : OUTLIER_NEIGHBORS + 1].mean(axis=1)
+def statistical_outlier_removal(distance: Float64) -> Bools:
+    """A mask (N,) of points whose distances (N, K) to neighbours are not unusual for the cloud."""
+    if len(distance) <= OUTLIER_NEIGHBORS:
+        return np.ones(len(distance), dtype=bool)
+    mean = distance[:, 1 : OUTLIER_NEIGHBORS + 1].mean(axis=1)
     kept: Bools = mean <= mean.mean() + OUTLIER_DEVIATIONS * mean.std()
     return kept
-
-
-def estimate_normals(points: Float32, near: Neighbors) -> Float32:
-    """Unit normals (N, 3) of points (N, 3), of either sign: the direction of least variance."""
-    normals: Float32 = least_spread(points, near.row)
-    return normals
 
 
 def orient_normals(points: Float32, normals: Float32, viewpoint: Float32) -> Float32:

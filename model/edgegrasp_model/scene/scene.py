@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.kernels import least_spread
 from edgegrasp_model.options import AutoPlane, DetectOptions, Region, SupportPlane, Workspace
 from edgegrasp_model.results import OBSTACLE, SUPPORT, UNLABELLED
 from edgegrasp_model.scene.cloud import (
@@ -17,10 +18,9 @@ from edgegrasp_model.scene.cloud import (
     CanonicalFrame,
     CheckedCloud,
     Cloud,
-    Neighbors,
     Voxels,
     assumed_viewpoint,
-    estimate_normals,
+    nearest_points,
     orient_normals,
     statistical_outlier_removal,
     thinned,
@@ -320,11 +320,11 @@ def _clean_cloud(
     viewpoints: Float64 | None,  # (W, 3) cloud frame
 ) -> tuple[Cloud | None, Bools]:
     """The voxels without outliers, and a mask (V,) of them; no cloud if too few are left."""
-    near = Neighbors.within(middles)
-    kept = statistical_outlier_removal(near)
+    distance, near = nearest_points(middles)
+    kept = statistical_outlier_removal(distance)
     if kept.sum() < MIN_POINTS:
         return None, kept
-    normals = estimate_normals(middles, near)[kept]
+    normals = least_spread(middles, near)[kept]  # of either sign
     normals = _turned_normals(sent, middles[kept], normals, kept, voxels, frame, viewpoints)
     return Cloud(middles[kept], normals), kept
 
