@@ -15,7 +15,7 @@ from scipy.special import expit
 from torch import nn
 
 from edgegrasp_camera.arrays import Array, Float32, Float64, Floats, Int64
-from edgegrasp_model.candidates.collision import CollisionCheck, clearances, collides
+from edgegrasp_model.candidates.collision import CollisionCheck, collides
 from edgegrasp_model.candidates.sample import NOTHING, Sample, Sampler
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import (
@@ -225,8 +225,7 @@ class GraspDetector:
                 score, ratings = score * found, expit(logits) * found
                 rows, outcome = select(scene, sample, score, ratings, gripper, options, counts)
                 best, free = sample.candidates.take(rows), sample.collision_free[rows]
-                clear = clearances(scene, best.T_cloud_hand, gripper)
-                grasps = grasps_in_cloud(scene, best, gripper, score[rows], free, clear)
+                grasps = grasps_in_cloud(scene, best, gripper, score[rows], free)
             if options.debug and scene is not None:
                 debug = debug_info(scene, sample, score, outcome, prepared.selected.labels)
         tracking, objects = untracked(options.previous), []

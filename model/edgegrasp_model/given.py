@@ -9,7 +9,6 @@ from edgegrasp_camera.arrays import Bools, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import (
     CollisionCheck,
     HandView,
-    clearances,
     collides,
     hand_views,
 )
@@ -72,17 +71,10 @@ def evaluate(
     else:
         score = _score_balls(scene, candidates, scorer)
     score = score * object_probability(scene, candidates.contact_index)
+    free = ~collide(scene, candidates.T_cloud_hand, gripper, request)
     if given.T_cloud_hand is not None:
         candidates = replace(candidates, T_cloud_hand=given.T_cloud_hand)
-    hands = candidates.T_cloud_hand
-    grasps = grasps_in_cloud(
-        scene,
-        candidates,
-        gripper,
-        score,
-        ~collide(scene, given.candidates.T_cloud_hand, gripper, request),
-        clearances(scene, hands, gripper),
-    )
+    grasps = grasps_in_cloud(scene, candidates, gripper, score, free)
     evaluations = [Evaluation(None, reason) for reason in given.reason]
     for number, grasp in zip(candidates.pair.tolist(), grasps, strict=True):
         evaluations[number] = Evaluation(grasp, None)

@@ -152,12 +152,12 @@ def grasps_in_cloud(
     gripper: Gripper,
     score: Floats,
     collision_free: Bools,
-    clearance: Float32,
 ) -> list[Grasp]:
     """Grasps in the cloud's frame, of E candidates; all arrays are (E,)."""
     T_cloud_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     T_cloud_tcp = T_cloud_hand @ gripper.T_hand_tcp
     width, hidden = openings(scene, candidates.T_cloud_hand, gripper)
+    clearance = clearances(scene, candidates.T_cloud_hand, gripper)
     number = scene.object_of_point[candidates.contact_index]
     return [
         Grasp(
