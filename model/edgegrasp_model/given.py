@@ -182,18 +182,12 @@ def from_hand_poses(
     within `crop_radius` metres of it that is nearest to the hand's approach axis.
     """
     view = hand_views(scene.cloud, T_cloud_hand, gripper)
-    x, y, z = view.position.T
-    between = np.flatnonzero(
-        (np.abs(x) < gripper.pad_half_width)
-        & (np.abs(y) < gripper.max_opening / 2)
-        & (z > gripper.palm_z)
-        & (z < gripper.max_tip_z)
-    )
-    hand = view.candidate[between]
-    off_contact = x[between] ** 2 + (z[between] - gripper.contact_z_at(2 * np.abs(y[between]))) ** 2
+    between = np.flatnonzero(gripper.between_fingers(view.position))
+    hand, (x, y, z) = view.candidate[between], view.position[:, between]
+    off_contact = x**2 + (z - gripper.contact_z_at(2 * np.abs(y))) ** 2
     facing = np.full((2, len(T_cloud_hand)), -np.inf)  # (+y, -y): cosine of normal and finger
     touched = np.zeros((2, len(T_cloud_hand)), dtype=np.int64)  # rows of `view`
-    for side, outward in enumerate((y[between], -y[between])):
+    for side, outward in enumerate((y, -y)):
         outermost = np.full(len(T_cloud_hand), -np.inf, dtype=np.float32)
         np.maximum.at(outermost, hand, outward)
         first = np.flatnonzero(outward > outermost[hand] - FIRST_TOUCH)
@@ -222,9 +216,9 @@ def _approach_points(view: HandView, contact: Int64, crop_radius: float) -> Int6
     result = np.full(len(contact), -1, dtype=np.int64)
     if len(view.row) == 0:
         return result
-    apart = np.linalg.norm(view.position - view.position[contact[view.candidate]], axis=1)
+    apart = np.linalg.norm(view.position - view.position[:, contact[view.candidate]], axis=0)
     near = np.flatnonzero((apart > MIN_EDGE) & (apart < 0.99 * crop_radius))
-    off_axis = (view.position[near, :2] ** 2).sum(axis=1)
+    off_axis = (view.position[:2, near] ** 2).sum(axis=0)
     hands, best = _least(view.candidate[near], off_axis)
     result[hands] = view.row[near[best]]
     return result

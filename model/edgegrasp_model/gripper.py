@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import ValidationError
 
-from edgegrasp_camera.arrays import Float32, Float64, Floats
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
 from edgegrasp_model.errors import InvalidGripper, InvalidRequest
 from edgegrasp_model.options import Boxes, DetectOptions, GripperGeometry, Linkage
 
@@ -60,6 +60,12 @@ class Gripper:
             return self.tip_z
         upright = self.max_opening - 2 * self.linkage.reach  # the links point straight ahead there
         return self.tip_z + float(self.tip_advance(upright))
+
+    def between_fingers(self, position: Floats) -> Bools:
+        """Which points (3, P), hand frame, lie between the pads as the open fingers close."""
+        x, y, z = position
+        across = (np.abs(x) < self.pad_half_width) & (np.abs(y) < self.max_opening / 2)
+        return np.asarray(across & (z > self.palm_z) & (z < self.max_tip_z))
 
     def tip_advance(self, opening: ArrayLike) -> Floats:
         """Metres along z that the fingertips have moved since it was open, by opening (...)."""

@@ -127,7 +127,7 @@ def points_around_fingers(
     _around_fingers(
         view.bounds,
         view.row,
-        view.columns,
+        view.position,
         around.cloud.normals,
         T_cloud_hand,
         around.mirror_sides(T_cloud_hand),
@@ -191,7 +191,7 @@ def _look(
     lengths = (np.float32(length) for length in (*across, *along))
     hand = _Hand(boxes[:first], boxes[first:last], *lengths)
     cut = np.zeros(len(normals), dtype=bool) if at_side is None else at_side
-    _look_from_each(view.bounds, view.row, view.columns, normals, mirrored, side, cut, hand, seen)
+    _look_from_each(view.bounds, view.row, view.position, normals, mirrored, side, cut, hand, seen)
     return seen
 
 

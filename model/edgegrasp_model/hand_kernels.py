@@ -14,14 +14,14 @@ def points_in_hand_boxes(
 ) -> tuple[Int64, Int64, Float32]:
     """Points (N, 3) between two corners (3,) of hands' frames T_cloud_hand (E, 4, 4), metres.
 
-    Hand (P,) ascending, row (P,) ascending within each, position (P, 3) in its frame.
+    Hand (P,) ascending, row (P,) ascending within each, position (3, P) in its frame.
     """
     columns, turn, shift = columns_of(points), *_to_hand(T_cloud_hand)
     count = np.empty(len(turn), dtype=np.int64)
     _count_within(columns, turn, shift, low, high, count)
     hand = np.repeat(np.arange(len(turn)), count)
     row = np.empty(len(hand), dtype=np.int64)
-    position = np.empty((len(hand), 3), dtype=np.float32)
+    position = np.empty((3, len(hand)), dtype=np.float32)
     _fill_within(columns, turn, shift, low, high, np.cumsum(count) - count, row, position)
     return hand, row, position
 
@@ -272,7 +272,7 @@ def _fill_within(
                     x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
                     if _between(x, y, z, low, high):
                         row[place] = i
-                        position[place, 0], position[place, 1], position[place, 2] = x, y, z
+                        position[0, place], position[1, place], position[2, place] = x, y, z
                         place += 1
 
 

@@ -38,9 +38,7 @@ def held_by(grasp: Grasp, scene: Scene, gripper: Gripper) -> Held:
     """The points of the object that a grasp is on, and those between the fingers."""
     points = scene.points_in_cloud.astype(np.float64)
     T_hand_cloud = np.linalg.inv(grasp.T_cloud_hand.astype(np.float64))
-    x, y, z = np.abs(moved(T_hand_cloud, points)).T
-    held = (x < gripper.pad_half_width) & (y < gripper.max_opening / 2)
-    held &= (z > gripper.palm_z) & (z < gripper.max_tip_z)
+    held = gripper.between_fingers(np.abs(moved(T_hand_cloud, points)).T)
     if grasp.object is not None:
         held |= scene.object_of_point == grasp.object
     if not held.any():

@@ -139,8 +139,7 @@ class HandView:
 
     candidate: Int64  # (P,) ascending
     row: Int64  # (P,) row of the cloud
-    position: Float32  # (P, 3) in the hand frame
-    columns: Float32  # (3, P) the same, which is many times faster to process
+    position: Float32  # (3, P) x, y and z in the hand frame
     bounds: Int64  # (E + 1,) where the points of each hand begin, and the last's end
 
 
@@ -153,18 +152,14 @@ def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandVie
     reach = low.astype(np.float32), high.astype(np.float32)
     hand, row, position = points_in_hand_boxes(cloud.points, T_cloud_hand, *reach)
     bounds = np.searchsorted(hand, np.arange(len(T_cloud_hand) + 1))
-    return HandView(hand, row, position, np.ascontiguousarray(position.T), bounds)
+    return HandView(hand, row, position, bounds)
 
 
 def met_first(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
     """Greatest and least y (E, 2) of the points between open fingers, hand frame; 0 without any."""
     view = hand_views(cloud, T_cloud_hand, gripper)
-    half = gripper.pad_half_width
-    x, y, z = view.columns
-    inner = gripper.max_opening / 2
-    ahead = (z > gripper.palm_z) & (z < gripper.max_tip_z)
-    between = (np.abs(x) < half) & (np.abs(y) < inner) & ahead
-    hand, place = view.candidate[between], y[between]
+    between = gripper.between_fingers(view.position)
+    hand, place = view.candidate[between], view.position[1, between]
     met = np.full((len(T_cloud_hand), 2), (-np.inf, np.inf), dtype=np.float32)
     np.maximum.at(met[:, 0], hand, place)
     np.minimum.at(met[:, 1], hand, place)
