@@ -15,14 +15,15 @@ from scipy.special import expit
 from torch import nn
 
 from edgegrasp_camera.arrays import Array, Float32, Float64, Floats, Int64
-from edgegrasp_model.candidates.collision import CollisionCheck, collides
 from edgegrasp_model.candidates.sample import NOTHING, Sample, Sampler
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import (
-    Scorer,
+    Batch,
+    Given,
+    batches,
     check_edges,
     check_hand_poses,
-    evaluate,
+    evaluated,
     from_edges,
     from_hand_poses,
 )
@@ -30,7 +31,7 @@ from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import check_reference_logits, load_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
-from edgegrasp_model.networks.hand import HandBatch, hand_batch
+from edgegrasp_model.networks.hand import hand_batch
 from edgegrasp_model.options import Collision, DetectOptions
 from edgegrasp_model.ranking import (
     GOOD_SCORE,
@@ -74,9 +75,6 @@ MANY_HANDS = 30  # number of training grippers from which weights suit any gripp
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 PREFERRED = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
 DEVICE_NAMES = re.compile(r"auto|cpu|cuda(:\d+)?")
-
-
-Batch = BallBatch | HandBatch
 
 
 @dataclass(frozen=True)
@@ -286,36 +284,31 @@ class GraspDetector:
                 with prepared.timed("candidates"):
                     margin = options.collision.margin
                     given = from_edges(scene, asked, gripper, prepared.crop_radius, margin)
-                with prepared.timed("network"):
-                    scorer = self._scorer(prepared)
-                    evaluations = evaluate(scene, given, gripper, options.collision, scorer)
+                evaluations = self._score_given(prepared, scene, given, options.collision)
         prepared.counts["given"] = len(asked)
         prepared.counts["scored"] = sum(each.grasp is not None for each in evaluations)
         seconds, name = prepared.total_seconds(), self.metadata.name
         return Scoring(evaluations, prepared.counts, seconds, name, prepared.warnings)
 
     def _score_poses(
-        self,
-        prepared: Prepared,
-        scene: Scene,
-        T_cloud_hand: Float32,
-        request: Collision,
-        collide: CollisionCheck = collides,
+        self, prepared: Prepared, scene: Scene, T_cloud_hand: Float32, request: Collision
     ) -> list[Evaluation]:
         """An evaluation of each hand pose (M, 4, 4)."""
         with prepared.timed("candidates"):
             poses = scene.frame.poses(T_cloud_hand)
             given = from_hand_poses(scene, poses, prepared.gripper, prepared.crop_radius)
-        with prepared.timed("network"):
-            scorer = self._scorer(prepared)
-            return evaluate(scene, given, prepared.gripper, request, scorer, collide)
+        return self._score_given(prepared, scene, given, request)
 
-    def _scorer(self, prepared: Prepared) -> Scorer:
-        return Scorer(
-            lambda batch: self._probability(self.run(batch)),
-            prepared.crop_radius,
-            self.metadata.network,
-        )
+    def _score_given(
+        self, prepared: Prepared, scene: Scene, given: Given, request: Collision
+    ) -> list[Evaluation]:
+        """An evaluation of each given edge or hand pose."""
+        gripper, score = prepared.gripper, np.empty(len(given.candidates))
+        sizes = prepared.crop_radius, self.metadata.network
+        with prepared.timed("network"):
+            for rows, batch in batches(scene, given.candidates, gripper, *sizes):
+                score[rows] = self._probability(self.run(batch))
+            return evaluated(scene, given, score, gripper, request)
 
     def _with_scene(
         self,

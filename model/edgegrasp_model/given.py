@@ -1,16 +1,16 @@
 """Score edges and hand poses given by the caller (the paper's grasp evaluation function)."""
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from edgegrasp_camera.arrays import Bools, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import (
-    CollisionCheck,
     HandView,
     collides,
     hand_views,
+    hits,
 )
 from edgegrasp_model.candidates.edge_grasps import (
     EDGE_MARGIN,
@@ -38,13 +38,7 @@ FIRST_TOUCH = 0.004  # metres behind the outermost point within which points cou
 FLIP = np.diag(np.array([-1.0, -1.0, 1.0, 1.0], dtype=np.float32))  # the same hand, y reversed
 
 
-@dataclass(frozen=True)
-class Scorer:
-    """The network and the sizes that `evaluate` needs."""
-
-    probability: Callable[[BallBatch | HandBatch], Floats]
-    crop_radius: float  # metres
-    network: NetworkConfig
+Batch = BallBatch | HandBatch
 
 
 @dataclass(frozen=True)
@@ -56,21 +50,17 @@ class Given:
     T_cloud_hand: Float32 | None = None  # (E, 4, 4) as given, canonical frame
 
 
-def evaluate(
-    scene: Scene,  # the scene
+def evaluated(
+    scene: Scene,
     given: Given,  # edges or hand poses as candidates
-    gripper: Gripper,  # the hand
-    request: Collision,  # what collides
-    scorer: Scorer,  # the network
-    collide: CollisionCheck = collides,  # the collision check
+    score: Floats,  # (E,) probabilities of the candidates
+    gripper: Gripper,
+    request: Collision,  # its margin is negative for hands that were fully checked earlier
 ) -> list[Evaluation]:
-    """Evaluate the given edges or poses, in order."""
+    """An evaluation of each given edge or pose, in order."""
     candidates = given.candidates
-    if scorer.network.architecture == "hand":
-        score = scorer.probability(hand_batch(scene, candidates, gripper, scorer.network))
-    else:
-        score = _score_balls(scene, candidates, scorer)
     score = score * object_probability(scene, candidates.contact_index)
+    collide = hits if request.margin < 0.0 else collides
     free = ~collide(scene, candidates.T_cloud_hand, gripper, request)
     if given.T_cloud_hand is not None:
         candidates = replace(candidates, T_cloud_hand=given.T_cloud_hand)
@@ -81,26 +71,33 @@ def evaluate(
     return evaluations
 
 
-def _score_balls(scene: Scene, candidates: Candidates, scorer: Scorer) -> Floats:
-    """Scores (E,), ball by ball; there is one ball for each approach point."""
-    score = np.empty(len(candidates))
+def batches(
+    scene: Scene,
+    candidates: Candidates,  # E of them
+    gripper: Gripper,
+    crop_radius: float,  # of the balls, metres
+    network: NetworkConfig,
+) -> Iterator[tuple[Int64, Batch]]:
+    """Inputs of the network and the rows of their candidates: of hands at once, or of some balls.
+
+    There is one ball for each approach point.
+    """
+    if network.architecture == "hand":
+        yield np.arange(len(candidates)), hand_batch(scene, candidates, gripper, network)
+        return
     points, normals = scene.cloud.points, scene.cloud.normals
     balls = np.unique(candidates.approach_index)
     for start in range(0, len(balls), BALLS_AT_A_TIME):
         some = balls[start : start + BALLS_AT_A_TIME]
-        crop = crop_balls(points, some, scorer.crop_radius)
+        crop = crop_balls(points, some, crop_radius)
         rows = np.flatnonzero(np.isin(candidates.approach_index, some))
         here = candidates.take(rows)
         size = len(points)
         keys = crop.ball_of_point * size + crop.ball_rows  # ascending
         ball = np.searchsorted(some, here.approach_index)
         contact = np.searchsorted(keys, ball * size + here.contact_index).astype(np.int64)
-        score[rows] = scorer.probability(
-            BallBatch.from_cloud(
-                points, normals, some, crop, contact, here.approach, here.depth, scorer.network.k
-            )
-        )
-    return score
+        edges = contact, here.approach, here.depth
+        yield rows, BallBatch.from_cloud(points, normals, some, crop, *edges, network.k)
 
 
 def check_edges(edges: object, rows: int) -> Int64:

@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
-from edgegrasp_model.candidates.collision import CollisionCheck, collides, hits
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.hand_kernels import non_max_suppression
 from edgegrasp_model.options import (
@@ -135,8 +134,7 @@ def merged(
     followed: Followed,
     options: DetectOptions,
     up: Float64,  # (3,) unit, cloud frame
-    # evaluates poses (M, 4, 4) T_cloud_hand with a collision check
-    score: Callable[[Float32, Collision, CollisionCheck], list[Evaluation]],
+    score: Callable[[Float32, Collision], list[Evaluation]],  # of poses (M, 4, 4) T_cloud_hand
 ) -> tuple[list[Grasp], Tracking]:
     """The earlier answer's grasps at their new poses, then others; the kept grasp comes first."""
     previous = options.previous
@@ -148,8 +146,7 @@ def merged(
         move = [np.eye(4) if one.object is None else followed.moved[one.object] for one in old]
         rule = options.collision.model_copy(update={"margin": options.collision.margin - SLACK})
         # A small overlap is allowed, since the hand was fully checked when it was found.
-        collide = hits if rule.margin < 0.0 else collides
-        there = zip(old, score((move @ before).astype(np.float32), rule, collide), strict=True)
+        there = zip(old, score((move @ before).astype(np.float32), rule), strict=True)
         kept = [replace(e.grasp, id=one.id, object=one.object) for one, e in there if e.grasp]
     if options.collision.mode == "avoid":
         kept = [grasp for grasp in kept if grasp.collision_free]

@@ -1,6 +1,5 @@
 """The points near a hand, its collisions and clearance, and the opening its fingers need."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,9 +73,6 @@ def hits(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collisi
             solid |= _hits_any(SolidBoxes.of_hands(T_cloud_hand, boxes), scene.obstacles, way)
         hit |= solid.reshape(len(hit), len(boxes)).any(axis=1)
     return hit
-
-
-CollisionCheck = Callable[[Scene, Float32, Gripper, Collision], Bools]
 
 
 def closes_on_background(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Bools:
