@@ -62,26 +62,18 @@ class Pixels(NamedTuple):
     footprint: float  # metres, width of a pixel at a depth of one metre
 
 
-class Recogniser(NamedTuple):
-    """The `scene` network, and how it recognises objects.
+@cache
+def shipped() -> tuple[SceneNet, Float64]:
+    """The `scene` network with the shipped weights, loaded once per process, and its confidence.
 
-    The log odds that an instance is an object are `confidence` (2,): a constant and a factor of its
-    `mean_probability`.
+    The log odds that an instance is an object are that confidence (2,): a constant and a factor of
+    its `mean_probability`.
     """
-
-    network: SceneNet
-    confidence: Float64
-
-    @classmethod
-    @cache
-    def shipped(cls) -> "Recogniser":
-        """With the shipped weights; loaded once per process."""
-        network = SceneNet()
-        network.load_state_dict(load_file(WEIGHTS))
-        network.eval().fused().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        with safe_open(WEIGHTS, "pt") as file:
-            confidence = np.array(json.loads(file.metadata()["confidence"]))
-        return cls(network, confidence)
+    network = SceneNet()
+    network.load_state_dict(load_file(WEIGHTS))
+    network.eval().fused().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    with safe_open(WEIGHTS, "pt") as file:
+        return network, np.array(json.loads(file.metadata()["confidence"]))
 
 
 def segment(
@@ -117,11 +109,10 @@ def _segment_view(
 ) -> Segmentation:
     """The segmentation of M points seen by one camera."""
     image = range_image(points, viewpoint, up, down)
-    turn, shipped = image.T_cloud_camera[:3, :3], Recogniser.shipped()
+    turn, (network, (constant, factor)) = image.T_cloud_camera[:3, :3], shipped()
     up_in_view = None if up is None else up @ turn
-    pixels, seen_up = look(shipped.network, image.points, up_in_view, image.footprint)
+    pixels, seen_up = look(network, image.points, up_in_view, image.footprint)
     of_pixel = group(pixels)
-    constant, factor = shipped.confidence
     score = constant + factor * mean_probability(of_pixel, pixels.classes)
     likely = score > 0.0  # that it is an object, rather than background
     new = np.append(np.where(likely, np.cumsum(likely) - 1, FIXED), [UNKNOWN, FIXED])
