@@ -30,7 +30,8 @@ def any_point_in_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -
     """Which hands (E,) have a point (N, 3) in one of their boxes (B, 2, 3), hand frame."""
     turn, shift = _to_hand(T_cloud_hand)
     hit = np.zeros(len(turn), dtype=np.bool_)
-    _meet(columns_of(points), turn, shift, boxes.astype(np.float32), hit)
+    around = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)]).astype(np.float32)
+    _meet(columns_of(points), turn, shift, boxes.astype(np.float32), around, hit)
     return hit
 
 
@@ -214,15 +215,6 @@ def _blocks(columns: Float32) -> Float32:
 
 
 @compiled("contract")
-def _around_all(boxes: Float32) -> tuple[Float32, Float32]:
-    """Low and high corner (3,) of the box around boxes (B, 2, 3)."""
-    low, high = boxes[0, 0].copy(), boxes[0, 1].copy()
-    for b in range(1, len(boxes)):
-        low, high = np.minimum(low, boxes[b, 0]), np.maximum(high, boxes[b, 1])
-    return low, high
-
-
-@compiled("contract")
 def _may_reach(sphere: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32) -> bool:
     """Whether a point of a block may lie in a box of the hand frame, given by two corners."""
     x, y, z = _position(sphere[0], sphere[1], sphere[2], turn, shift)
@@ -277,9 +269,11 @@ def _fill_within(
 
 
 @compiled("contract")
-def _meet(columns: Float32, turn: Float32, shift: Float32, boxes: Float32, hit: Bools) -> None:
+def _meet(
+    columns: Float32, turn: Float32, shift: Float32, boxes: Float32, around: Float32, hit: Bools
+) -> None:
     sphere = _blocks(columns)
-    least, most = _around_all(boxes)
+    least, most = around
     for e in range(len(turn)):
         for k in range(len(sphere)):
             if not _may_reach(sphere[k], turn[e], shift[e], least, most):
