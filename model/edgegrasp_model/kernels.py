@@ -4,7 +4,7 @@ NumPy would need many passes over large arrays; these loops take one point at a 
 processor's cache.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numba
@@ -54,12 +54,12 @@ def level_spread(
     toward: Float32,  # (T, M, 3) unit, toward each viewpoint
     radius: float,  # metres around each point in which others count,
     drop: float,  # and how much lower they may lie, metres
-) -> Iterator[tuple[Float32, Float32, Float32]]:
-    """How the neighbourhood of each point is distributed, from one viewpoint after another.
+) -> tuple[Float32, Float32, Float32]:
+    """How the neighbourhood of each point is distributed, from each viewpoint.
 
-    Yields the direction orthogonal to `toward` in which they spread least, (M, 3) unit; how far
-    (M,) the point lies from their mean along it, not negative; their standard deviation (M,) along
-    it, metres.
+    Returns the direction orthogonal to `toward` in which they spread least, (T, M, 3) unit; how far
+    (T, M) the point lies from their mean along it, not negative; their standard deviation (T, M)
+    along it, metres.
     """
     cells = np.floor((points - points.min(axis=0)) / np.float32(radius)).astype(np.int64) + 1
     sizes = cells.max(axis=0) + 2
@@ -79,7 +79,7 @@ def level_spread(
         offset,
         deviation,
     )
-    yield from zip(least, offset, deviation, strict=True)
+    return least, offset, deviation
 
 
 def columns_of(points: Float32) -> Float32:

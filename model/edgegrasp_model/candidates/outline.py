@@ -61,10 +61,9 @@ def outlines(
             way = np.array([np.sin(LEAN) * np.cos(turn), np.sin(LEAN) * np.sin(turn), np.cos(LEAN)])
             toward.append(np.broadcast_to(way.astype(np.float32), points.shape))
     ways = np.stack([each[rows] for each in toward])
+    spreads = level_spread(points, rows, ways, OUTLINE_RADIUS, DROP)
     found: list[Outline] = []
-    for each, way, (least, outward, spread) in zip(
-        toward, ways, level_spread(points, rows, ways, OUTLINE_RADIUS, DROP), strict=True
-    ):
+    for each, way, least, outward, spread in zip(toward, ways, *spreads, strict=True):
         heading, is_edge = np.zeros_like(points), np.zeros(len(points), dtype=bool)
         # A point is on the outline if its neighbours at its height or above lie on one side.
         heading[rows] = least
