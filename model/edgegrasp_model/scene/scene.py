@@ -119,7 +119,10 @@ def select_points(
     named = _given_numbers(sent) if sent.segment_ids is not None or shown is None else shown.number
     support = choose_support(seen, inside, shown, named >= 0, options, warnings)
     up = _up(options, support, None if viewpoints is None else shown)
-    height, margin = _heights(seen, support)
+    # Without a support, everything counts as above it.
+    height, margin = np.ones(len(inside), np.float32), np.zeros(len(inside), np.float32)
+    if support is not None:
+        height, margin = support.heights(seen)
     labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
     labels[sent.row[np.abs(height) <= margin]] = SUPPORT
     above = np.flatnonzero(height > margin)
@@ -165,14 +168,6 @@ def _segmentation(
         return None
     views = _views(sent, viewpoints, options)
     return segment(sent.points, views, options.known_up, _down_in_image(sent, viewpoints))
-
-
-def _heights(seen: Seen, support: Support | None) -> tuple[Float32, Float32]:
-    """As `Support.heights`; without a support, everything counts as above it."""
-    if support is not None:
-        return support.heights(seen)
-    everywhere = np.ones(len(seen.points), dtype=np.float32)
-    return everywhere, 0 * everywhere
 
 
 def _recognised(
@@ -449,5 +444,5 @@ def plane_in_frame(plane: SupportPlane, frame: CanonicalFrame) -> SupportPlane:
     normal = np.asarray(plane.normal)
     length = float(np.linalg.norm(normal))
     foot = frame.points(normal * (plane.offset / length**2))
-    x, y, z = (frame.directions(normal) / length).tolist()
-    return SupportPlane(normal=(x, y, z), offset=float(foot @ np.array([x, y, z])))
+    turned = frame.directions(normal) / length
+    return SupportPlane(normal=tuple(turned.tolist()), offset=float(foot @ turned))

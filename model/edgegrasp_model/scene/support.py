@@ -190,9 +190,8 @@ def _assumed(
         up = _up_of_cut(seen.points[objects], seen.viewpoint)
     if up is None:
         return None
-    x, y, z = up.tolist()
     offset = float(np.percentile(seen.points.astype(np.float64) @ up, LOWEST)) - UNDER
-    return measured(seen, SupportPlane(normal=(x, y, z), offset=offset), 0.0)
+    return measured(seen, SupportPlane(normal=tuple(up.tolist()), offset=offset), 0.0)
 
 
 def _up_of_cut(cloud: Float32, viewpoint: Float64) -> Float64 | None:
@@ -235,8 +234,7 @@ def _close_to(plane: SupportPlane, points: Float32) -> SupportPlane:
         if len(near) < FEWEST:
             break
         normal, offset = _least_squares(near, normal)
-    x, y, z = normal.tolist()
-    return SupportPlane(normal=(x, y, z), offset=offset)
+    return SupportPlane(normal=tuple(normal.tolist()), offset=offset)
 
 
 def _least_squares(points: Float64, toward: Float64) -> tuple[Float64, float]:
@@ -303,8 +301,7 @@ def fit_plane(
         normal, offset = _least_squares(points[near], normal)
     if up is not None and normal @ up < math.cos(max_tilt + 1e-9):
         return None
-    x, y, z = normal.tolist()
-    return SupportPlane(normal=(x, y, z), offset=offset)
+    return SupportPlane(normal=tuple(normal.tolist()), offset=offset)
 
 
 def _toward(seen: Seen, origin: Float64, up: Float64 | None) -> Float64:
