@@ -62,16 +62,15 @@ def can_leave(
     ends = np.concatenate([held.points, held.points + way])
     low, high = ends.min(axis=0) - MEETS, ends.max(axis=0) + MEETS
     others = held.others[((held.others > low) & (held.others < high)).all(axis=1)]
-    tree = cKDTree(others) if len(others) else None
+    tree = cKDTree(others)
     if _lowest(scene, held.points + way) < _lowest(scene, held.points) - SINKS:
         return False
     steps = max(1, int(np.ceil(np.linalg.norm(way) / STEP)))
     for share in np.arange(1, steps + 1) / steps:
         there = held.points + share * way
-        if tree is not None:
-            away = tree.query(there, distance_upper_bound=MEETS)[0]
-            if np.isfinite(away).mean() > STRAY:
-                return False
+        away = tree.query(there, distance_upper_bound=MEETS)[0]
+        if np.isfinite(away).mean() > STRAY:
+            return False
         for T_cloud_box, half in map(box_pose, collision.obstacles):
             T_box_cloud = np.linalg.inv(T_cloud_box.astype(np.float64))
             if (np.abs(moved(T_box_cloud, there)) < half).all(axis=1).any():

@@ -158,7 +158,8 @@ def _fitted(
     on, held = np.flatnonzero(shown.support > 0.5), np.flatnonzero(objects)
     part = Seen(seen.points[on[thinned(len(on))]], seen.viewpoint)
     around = seen.points[held[thinned(len(held), 500)]]
-    apart = _nearest(part.points, around)
+    # Metres to the nearest object; infinity beyond NEAR_OBJECTS, or where there is no object.
+    apart = np.asarray(cKDTree(around).query(part.points, distance_upper_bound=NEAR_OBJECTS)[0])
     weight = np.where(np.isfinite(apart), 1.0, FAR_WEIGHT)
     up = shown.up if up is None else up
     plane = fit_plane(part, weight, rng, up)
@@ -243,13 +244,6 @@ def _least_squares(points: Float64, toward: Float64) -> tuple[Float64, float]:
     _, vectors = np.linalg.eigh(np.cov((points - middle).T))  # ascending
     normal = vectors[:, 0] if vectors[:, 0] @ toward >= 0 else -vectors[:, 0]
     return normal, float(normal @ middle)
-
-
-def _nearest(points: Float32, objects: Float32) -> Float64:
-    """Metres (N,) from points (N, 3) to the nearest of objects (M, 3); inf beyond NEAR_OBJECTS."""
-    if len(objects) == 0:
-        return np.full(len(points), np.inf)
-    return np.asarray(cKDTree(objects).query(points, distance_upper_bound=NEAR_OBJECTS)[0])
 
 
 def by_surface(points: Float32) -> Float64:
