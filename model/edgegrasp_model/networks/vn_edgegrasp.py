@@ -89,7 +89,8 @@ class VNPointNetConv(nn.Module):
     def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 3, inputs) to (P, 3, width)."""
         # W [f_j, p_j - p_i] = W [f_j, p_j] - w p_i, w the last column: the product runs per point.
-        weight = _beside(self.hidden.weight, self.hidden_relu.direction.weight)
+        weight, direction = self.hidden.weight, self.hidden_relu.direction.weight
+        weight = torch.cat((weight, direction @ weight))
         output = PackedLinear(_with_reach(self.output, self.reach))
         u = torch.cat((features, batch.points.unsqueeze(2)), dim=2)
         u = by_chunks(PackedLinear(weight), u, VN_ROWS)  # (P, 3, 2 width)
@@ -129,12 +130,12 @@ class VNGlobalFeature(nn.Module):
         for chunk in chunks:
             both = vn_3(relu(vn_2(relu(vn_1(chunk.values)))))  # (p, 3, 2 x 128)
             furthest_1.add(both, chunk.balls, chunk.sizes)
-        join = SharedProduct(self.join.weights, None, self.maximum_1.relu(furthest_1.result()))
+        join = SharedProduct(self.join.weights, None, self.maximum_1.relu(furthest_1.vectors))
         furthest_2 = Furthest(batch.num_balls, self.vn_5.out_features)
         for chunk in chunks:
             both = vn_5(relu(join(chunk.values, chunk.ball_of_point)))  # (p, 3, 2 x 381)
             furthest_2.add(both, chunk.balls, chunk.sizes)
-        ball: Tensor = self.maximum_2.relu(furthest_2.result())
+        ball: Tensor = self.maximum_2.relu(furthest_2.vectors)
         return ball
 
 
@@ -172,11 +173,6 @@ class VNReLU(nn.Module):
         """Maps (M, 3, width) to the same shape."""
         directions = PackedLinear(self.direction.weight)
         return by_chunks(lambda v: relu(torch.cat((v, directions(v)), dim=2)), vectors, VN_ROWS)
-
-
-def _beside(weight: Tensor, direction: Tensor) -> Tensor:
-    """The weight (C, inputs), stacked on its composition with the direction map."""
-    return torch.cat((weight, direction @ weight))
 
 
 def _with_reach(layer: nn.Linear, reach: nn.Linear) -> Tensor:
@@ -222,22 +218,18 @@ class Furthest:
 
     def __init__(self, groups: int, width: int) -> None:
         self._best = torch.full((groups, width), -torch.inf)
-        self._vectors = torch.zeros(groups, 3, width)
+        self.vectors = torch.zeros(groups, 3, width)  # of each group so far
 
     def add(self, both: Tensor, groups: list[int], sizes: list[int]) -> None:
         """Add vectors and directions (p, 3, 2 width), and the number of rows of each group."""
         if float32_inference(both):
             bounds = np.cumsum([0, *sizes[: len(groups)]])
             these = slice(groups[0], groups[-1] + 1)
-            best, vectors = self._best[these], self._vectors[these]
+            best, vectors = self._best[these], self.vectors[these]
             _furthest_rows(both.numpy(), bounds, best.numpy(), vectors.numpy())
         else:
             parts = torch.split(both, sizes)[: len(groups)]
-            self._vectors = torch.stack([_furthest(part, dim=0) for part in parts])
-
-    def result(self) -> Tensor:
-        """The vectors (groups, 3, width)."""
-        return self._vectors
+            self.vectors = torch.stack([_furthest(part, dim=0) for part in parts])
 
 
 def _furthest(both: Tensor, dim: int) -> Tensor:
