@@ -202,7 +202,7 @@ def from_hand_poses(
         reason[row] = None
     given = T_cloud_hand[found]
     pose = np.where((side[found] == 0)[:, None, None], given, given @ FLIP)
-    a, c = approach[found], view.row[contact[found]] if len(found) else found
+    a, c = approach[found], view.row[contact[found]]
     edge = scene.cloud.points[c] - scene.cloud.points[a]
     depth = np.maximum(np.einsum("ed,ed->e", edge, pose[:, :3, 2]), 0.0)
     return Given(Candidates(found, a, c, -pose[:, :3, 2], depth, pose), reason, given)
@@ -211,8 +211,6 @@ def from_hand_poses(
 def _approach_points(view: HandView, contact: Int64, crop_radius: float) -> Int64:
     """Rows (M,) of the points nearest to the hands' axes, near the contacts (M,); else -1."""
     result = np.full(len(contact), -1, dtype=np.int64)
-    if len(view.row) == 0:
-        return result
     apart = np.linalg.norm(view.position - view.position[:, contact[view.candidate]], axis=0)
     near = np.flatnonzero((apart > MIN_EDGE) & (apart < 0.99 * crop_radius))
     off_axis = (view.position[:2, near] ** 2).sum(axis=0)

@@ -131,14 +131,14 @@ def ranked(
     collision_free: Bools,  # (E,) the scores of the others are multiplied by COLLIDING
     # `highest`: by height where the score is SURE_SCORE or more; `clearance`: collision-free ones
     # first, by clearance
-    order: Literal["score", "highest", "clearance"] = "score",
-    height: Floats | None = None,  # (E,) of the TCP along up, for `highest`
-    clearance: Floats | None = None,  # (E,) for `clearance`
+    order: Literal["score", "highest", "clearance"],
+    height: Floats,  # (E,) of the TCP along up, for `highest`
+    clearance: Floats | None,  # (E,) for `clearance`
 ) -> Int64:
     """Rows best first: by `order`, and then by score."""
     worth = np.where(collision_free, score, COLLIDING * score)
     keys: tuple[Array, ...] = (-worth,)
-    if order == "highest" and height is not None:
+    if order == "highest":
         sure = worth >= SURE_SCORE
         keys = (-worth, np.where(sure, -height, -worth), ~sure)
     if order == "clearance" and clearance is not None:

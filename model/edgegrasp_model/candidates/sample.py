@@ -35,8 +35,7 @@ FEWEST_EACH = 4  # of an object, however many there are
 OVERSAMPLING = 4  # hands checked for collision, in multiples of num_candidates
 NEAR, TURNED = 0.004, math.radians(10)  # within which hands share one score
 CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
-TOP_DOWN_ANGLE = math.radians(30)  # between the hand's direction and straight down
-SIDE_ANGLE = math.radians(30)  # between the hand's direction and the horizontal
+PRESET_ANGLE = math.radians(30)  # between a hand's direction and straight down, or the horizontal
 MIN_APPROACH_UP = -0.1  # where nothing is asked for: cosine of the outward approach and up
 
 
@@ -280,7 +279,7 @@ def allowed_directions(
         axis = in_frame(cone.direction)
         allowed |= direction @ (axis / np.linalg.norm(axis)) >= math.cos(cone.max_angle)
     if constraint.preset == "top-down":
-        allowed |= -rise >= math.cos(TOP_DOWN_ANGLE)
+        allowed |= -rise >= math.cos(PRESET_ANGLE)
     if constraint.preset == "side":
-        allowed |= np.abs(rise) <= math.sin(SIDE_ANGLE)
+        allowed |= np.abs(rise) <= math.sin(PRESET_ANGLE)
     return allowed
