@@ -38,7 +38,7 @@ def held_by(grasp: Grasp, scene: Scene, gripper: Gripper) -> Held:
     """The points of the object that a grasp is on, and those between the fingers."""
     points = scene.points_in_cloud.astype(np.float64)
     T_hand_cloud = np.linalg.inv(grasp.T_cloud_hand.astype(np.float64))
-    held = gripper.between_fingers(np.abs(moved(T_hand_cloud, points)).T)
+    held = gripper.between_fingers(moved(T_hand_cloud, points).T)
     if grasp.object is not None:
         held |= scene.object_of_point == grasp.object
     if not held.any():
