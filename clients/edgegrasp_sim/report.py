@@ -37,6 +37,8 @@ class Replay:
     def __init__(self, folder: ResultFolder, objects: Path | None = None) -> None:
         facts = folder.manifest()
         run = facts["run"]
+        if "arm" in run:
+            raise ValueError(f"{folder.path} holds attempts of an arm, whose motions are not kept")
         if objects is None and facts["objects_folder"] is not None:
             objects = Path(facts["objects_folder"])
         self.scene, self.protocol = SceneKind(run["scene"]), protocol_from(run["protocol"])
@@ -91,8 +93,10 @@ def write_report(folder: ResultFolder) -> Path:
     rounds = folder.rounds()
     facts = folder.manifest()
     summary = folder.finish(rounds)
-    with Replay(folder) as replay:
-        pictures = list(_failure_pictures(replay, rounds))
+    pictures: list[str] = []
+    if "arm" not in facts["run"]:
+        with Replay(folder) as replay:
+            pictures = list(_failure_pictures(replay, rounds))
     title = f"{planner_title(facts['run']['planner'])} on {summary['scene']} scenes"
     parts = [
         table(_key_figures(summary)),

@@ -102,6 +102,10 @@ def test_wrong_replays_and_comparisons_end_with_a_sentence(
     assert "contains no benchmark" in refused("compare", in_process, tmp_path)
     benchmark(tmp_path, TOP_DOWN, "--protocol", "giga", rounds=1)
     assert "differ in protocol" in refused("compare", in_process, tmp_path)
+    facts = json.loads((tmp_path / "manifest.json").read_text())
+    facts["run"]["arm"] = ["joint_1"]
+    (tmp_path / "manifest.json").write_text(json.dumps(facts))
+    assert "attempts of an arm" in refused("replay", "attempt", tmp_path)
 
 
 def test_two_planners_are_compared_scene_by_scene(in_process, top_down, run, tmp_path) -> None:
