@@ -114,6 +114,7 @@ def test_the_rest_of_a_table_that_was_cut_off_is_no_object(noise: float, height:
     found = detect(points[near], viewpoint=T_world_camera[:3, 3].tolist(), support=plane)
     assert len(found.objects) == 1
     assert 2 * found.objects[0].half_extents[:2].max() == pytest.approx(0.12, abs=0.03)
+    assert found.objects[0].confidence > 0.9
     assert found.grasps
 
 

@@ -55,7 +55,9 @@ REACH = 0.25  # metres around an object in which a hand at it may collide
 FOLLOWED_REACH = 0.16  # the same if only known grasps are checked
 PLAN_CELL = 0.05  # metres
 CLOSE = 0.06  # metres; no camera measures closer
-UNRECOGNISED = 0.7  # confidence of an object that the network did not see
+# Confidence of objects that the network did not see: where a cloud was cut off above its support,
+# hardly anything else is left; and elsewhere.
+CUT_OUT, UNRECOGNISED = 0.95, 0.7
 LIKELY = 0.5  # probability of object or support above which a risen point may be an object
 
 
@@ -186,9 +188,8 @@ def _recognised(
         cut_off = math.isnan(support.growth)
         if cut_off or not (number >= 0).any():
             number = with_clusters(number, plan, likely | cut_off)
-            confidence |= dict.fromkeys(
-                range(len(confidence), number.max(initial=-1) + 1), UNRECOGNISED
-            )
+            further = range(len(confidence), number.max(initial=-1) + 1)
+            confidence |= dict.fromkeys(further, CUT_OUT if cut_off else UNRECOGNISED)
     return number, confidence
 
 
