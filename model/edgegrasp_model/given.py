@@ -10,7 +10,6 @@ from edgegrasp_model.candidates.collision import (
     HandView,
     collides,
     hand_views,
-    hits,
 )
 from edgegrasp_model.candidates.edge_grasps import (
     EDGE_MARGIN,
@@ -55,13 +54,12 @@ def evaluated(
     given: Given,  # edges or hand poses as candidates
     score: Floats,  # (E,) probabilities of the candidates
     gripper: Gripper,
-    request: Collision,  # its margin is negative for hands that were fully checked earlier
+    request: Collision,
 ) -> list[Evaluation]:
     """An evaluation of each given edge or pose, in order."""
     candidates = given.candidates
     score = score * object_probability(scene, candidates.contact_index)
-    collide = hits if request.margin < 0.0 else collides
-    free = ~collide(scene, candidates.T_cloud_hand, gripper, request)
+    free = ~collides(scene, candidates.T_cloud_hand, gripper, request)
     if given.T_cloud_hand is not None:
         candidates = replace(candidates, T_cloud_hand=given.T_cloud_hand)
     grasps = grasps_in_cloud(scene, candidates, gripper, score, free)

@@ -36,16 +36,19 @@ def collides(
     """Which open hands (E,) collide at the grasp, on the approach or the retreat.
 
     With the cloud, the support plane, an obstacle or space that no camera saw, or that close on
-    background. The margin is added on every side of each box of the hand.
+    background. The margin is added on every side of each box of the hand. It is negative for hands
+    that were fully checked earlier, of which only what they hit is checked.
     """
-    hit = hits(scene, T_cloud_hand, gripper, request)
+    hit = _hits(scene, T_cloud_hand, gripper, request)
+    if request.margin < 0.0:
+        return hit
     free = np.flatnonzero(~hit)
     hit[free] = closes_on_background(scene, T_cloud_hand[free], gripper)
     hit[free] |= enters_unseen(scene.depths, T_cloud_hand[free], gripper)
     return hit
 
 
-def hits(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
+def _hits(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
     """Which open hands collide with the cloud, the support plane or an obstacle.  # (E,)."""
     boxes = gripper.open_boxes + request.margin * np.array([[-1.0], [1.0]])  # (B, 2, 3)
     behind, lift = request.approach_length, 0.0  # metres along the hand's z, and straight up
