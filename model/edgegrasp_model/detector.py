@@ -161,7 +161,7 @@ class GraspDetector:
     ) -> Prepared:
         """First stage: choose the gripper, and build the scene if enough of the cloud is left."""
         start = time.perf_counter()
-        sent = check_cloud(cloud, options.num_approach_points or 1)
+        sent = check_cloud(cloud, options.num_approach_points or 1, thin=True)
         return self._with_scene(sent, options, start, max_voxels)
 
     def evaluate(self, prepared: Prepared) -> Scored | None:

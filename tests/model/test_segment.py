@@ -17,6 +17,7 @@ from edgegrasp_results import Detection
 
 from .rendered import (
     BACKGROUND,
+    HEIGHT,
     SolidBox,
     bin_walls,
     box,
@@ -356,12 +357,15 @@ def test_segments_stand_on_what_lies_below_them_not_on_the_top_of_a_carton() -> 
     assert height - found.support.offset == pytest.approx(small.half[2], abs=0.005)
 
 
-def test_every_row_is_labelled_with_an_object_the_support_or_neither() -> None:
+@pytest.mark.parametrize("times", [1, 4])  # the latter as large as those that lose pixels
+def test_every_row_is_labelled_with_an_object_the_support_or_neither(times: int) -> None:
     objects, pose = boxes_on_table(7), camera(0.7, -1.2, 0.85)
     boxes = [table(), *objects]
-    found = detect(render(boxes, pose), debug=True)
+    image = render(boxes, pose)
+    found = detect(image.repeat(times, axis=0).repeat(times, axis=1), debug=True)
     assert found.debug is not None
     labels, number = found.debug.labels, seen_box(boxes, pose)
+    labels = labels.reshape(times * HEIGHT, -1)[times - 1 :: times, times - 1 :: times].ravel()
     assert set(labels[labels >= 0].tolist()) == {one.number for one in found.objects}
     assert (labels[number == 0] == SUPPORT).mean() > 0.95
     assert (labels[number == -1] < 0).all()

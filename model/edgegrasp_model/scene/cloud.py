@@ -23,6 +23,8 @@ WIDEST_VIEW = 1.2  # tangent of half the angle that a depth camera sees
 MAX_UPWARD = 0.5  # sine of the angle from the level at which a camera looks up
 MIN_HORIZONTAL = 1e-3  # metres; a shorter horizontal offset has no direction
 ENOUGH = 6000  # points that stand for a whole cloud where a fit, a mean or a view is asked for
+LARGE = 704, 960  # pixels of an image of which every second row and column may be enough
+FINE = 0.00125  # metres between its neighbouring pixels, at most, if they are
 
 
 Vectors = TypeVar("Vectors", bound=Floats)
@@ -38,7 +40,8 @@ class CheckedCloud:
     normals: Float32 | None = None  # (N, 3)
     segment_ids: Int64 | None = None  # (N,)
     view_ids: Int64 | None = None  # (N,)
-    image_size: tuple[int, int] | None = None  # (H, W) of an organised cloud
+    image_size: tuple[int, int] | None = None  # (H, W) of an organised cloud as sent
+    step: int = 1  # between its rows and columns that are kept
     warnings: tuple[str, ...] = ()
 
     def take(self, kept: Bools | Int64) -> "CheckedCloud":
@@ -52,29 +55,43 @@ class CheckedCloud:
             None if self.segment_ids is None else self.segment_ids[place],
             None if self.view_ids is None else self.view_ids[place],
             self.image_size,
+            self.step,
             self.warnings,
         )
 
+    def of_all_pixels(self, values: Int64) -> Int64:
+        """Values (R,) of the rows sent, with those of the nearest kept pixel at pixels left out."""
+        if self.image_size is None or self.step == 1:
+            return values
+        height, width = self.image_size
+        kept = values.reshape(height, width)[:: self.step, :: self.step]
+        wide = kept.repeat(self.step, axis=0).repeat(self.step, axis=1)
+        return np.ascontiguousarray(wide[:height, :width]).reshape(-1)
 
-def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
+
+def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False) -> CheckedCloud:
     """Check a caller's CloudInput or array of points, and drop the holes of an organised one.
 
-    Raises InvalidRequest, which names `cloud`, `normals`, `colors`, `segment_ids` or `view_ids`.
+    With `thin`, a large image of something near loses every second row and column. Raises
+    InvalidRequest, which names `cloud`, `normals`, `colors`, `segment_ids` or `view_ids`.
     """
     sent = cloud if isinstance(cloud, CloudInput) else CloudInput(cloud)
-    points = sent.points
-    kept = size_of_image = None
+    points, size_of_image, row, step = sent.points, None, None, 1
     if isinstance(points, np.ndarray) and points.ndim == 3 and points.shape[2] == 3:
         # A single row of points, such as fused images, is not an image.
         size_of_image = None if 1 in points.shape[:2] else points.shape[:2]
-        points = points.reshape(-1, 3)
         if points.dtype in (np.float32, np.float64):
+            step = 2 if thin and _is_fine(points) else 1
+            columns, points = points.shape[1], points[::step, ::step]
+            narrow, points = points.shape[1], points.reshape(-1, 3)
             kept = np.flatnonzero(_finite(points))
+            row = kept if step == 1 else kept // narrow * (step * columns) + kept % narrow * step
             points = points.take(kept, axis=0)
             if len(points) == 0:
                 raise InvalidRequest("cloud", "holes only", "Send finite points among the holes.")
+        points = points.reshape(-1, 3)
     valid, low, high = _valid_points(points)
-    row = np.arange(len(valid)) if kept is None else kept
+    row = np.arange(len(valid)) if row is None else row
     size = len(sent.points.reshape(-1, 3)) if isinstance(sent.points, np.ndarray) else len(valid)
     said = sent.warnings
     if (high - low).max() > MAX_EXTENT:
@@ -95,8 +112,18 @@ def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
         _beside("segment_ids", sent.segment_ids, size, row),
         _beside("view_ids", sent.view_ids, size, row),
         size_of_image,
+        step,
         said,
     )
+
+
+def _is_fine(image: Floats) -> bool:
+    """Whether an image (H, W, 3) is large and its neighbouring pixels lie close together."""
+    if image.shape[0] < LARGE[0] or image.shape[1] < LARGE[1]:
+        return False
+    apart = np.linalg.norm(image[::16, 1::8] - image[::16, :-1:8], axis=-1)
+    apart = apart[np.isfinite(apart)]
+    return len(apart) > 0 and bool(np.median(apart) <= FINE)
 
 
 def thinned(count: int, most: int = ENOUGH) -> slice:

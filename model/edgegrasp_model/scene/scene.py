@@ -149,6 +149,8 @@ def select_points(
             )
     number = np.where(inside | (number == FIXED), number, UNKNOWN)
     labels[sent.row] = np.where(number >= 0, number, OBSTACLE)
+    if options.debug:
+        labels = sent.of_all_pixels(labels)
     number = chosen_objects(number, sent, options, warnings)
     kept = near_objects_along(plan, number)
     near, number = sent.take(kept), number[kept]
