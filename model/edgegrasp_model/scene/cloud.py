@@ -121,7 +121,8 @@ def _is_fine(image: Floats) -> bool:
     """Whether an image (H, W, 3) is large and its neighbouring pixels lie close together."""
     if image.shape[0] < LARGE[0] or image.shape[1] < LARGE[1]:
         return False
-    apart = np.linalg.norm(image[::16, 1::8] - image[::16, :-1:8], axis=-1)
+    with np.errstate(invalid="ignore"):  # holes may be infinite
+        apart = np.linalg.norm(image[::16, 1::8] - image[::16, :-1:8], axis=-1)
     apart = apart[np.isfinite(apart)]
     return len(apart) > 0 and bool(np.median(apart) <= FINE)
 
