@@ -254,8 +254,8 @@ def _why_ungraspable(
     if size[2] < FLAT and out_of_reach.sum() >= len(outcome) / 2:
         return Ungraspable.TOO_FLAT
     if not sample.collision_free[scored].any():
-        hit = len(scored) > 0 or (outcome == CODE[Outcome.COLLISION]).any()
-        return Ungraspable.BLOCKED if hit else None
+        allowed = outcome != CODE[Outcome.DIRECTION]
+        return Ungraspable.BLOCKED if allowed.any() else None
     hands = sample.candidates.T_cloud_hand[scored]
     met = met_first(scene.cloud, hands, gripper)
     hidden = _far_side_hidden(scene, hands, met, gripper)

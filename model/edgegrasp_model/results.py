@@ -36,7 +36,7 @@ class Ungraspable(StrEnum):
 
     TOO_WIDE = "too-wide"  # its visible part is wider than the hand opens, on all sides
     TOO_FLAT = "too-flat"  # most hands would cut into the support, or come from below
-    BLOCKED = "blocked"  # every hand would hit something, or could in unseen space
+    BLOCKED = "blocked"  # every hand would hit something or the support, or could in unseen space
     HIDDEN = "hidden"  # no camera saw where it ends beyond the fingers
 
 

@@ -315,13 +315,13 @@ LID = [{"kind": "box", "min": (-0.5, -0.5, 0.09), "max": (0.5, 0.5, 0.2)}]
         ((0.10, 0.13, 0.10), {}, "too-wide"),
         ((0.03, 0.05, 0.008), {}, "too-flat"),
         ((0.04, 0.06, 0.08), {"collision": {"obstacles": LID}}, "blocked"),
+        ((0.04, 0.06, 0.03), {"collision": {"margin": 0.05}}, "blocked"),  # by the support
         ((0.04, 0.06, 0.08), {"viewpoint": (1.0, 0.0, 0.04)}, "hidden"),
         ((0.04, 0.06, 0.08), {"viewpoint": None}, None),  # nobody can say
     ],
 )
 def test_an_object_without_a_good_grasp_has_a_reason(size, options, reason) -> None:
-    floor = {"normal": (0, 0, 1), "offset": 0.0}
-    known = {"viewpoint": (0.3, 0.2, 0.5), "support": floor, "objects": "off"}
+    known = ASKED | {"viewpoint": (0.3, 0.2, 0.5), "objects": "off"}
     asked = parse_options(known | {"approach_direction": {"preset": "top-down"}} | options)
     (single,) = convinced(-50.0).detect(box_on_table(3000, size=size), asked).objects
     assert single.reason == reason
