@@ -28,6 +28,7 @@ CLOUD = box_on_table()
 ASKED = {"viewpoint": (0.3, 0.0, 0.5), "support": {"normal": (0.0, 0.0, 1.0), "offset": 0.0}}
 NOWHERE = {"min": (1, 1, 1), "max": (2, 2, 2)}
 WALL = {"kind": "box", "min": [-1, -1, -1], "max": [1, 1, 1]}  # holds every hand
+LID = [{"kind": "box", "min": (-0.5, -0.5, 0.09), "max": (0.5, 0.5, 0.2)}]
 
 
 def detect(cloud: object = CLOUD, **fields: object) -> Detection:
@@ -304,9 +305,6 @@ def convinced(logit: float) -> GraspDetector:
     with torch.no_grad():
         list(network.parameters())[-1].fill_(logit)  # the bias of the last layer
     return GraspDetector(network, CheckpointMetadata("no", TINY["hand"], 0.0045, "panda"), PANDA)
-
-
-LID = [{"kind": "box", "min": (-0.5, -0.5, 0.09), "max": (0.5, 0.5, 0.2)}]
 
 
 @pytest.mark.parametrize(
