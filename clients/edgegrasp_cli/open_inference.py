@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
+from types import SimpleNamespace
 from typing import Annotated, Any
 
 import grpc
@@ -105,13 +106,14 @@ class Models:
         """The models' names."""
         return [self._default, *(model.name for model in self._client.models())]
 
-    def check(self, name: str, version: str = "") -> None:
-        """Refuse an unknown name or version."""
+    def check(self, name: str, version: str = "") -> bool:
+        """True; refuses an unknown name or version."""
         known = self.names()
         if name not in known:
             raise errors.UnknownModelError(f"No model {name!r}. Use one of: {', '.join(known)}.")
         if version not in ("", VERSION):
             raise errors.UnknownModelError(f"No version {version!r}. Use {VERSION}.")
+        return True
 
     def metadata(self, name: str, version: str = "") -> dict[str, Any]:
         """The inputs and outputs of a model, as the protocol describes them."""
@@ -131,14 +133,13 @@ class Models:
         parameters: Mapping[str, Any],
         timeout: float | None,
         wanted: Sequence[str] = (),
-    ) -> tuple[list[tuple[dict[str, Any], Array]], dict[str, str]]:
+    ) -> tuple[dict[str, Any], list[Array]]:
         """Grasps of `points`, or of `depth` with `intrinsics`; parameters are options.
 
         `timeout` among them is in microseconds; `wanted` are names of outputs, empty: all.
 
         Returns:
-            Outputs in the order of OUTPUTS, each described by name, datatype and shape; and the
-            answer's parameters.
+            The answer, with name, datatype and shape of each output; and the outputs.
         """
         asked = {key: option_of_text(value) for key, value in parameters.items()}
         options: Any = {key: value for key, value in asked.items() if key not in NOT_OPTIONS}
@@ -161,13 +162,17 @@ class Models:
         if isinstance(micro, int | float) and micro > 0:
             seconds = min(seconds, micro / 1e6)
         found = self._client.detect(**cloud, **options, timeout=seconds)
-        outputs = []
+        outputs: list[dict[str, Any]] = []
+        arrays: list[Array] = []
         for each in dict.fromkeys(wanted or OUTPUTS):
             kind, shape = OUTPUTS[each]
             values = [getattr(grasp, each) for grasp in found.grasps]
             array = tensor(each, kind, shape, [-1 if value is None else value for value in values])
-            outputs.append(({"name": each, "datatype": kind, "shape": array.shape}, array))
-        return outputs, {"model": found.model, "warnings": " ".join(found.warnings)}
+            outputs.append({"name": each, "datatype": kind, "shape": array.shape})
+            arrays.append(array)
+        said = {"model": found.model, "warnings": " ".join(found.warnings)}
+        answer = {"model_name": name, "model_version": VERSION, "outputs": outputs}
+        return answer | {"parameters": said}, arrays
 
 
 def tensor(name: str, datatype: str, shape: Any, data: Any) -> Array:
@@ -186,9 +191,20 @@ def tensor(name: str, datatype: str, shape: Any, data: Any) -> Array:
 @contextmanager
 def grpc_server(models: Models, address: str) -> Iterator[int]:
     """Serve `inference.GRPCInferenceService` while the context lasts; gives its port."""
+    # Of each call, the fields of its answer.
+    calls: dict[str, Callable[[Any, Any], dict[str, Any]]] = {
+        "ServerLive": lambda *_: {"live": True},
+        "ServerReady": lambda *_: {"ready": models.ready()},
+        "ServerMetadata": lambda *_: {"name": PLATFORM, "version": VERSION},
+        "ModelReady": lambda asked, _: {"ready": models.check(asked.name, asked.version)},
+        "ModelMetadata": lambda asked, _: models.metadata(asked.name, asked.version),
+        "ModelInfer": partial(_grpc_infer, models),
+    }
+    methods = {name: partial(_grpc_answer, name, fields_of) for name, fields_of in calls.items()}
+    servicer: Any = SimpleNamespace(**methods)
     options = [("grpc.max_receive_message_length", MAX_BODY_BYTES)]
     server = grpc.server(ThreadPoolExecutor(PARALLEL_CALLS), options=options)
-    service.add_GRPCInferenceServiceServicer_to_server(_Servicer(models), server)
+    service.add_GRPCInferenceServiceServicer_to_server(servicer, server)
     port = server.add_insecure_port(address)
     server.start()
     try:
@@ -197,58 +213,16 @@ def grpc_server(models: Models, address: str) -> Iterator[int]:
         server.stop(grace=5.0).wait()
 
 
-class _Servicer(service.GRPCInferenceServiceServicer):
-    def __init__(self, models: Models) -> None:
-        self._models = models
-
-    def ServerLive(self, request: Any, context: Any) -> Any:  # noqa: N802
-        return messages.ServerLiveResponse(live=True)
-
-    def ServerReady(self, request: Any, context: Any) -> Any:  # noqa: N802
-        return messages.ServerReadyResponse(ready=self._models.ready())
-
-    def ModelReady(self, request: Any, context: Any) -> Any:  # noqa: N802
-        with _aborting(context):
-            self._models.check(request.name, request.version)
-        return messages.ModelReadyResponse(ready=True)
-
-    def ServerMetadata(self, request: Any, context: Any) -> Any:  # noqa: N802
-        return messages.ServerMetadataResponse(name=PLATFORM, version=VERSION)
-
-    def ModelMetadata(self, request: Any, context: Any) -> Any:  # noqa: N802
-        with _aborting(context):
-            described = self._models.metadata(request.name, request.version)
-        return messages.ModelMetadataResponse(**described)
-
-    def ModelInfer(self, request: Any, context: Any) -> Any:  # noqa: N802
-        name, wanted = request.model_name, [each.name for each in request.outputs]
-        with _aborting(context):
-            given = {name: _value(one) for name, one in request.parameters.items()}
-            tensors = _grpc_inputs(request)
-            if request.model_version:
-                self._models.check(name, request.model_version)
-            seconds = context.time_remaining()
-            outputs, parameters = self._models.infer(name, tensors, given, seconds, wanted)
-        fields: dict[str, Any] = {
-            "parameters": {key: {"string_param": text} for key, text in parameters.items()},
-            "outputs": [described for described, _ in outputs],
-            "raw_output_contents": [array.tobytes() for _, array in outputs],
-        }
-        named = {"model_name": name, "model_version": VERSION, "id": request.id}
-        return messages.ModelInferResponse(**named, **fields)
-
-
-@contextmanager
-def _aborting(context: grpc.ServicerContext) -> Iterator[None]:
-    """End the call with the client's errors in the protocol's form."""
+def _grpc_answer(name: str, fields_of: Callable[[Any, Any], Any], request: Any, call: Any) -> Any:
+    """The answer to a call, or the client's error in the protocol's form."""
     try:
-        yield
+        return getattr(messages, f"{name}Response")(**fields_of(request, call))
     except errors.GraspClientError as error:
         code, _, why = refusal(error)
-        context.abort(grpc.StatusCode[code], why)
+        call.abort(grpc.StatusCode[code], why)
 
 
-def _grpc_inputs(request: Any) -> Tensors:
+def _grpc_infer(models: Models, request: Any, call: Any) -> dict[str, Any]:
     raw = list(request.raw_input_contents)
     if raw and len(raw) != len(request.inputs):
         value = f"{len(raw)} for {len(request.inputs)} inputs"
@@ -258,12 +232,16 @@ def _grpc_inputs(request: Any) -> Tensors:
         field = CONTENTS.get(each.datatype, "fp32_contents")
         data = raw[number] if raw else getattr(each.contents, field)
         tensors[each.name] = tensor(each.name, each.datatype, each.shape, data)
-    return tensors
-
-
-def _value(parameter: Any) -> Any:
-    kind = parameter.WhichOneof("parameter_choice")
-    return None if kind is None else getattr(parameter, kind)
+    kinds = {key: one.WhichOneof("parameter_choice") for key, one in request.parameters.items()}
+    given = {key: kind and getattr(request.parameters[key], kind) for key, kind in kinds.items()}
+    wanted = [each.name for each in request.outputs]
+    if request.model_version:
+        models.check(request.model_name, request.model_version)
+    seconds = call.time_remaining()
+    answer, arrays = models.infer(request.model_name, tensors, given, seconds, wanted)
+    said = {key: {"string_param": text} for key, text in answer["parameters"].items()}
+    contents = [array.tobytes() for array in arrays]
+    return {**answer, "id": request.id, "parameters": said, "raw_output_contents": contents}
 
 
 def http_app(models: Models) -> Starlette:
@@ -276,13 +254,8 @@ def http_app(models: Models) -> Starlette:
         is_ready = models.ready()
         return JSONResponse({"ready": is_ready}, 200 if is_ready else 503)
 
-    def repository() -> list[dict[str, str]]:
-        state = {"version": VERSION, "state": "READY", "reason": ""}
-        return [{"name": name, **state} for name in models.names()]
-
     def model_ready(name: str, version: str = "") -> dict[str, Any]:
-        models.check(name, version)
-        return {"name": name, "ready": True}
+        return {"name": name, "ready": models.check(name, version)}
 
     async def infer(request: Request) -> Response:
         body = bytearray()
@@ -301,12 +274,14 @@ def http_app(models: Models) -> Starlette:
         _, status, why = refusal(error)
         return JSONResponse({"error": why}, status)
 
+    state = {"version": VERSION, "state": "READY", "reason": ""}
+    index = answers(lambda: [{"name": name, **state} for name in models.names()])
     routes = [
         Route("/v2", answers(lambda: {"name": PLATFORM, "version": VERSION, "extensions": []})),
         Route("/v2/health/live", answers(lambda: {"live": True})),
         Route("/v2/health/ready", ready),
         Route("/v2/models", answers(lambda: {"models": models.names()})),
-        Route("/v2/repository/index", answers(repository), methods=["POST"]),
+        Route("/v2/repository/index", index, methods=["POST"]),
     ]
     for path in ("/v2/models/{name}", "/v2/models/{name}/versions/{version}"):
         routes += [
@@ -342,7 +317,7 @@ def _http_infer(models: Models, name: str, body: bytearray, header: str | None) 
         raise
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise invalid("body", repr(error), "Give the JSON of an inference request.") from None
-    found, said = models.infer(name, tensors, parameters, None, wanted)
-    outputs = [described | {"data": array.ravel().tolist()} for described, array in found]
-    named = {"model_name": name, "model_version": VERSION, "id": request.get("id", "")}
-    return {**named, "parameters": said, "outputs": outputs}
+    answer, arrays = models.infer(name, tensors, parameters, None, wanted)
+    for output, array in zip(answer["outputs"], arrays, strict=True):
+        output["data"] = array.ravel().tolist()
+    return answer | {"id": request.get("id", "")}
