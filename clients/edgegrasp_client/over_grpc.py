@@ -204,13 +204,8 @@ def wire_of(request: Request) -> list[bytes | memoryview]:
     else:
         message.encoded.format, message.encoded.data = cloud_file(cloud)
     for name, array in request.arrays.items():
-        if name == "edges":
-            for approach, contact in array.tolist():
-                edge = {"approach_index": approach, "contact_index": contact}
-                fill(message.edges.add(), edge, "edges")
-        elif name == "hand_poses":
-            for pose in array:
-                message.hand_poses.add(T_cloud_hand=pose.ravel().tolist())
+        if name in ("edges", "hand_poses"):
+            _extend(getattr(message, name), array, name, messages=True)
         else:
             long += _field(message, name, _little_endian(array))
     fill(message.options, request.options, "options")
@@ -269,6 +264,8 @@ def _extend(container: Any, values: object, path: str, messages: bool) -> None:
         for row, value in enumerate(values):
             fill(container.add(), value, f"{path}.{row}")
         return
+    if path.rpartition(".")[2].startswith("T_") and all(isinstance(row, list) for row in values):
+        values = [number for row in values for number in row]  # a pose by its rows, like an array
     try:
         container.extend(values)
     except (TypeError, ValueError) as error:
@@ -295,21 +292,14 @@ def _target(message: Any, value: Any, path: str) -> tuple[Any, Any]:
             if viewpoint is not None and not listed:
                 fields["viewpoint"] = [viewpoint]
             return message, fields
-        case "DepthImage" | "RobotArm" | "Place" if fields:
-            # A pose may also be given as rows, like an array.
-            for name, pose in fields.items():
-                if name.startswith("T_") and pose and all(isinstance(row, list) for row in pose):
-                    fields[name] = [number for row in pose for number in row]
-            return message, fields
-        case "Pixel" | "Vector" | "Quaternion":
+        case "HandPose":
+            return message, {names[0]: value}
+        case "Edge" | "HandBox" | "Pixel" | "Vector" | "Quaternion" as kind:
             if not isinstance(value, Sequence) or len(value) != len(names):
                 count = {2: "two", 3: "three", 4: "four"}[len(names)]
-                raise invalid(path, repr(value)[:80], f"Give {count} numbers: {', '.join(names)}.")
+                parts = "corners" if kind == "HandBox" else "numbers"
+                raise invalid(path, repr(value)[:80], f"Give {count} {parts}: {', '.join(names)}.")
             return message, dict(zip(names, value, strict=True))
-        case "HandBox":
-            if not isinstance(value, Sequence) or len(value) != 2:
-                raise invalid(path, repr(value)[:80], "Give two corners: [min, max].")
-            return message, {"min": value[0], "max": value[1]}
         case "GripperChoice":
             named = isinstance(value, str)
             return (message, {"name": value}) if named else (message.geometry, value)
@@ -323,15 +313,13 @@ def _target(message: Any, value: Any, path: str) -> tuple[Any, Any]:
         case "Support":
             if value is None or value == "none":
                 return message, {"disabled": True}
-            if not isinstance(value, Mapping | str):
-                raise invalid(path, repr(value)[:80], "Give a mapping with normal and offset.")
             kind = value if isinstance(value, str) else fields.pop("kind", "plane")
             if kind in ("auto", "ransac"):
                 return getattr(message, kind), fields
             if kind != "plane" or {"auto", "ransac"} & fields.keys():
                 fix = "Set its kind to one of auto, plane, ransac, none."
                 raise invalid(path, repr(kind)[:80], fix)
-            return message, fields
+            return message, fields if isinstance(value, Mapping) else value
         case "Suppression" if value is None:
             return message, {"disabled": True}
         case "Collision" if isinstance(value, str):

@@ -159,6 +159,7 @@ def image(**changes: Any) -> dict[str, Any]:
         (mask([[True], [False, True]]), "contact_region.include.0.mask"),
         (NEGATIVE, "contact_region.include.0.indices.1"),
         ({"gripper": [7]}, "gripper"),
+        ({"robot": {"name": "fr3", "T_base_cloud": 3, "joints": [0.0]}}, "robot.T_base_cloud"),
     ],
 )
 def test_a_bad_option_is_refused_by_field_value_and_fix(options, field, client, cloud) -> None:
