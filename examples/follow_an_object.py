@@ -30,9 +30,8 @@ def camera() -> Iterator[dict[str, np.ndarray]]:
             time.sleep(1 / 30)
 
 
-address = sys.argv[1] if len(sys.argv) > 1 else "127.0.0.1:50051"
 tracker = GraspTracker(viewpoint=T_WORLD_CAMERA[:3, 3])
-with GraspClient(address) as client:
+with GraspClient(*sys.argv[1:]) as client:
     client.wait_until_ready()
     for _, found in tracker.follow(client, camera()):
         for best in found.grasps[:1]:

@@ -16,18 +16,11 @@ HANDLE: Region = {
     "include": [{"kind": "sphere", "center": (0.122, 0.098, 0.497), "radius": 0.022}]
 }  # metres, camera frame
 
-
-def main(address: str = "127.0.0.1:50051") -> None:
-    """Print the grasps whose approach point and contact point lie on the handle."""
-    with GraspClient(address) as client:
-        detection = client.detect(
-            depth_images=[IMAGE], approach_region=HANDLE, contact_region=HANDLE, top_k=5
-        )
-    for grasp in detection.grasps:
-        x, y, z = grasp.contact_point
-        print(f"score {grasp.score:.3f}, contact point at {x:.3f}, {y:.3f}, {z:.3f} m")
-    print("counts:", detection.counts)
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+with GraspClient(*sys.argv[1:]) as client:
+    detection = client.detect(
+        depth_images=[IMAGE], approach_region=HANDLE, contact_region=HANDLE, top_k=5
+    )
+for grasp in detection.grasps:
+    x, y, z = grasp.contact_point
+    print(f"score {grasp.score:.3f}, contact point at {x:.3f}, {y:.3f}, {z:.3f} m")
+print("counts:", detection.counts)

@@ -30,27 +30,22 @@ def views(simulation: ClutterSimulation, rng: np.random.Generator) -> list[Depth
     return images
 
 
-def main(address: str = "127.0.0.1:50051", scenes: str = "1") -> None:
-    """Print a line for each scene."""
-    detector = DetectorFlags(server=address)
-    with ClutterSimulation() as simulation, open_client(detector) as client:
-        for number in range(int(scenes)):
-            rng = np.random.default_rng([0, number])
-            simulation.reset(("packed", "pile")[number % 2], rng, num_objects=5)
-            images = views(simulation, rng)
-            asked = [[image] for image in images] + [images]
-            found = [client.detect(depth_images=some).grasps for some in asked]
-            counts = [len(grasps) for grasps in found]
-            holds = [
-                bool(grasps and simulation.try_grasp(grasps[0].T_cloud_hand).success)
-                for grasps in found
-            ]
-            print(
-                f"each view: {counts[:3]} grasps, best holds {holds[:3]}; "
-                f"all three: {counts[3]}, {holds[3]}",
-                flush=True,
-            )
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+address = sys.argv[1] if len(sys.argv) > 1 else "127.0.0.1:50051"
+scenes = int(sys.argv[2]) if len(sys.argv) > 2 else 1
+with ClutterSimulation() as simulation, open_client(DetectorFlags(server=address)) as client:
+    for number in range(scenes):
+        rng = np.random.default_rng([0, number])
+        simulation.reset(("packed", "pile")[number % 2], rng, num_objects=5)
+        images = views(simulation, rng)
+        asked = [[image] for image in images] + [images]
+        found = [client.detect(depth_images=some).grasps for some in asked]
+        counts = [len(grasps) for grasps in found]
+        holds = [
+            bool(grasps and simulation.try_grasp(grasps[0].T_cloud_hand).success)
+            for grasps in found
+        ]
+        print(
+            f"each view: {counts[:3]} grasps, best holds {holds[:3]}; "
+            f"all three: {counts[3]}, {holds[3]}",
+            flush=True,
+        )

@@ -16,16 +16,9 @@ from edgegrasp_model.options import DetectOptions
 SAMPLE = Path(__file__).with_name("sample") / "depth.png"
 IMAGE = {"depth": SAMPLE, "intrinsics": (540.0, 540.0, 320.0, 239.0)}
 
-
-def main() -> None:
-    """Print the five best grasps of the sample."""
-    points = np.asarray(sent_cloud(None, [IMAGE]).points)  # (480, 640, 3) metres, NaN for holes
-    options = DetectOptions(viewpoint=(0.0, 0.0, 0.0), top_k=5)
-    detection = ModelCatalogue.load().get("").detect(points, options)
-    for grasp in detection.grasps:
-        print(f"score {grasp.score:.3f}, approach {np.round(grasp.approach_direction, 2)}")
-    print("counts:", detection.counts)
-
-
-if __name__ == "__main__":
-    main()
+points = np.asarray(sent_cloud(None, [IMAGE]).points)  # (480, 640, 3) metres, NaN for holes
+options = DetectOptions(viewpoint=(0.0, 0.0, 0.0), top_k=5)
+detection = ModelCatalogue.load().get("").detect(points, options)
+for grasp in detection.grasps:
+    print(f"score {grasp.score:.3f}, approach {np.round(grasp.approach_direction, 2)}")
+print("counts:", detection.counts)

@@ -23,16 +23,9 @@ SMALL: GripperGeometry = {
     "finger": {"boxes": [((-0.006, 0.0, 0.045), (0.006, 0.010, 0.085))]},  # inner face at y = 0
 }
 
-
-def main(address: str = "127.0.0.1:50051") -> None:
-    """Print the best grasps for a small gripper and for the one the weights were trained for."""
-    with GraspClient(address) as client:
-        for gripper in (SMALL, "panda"):
-            detection = client.detect(depth_images=[IMAGE], gripper=gripper, top_k=5)
-            print("panda:" if gripper == "panda" else "small:")
-            for grasp in detection.grasps:
-                print(f"  score {grasp.score:.3f}, opening {1000 * grasp.width:.0f} mm")
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+with GraspClient(*sys.argv[1:]) as client:
+    for gripper in (SMALL, "panda"):  # the latter is the one that the weights were trained for
+        detection = client.detect(depth_images=[IMAGE], gripper=gripper, top_k=5)
+        print("panda:" if gripper == "panda" else "small:")
+        for grasp in detection.grasps:
+            print(f"  score {grasp.score:.3f}, opening {1000 * grasp.width:.0f} mm")
