@@ -133,7 +133,8 @@ def moveit_grasp(
         retreat_distance: Metres of straight retreat, back along the approach.
 
     Returns:
-        The message's fields; orientations are the four fields x, y, z, w.
+        The message's fields, without those that are as in a new message; orientations are the four
+        fields x, y, z, w.
     """
     approach = np.asarray(grasp.approach_direction, dtype=np.float64)
     T_cloud_link = _matrix(grasp.T_cloud_hand) @ _matrix(T_hand_link)
@@ -147,8 +148,6 @@ def moveit_grasp(
         "pre_grasp_approach": _translation(approach, approach_distance, header),
         "post_grasp_retreat": _translation(-approach, retreat_distance, header),
         "post_place_retreat": _translation(-approach, retreat_distance, header),
-        "max_contact_force": 0.0,
-        "allowed_touch_objects": [],
     }
 
 
@@ -156,13 +155,12 @@ def joint_trajectories(motion: ArmTrajectory) -> list[Message]:
     """A motion as the fields of `trajectory_msgs/JointTrajectory`, to be executed one by one.
 
     The first ends at the grasp, where the hand closes; where there is a place, the second ends
-    where it opens. Each begins and ends at rest.
+    where it opens. Each begins and ends at rest; without a stamp, it is executed as it comes.
     """
     stops = [0, motion.grasp_row, motion.release_row, len(motion.times) - 1]
     parts = pairwise([row for row in stops if row is not None])
     return [
         {
-            "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},  # as soon as it comes
             "joint_names": list(motion.joint_names),
             "points": [_point(motion, row, first) for row in range(first, last + 1)],
         }
@@ -302,13 +300,7 @@ def pose_fields(T: Array) -> Message:
 
 
 def _posture(joints: FingerJoints, opening: float, header: Message) -> Message:
-    point = {
-        "positions": list(joints.at(opening).values()),
-        "velocities": [],
-        "accelerations": [],
-        "effort": [],
-        "time_from_start": {"sec": 0, "nanosec": 0},
-    }
+    point = {"positions": list(joints.at(opening).values())}
     return {"header": header, "joint_names": list(joints.names), "points": [point]}
 
 

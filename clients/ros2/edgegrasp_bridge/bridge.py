@@ -251,8 +251,8 @@ def marker_array(found: Found) -> Message:
             "ns": "grasps",
             "id": number,
             "type": LINE_LIST,
-            "scale": {"x": LINE_WIDTH, "y": 0.0, "z": 0.0},
-            "color": {"r": 1.0 - score, "g": score, "b": 0.0, "a": 1.0},
+            "scale": {"x": LINE_WIDTH},
+            "color": {"r": 1.0 - score, "g": score, "a": 1.0},
             "points": [xyz_fields(end) for end in pieces.reshape(-1, 3)],
         }
         markers.append(marker)

@@ -89,6 +89,7 @@ class EdgeGraspNode(Node):
 
     def _detect(self, object_cloud: Any = None, follow: bool = False) -> Any:
         settings, options = self._read()
+        object_cloud = object_cloud if object_cloud and object_cloud.data else None
         if options != self._followed:
             self._followed, self._tracker = options, GraspTracker(**options)
         tracker = self._tracker if follow else None
@@ -122,13 +123,11 @@ class EdgeGraspNode(Node):
         return result
 
     def _plan(self, goal: Any) -> bridge.Message:
-        cluster = goal.object.point_cluster
-        found, settings = self._detect(cluster if cluster.data else None)
+        found, settings = self._detect(goal.object.point_cluster)
         return bridge.moveit_grasps(found, settings, self._lookup)
 
     def _generate(self, goal: Any) -> bridge.Message:
-        cluster = goal.object_cloud
-        found, settings = self._detect(cluster if cluster.data else None)
+        found, settings = self._detect(goal.object_cloud)
         return bridge.object_results(found, settings, goal.object_id, goal.max_candidates)
 
     def _lookup(self, target: str, source: str, stamp: Any) -> bridge.Float64:
