@@ -18,7 +18,6 @@ from edgegrasp_model.request_cloud import DepthImage, PointCloud2
 ROOT = Path(__file__).parents[1]
 DOCUMENT = Path("proto/edgegrasp/v1/openapi.json")
 SCHEMAS = "#/components/schemas"
-OPTIONS = f"{SCHEMAS}/DetectOptions/properties"
 TIMEOUT = {"$ref": "#/components/parameters/Timeout"}
 AS_TEXT = "With a point cloud file as body. As JSON; lists of numbers also as 0.1,0.2,0.3."
 OPTIONS_FILE = Path("clients/edgegrasp_client/options.py")
@@ -58,28 +57,24 @@ def document() -> str:
             "name": name,
             "in": "query",
             "description": f"{schema.get('description', '')}. {AS_TEXT}",
-            "content": {"application/json": {"schema": {"$ref": f"{OPTIONS}/{name}"}}},
+            "content": {"application/json": {"schema": schema}},
         }
         for name, schema in schemas["DetectOptions"]["properties"].items()
     ]
-    return json.dumps(_for_generators(found, schemas), indent=1, ensure_ascii=False) + "\n"
+    return json.dumps(_for_generators(found), indent=1, ensure_ascii=False) + "\n"
 
 
-def _for_generators(part: Any, schemas: dict[str, Any]) -> Any:
+def _for_generators(part: Any) -> Any:
     """The document as generators of clients read it.
 
-    They follow references to schemas, but not to properties of these; they refuse defaults that
-    are objects or lists, and take a field with a default for one that is always there.
+    They refuse defaults that are objects or lists, and take a field with a default for one that is
+    always there.
     """
     if isinstance(part, list):
-        return [_for_generators(each, schemas) for each in part]
+        return [_for_generators(each) for each in part]
     if not isinstance(part, dict):
         return part
-    path = str(part.get("$ref", "")).removeprefix(f"{SCHEMAS}/").split("/")
-    if path[1:2] == ["properties"]:
-        more = {key: value for key, value in part.items() if key != "$ref"}
-        return _for_generators(schemas[path[0]]["properties"][path[2]] | more, schemas)
-    found = {key: _for_generators(value, schemas) for key, value in part.items()}
+    found = {key: _for_generators(value) for key, value in part.items()}
     if "default" in found and not isinstance(found["default"], dict):
         default = found.pop("default")
         said = f"default {json.dumps(default)}"
