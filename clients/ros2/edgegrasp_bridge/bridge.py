@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from edgegrasp_camera.arrays import Array, Float32, Float64
+from edgegrasp_camera.arrays import Array, Float64
 from edgegrasp_camera.clouds import read_point_cloud2
 from edgegrasp_camera.depth import intrinsics_of, metres, unproject
 from edgegrasp_camera.picture import fork
@@ -206,15 +206,14 @@ def detect(
         asked = dict(on_mask(image_array(scene.mask), asked))
     if asked.get("robot"):
         asked["robot"] = _robot(client, asked["robot"], scene, lookup)
-    cloud, segment_ids, images = scene.cloud, None, None
+    cloud = scene.cloud
     if object_cloud is not None:
         T = lookup(frame_id, object_cloud.header.frame_id, stamp)
-        wanted = cloud_points(object_cloud) @ T[:3, :3].T + T[:3, 3]
-        around = cloud_points(cloud) if cloud is not None else _depth_points(scene)
-        cloud, segment_ids = object_in_scene(wanted, around)
+        wanted = _points(Scene(cloud=object_cloud)) @ T[:3, :3].T + T[:3, 3]
+        cloud, asked["segment_ids"] = object_in_scene(wanted, _points(scene))
         asked.setdefault("viewpoint", [0.0, 0.0, 0.0])
     elif cloud is None:
-        images = [
+        asked["depth_images"] = [
             {
                 "depth": depth_array(depth),
                 "intrinsics": camera_matrix(camera),
@@ -222,13 +221,14 @@ def detect(
             }
             for depth, camera in ((scene.depth, scene.camera), *scene.others)
         ]
-    given: Any = asked | {"segment_ids": segment_ids, "depth_images": images}
-    found = client.detect(cloud, **given)
+    found = client.detect(cloud, **asked)
     if tracker is not None:
         tracker.take(found)
-    target = settings.target_frame or frame_id
+    target, grasps = settings.target_frame or frame_id, []
     T_target_cloud = lookup(target, frame_id, stamp)
-    grasps = [_moved(grasp, T_target_cloud) for grasp in found.grasps]
+    for grasp in found.grasps:
+        pose = (T_target_cloud @ grasp.T_cloud_hand).astype(np.float32)
+        grasps.append(replace(grasp, T_cloud_hand=pose, approach_direction=pose[:3, 2]))
     taken = {"sec": stamp.sec, "nanosec": stamp.nanosec}
     return Found(grasps, found, {"stamp": taken, "frame_id": target})
 
@@ -359,12 +359,6 @@ def camera_matrix(camera: Any) -> Float64:
     return matrix
 
 
-def cloud_points(cloud: Any) -> Float64:
-    """Points (N, 3) of a sensor_msgs/PointCloud2, NaN for holes; raises InvalidRequest."""
-    points = read_point_cloud2(cloud).points
-    return np.asarray(points, dtype=np.float64).reshape(-1, 3)
-
-
 def matrix_of(transform: Any) -> Float64:
     """(4, 4) of a geometry_msgs/Transform."""
     turn, shift = transform.rotation, transform.translation
@@ -405,15 +399,11 @@ def _from_frames(scene: Scene, settings: Settings, lookup: Lookup) -> dict[str, 
     return asked
 
 
-def _depth_points(scene: Scene) -> Float32:
-    """Points (N, 3) of the scene's depth image, camera frame; NaN where there is no reading."""
-    intrinsics = intrinsics_of(camera_matrix(scene.camera))
-    return unproject(metres(depth_array(scene.depth)), intrinsics).reshape(-1, 3)
-
-
-def _moved(grasp: Grasp, T_target_cloud: Float64) -> Grasp:
-    pose = (T_target_cloud @ grasp.T_cloud_hand).astype(np.float32)
-    return replace(grasp, T_cloud_hand=pose, approach_direction=pose[:3, 2])
+def _points(scene: Scene) -> Any:
+    """Points (N, 3) or (H, W, 3) of the scene's cloud, or else of its depth image; own frame."""
+    if scene.cloud is not None:
+        return read_point_cloud2(scene.cloud).points
+    return unproject(metres(depth_array(scene.depth)), intrinsics_of(camera_matrix(scene.camera)))
 
 
 def _seconds(stamp: Any) -> float:
