@@ -295,7 +295,7 @@ def http_app(models: Models) -> Starlette:
 def _http_infer(models: Models, name: str, body: bytearray, header: str | None) -> dict[str, Any]:
     """The answer to the body of an inference; raises GraspClientErrors."""
     try:
-        head = len(body) if header is None else int(header)
+        head = len(body) if header is None else min(int(header), len(body))
         lists = body.count(b"[", 0, head)
         if lists > head // 7 + MAX_SHORT_LISTS:  # each takes 20 times its size in memory
             raise ValueError(f"{lists} lists in {head} bytes")
