@@ -71,7 +71,8 @@ class GraspTracker:
         finally:
             stopped.set()
             requests.put(None)
-            _put(latest, None)
+            with suppress(queue.Empty):  # the end of the images waits for its place
+                latest.get_nowait()
 
     def options(self) -> DetectOptions:
         """The options of the next request."""
@@ -127,15 +128,9 @@ def _read(images: Iterable[Any], latest: "queue.Queue[Any]", stopped: threading.
         for image in images:
             if stopped.is_set():
                 return
-            _put(latest, image)
+            with suppress(queue.Empty):
+                latest.get_nowait()
+            latest.put(image)
     except Exception as error:
         end = error
     latest.put(end)  # once the last image is taken
-
-
-def _put(latest: "queue.Queue[Any]", image: Any) -> None:
-    """Put an image in the place of one that is there."""
-    with suppress(queue.Empty):
-        latest.get_nowait()
-    with suppress(queue.Full):
-        latest.put_nowait(image)
