@@ -1,12 +1,11 @@
 """Planners for clutter removal: a detector, on a server or in this process, or any by name."""
 
 import hashlib
-import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -88,12 +87,11 @@ def named_planner(name: str) -> Planner:
         ValueError: there is no such planner.
     """
     installed = entry_points(group=GROUP)
-    module, colon, attribute = name.partition(":")
     try:
         if name in installed.names:
             found = installed[name].load()
-        elif module and colon and attribute:
-            found = getattr(importlib.import_module(module), attribute)
+        elif all(name.partition(":")):
+            found = EntryPoint(name, name, GROUP).load()
         else:
             known = ", ".join([*SHIPPED, *sorted(installed.names)])
             raise ValueError(f"planner is {name!r}; choose one of {known}, or module:callable")
