@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import typer
 from pydantic import BaseModel, Field
 from rich.console import Console
 from rich.progress import Progress, TimeElapsedColumn
 from rich.table import Table
+from typer import Argument, Option
 
 from edgegrasp_cli.flags import PlannerFlags, option_flags, parse_option_flags, takes_flags
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from edgegrasp_sim.results import ResultFolder
     from edgegrasp_sim.trial import Round
 
-Option = typer.Option
 FAR = 0.5  # metres from the arm's base to the middle of a scene
 LIFT = {"retreat_length": 0.1, "retreat_direction": "up"}  # metres
 # Options of a detection that are set by the simulation, the protocol or another flag.
@@ -184,8 +183,8 @@ def benchmark_arm(
 
 
 def compare(
-    first: Annotated[Path, typer.Argument(help="Folder that `benchmark --output` wrote.")],
-    second: Annotated[Path, typer.Argument(help="Another, of the same scenes.")],
+    first: Annotated[Path, Argument(help="Folder that `benchmark --output` wrote.")],
+    second: Annotated[Path, Argument(help="Another, of the same scenes.")],
     output: Annotated[Path | None, Option(help="JSON file for the figures as well.")] = None,
 ) -> None:
     """Compare two benchmarks scene by scene, with 95 % confidence intervals."""

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+from typer import Option
 
 from edgegrasp_camera.arrays import Int64
 from edgegrasp_camera.picture import Picture
@@ -23,7 +23,6 @@ from edgegrasp_model.gripper import choose_gripper, load_gripper
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.results import SUPPORT, UNLABELLED
 
-Option = typer.Option
 Rows = list[tuple[str, ...]]
 # Options that are set by the scene or by this command.
 DECIDED = ("viewpoint", "debug", "robot", "previous")

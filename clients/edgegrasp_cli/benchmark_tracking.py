@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
+from typer import Option
 
 from edgegrasp_camera.arrays import Float64
 from edgegrasp_cli.detect import DetectorFlags, open_client
@@ -23,7 +23,6 @@ from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.sensor import STRUCTURED_LIGHT
 from edgegrasp_sim.simulation import ClutterSimulation
 
-Option = typer.Option
 RATE = 30.0  # images a second
 NOISE, MISSING = (0.0003, 0.0015), 0.005  # metres, and for each square metre of depth; of pixels
 EYE, TARGET = np.array([0.15, -0.35, 0.65]), np.array([0.15, 0.15, 0.05])  # of the camera, metres

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import typer
 from pydantic import Field
 from rich import box
 from rich.console import Console
 from rich.table import Column, Table
+from typer import Argument, Option
 
 from edgegrasp_camera.files import pixels, sent_cloud
 from edgegrasp_camera.picture import draw_detection
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from edgegrasp_client import DepthImage, Model
     from edgegrasp_model.detector import ModelCatalogue
 
-Option = typer.Option
 PICTURES = (".png", ".jpg", ".jpeg")
 
 
@@ -92,7 +91,7 @@ class DetectFlags(DetectorFlags):
 @takes_flags(options=option_flags("robot", "previous"))
 def detect(
     file: Annotated[
-        Path | None, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
+        Path | None, Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
     ] = None,
     as_document: Annotated[bool, Option("--json", help="Print JSON, as the HTTP API.")] = False,
     options_file: Annotated[

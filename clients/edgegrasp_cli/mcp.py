@@ -14,8 +14,8 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
 from pydantic import Field
+from typer import Option
 
 from edgegrasp_camera import EdgeGraspError
 from edgegrasp_camera.files import pixels, sent_cloud
@@ -42,7 +42,6 @@ INSTRUCTIONS = (
     "Read `warnings` before a robot moves."
 )
 
-Option = typer.Option
 NumGrasps = Annotated[int, Field(ge=1, le=MOST_GRASPS)]
 Matrix = Annotated[
     list[list[float]], Field(description="4 x 4: camera to a base frame whose z is up, metres")

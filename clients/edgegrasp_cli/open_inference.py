@@ -14,13 +14,13 @@ from typing import Annotated, Any
 
 import grpc
 import numpy as np
-import typer
 import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
+from typer import Option
 
 from edgegrasp.oip import open_inference_pb2 as messages
 from edgegrasp.oip import open_inference_pb2_grpc as service
@@ -59,7 +59,6 @@ MAX_BODY_BYTES = 32 * 2**20
 MAX_SHORT_LISTS = 20_000  # in JSON; most lists hold numbers
 
 Tensors = dict[str, Array]
-Option = typer.Option
 
 
 @takes_flags()

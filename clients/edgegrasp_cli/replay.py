@@ -6,16 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
 from rich.console import Console
+from typer import Argument, Option, Typer
 
 if TYPE_CHECKING:
     from edgegrasp_service.settings import Settings
     from edgegrasp_service.worker.process import Answer, Job
 
-Option = typer.Option
 
-replay = typer.Typer(
+replay = Typer(
     help="Repeat a recording: an attempt of a benchmark, or a request.",
     no_args_is_help=True,
     add_completion=False,
@@ -24,7 +23,7 @@ replay = typer.Typer(
 
 @replay.command()
 def attempt(
-    results: Annotated[Path, typer.Argument(help="Folder that `benchmark --output` wrote.")],
+    results: Annotated[Path, Argument(help="Folder that `benchmark --output` wrote.")],
     round: Annotated[int, Option(help="Number of the round, from 0.")] = 0,  # noqa: A002
     number: Annotated[int, Option("--attempt", help="Number of the attempt in it, from 0.")] = 0,
     seed: Annotated[
@@ -61,7 +60,7 @@ def attempt(
 
 @replay.command()
 def request(
-    file: Annotated[Path, typer.Argument(help="A file that a server with --record-folder wrote.")],
+    file: Annotated[Path, Argument(help="A file that a server with --record-folder wrote.")],
     config: Annotated[Path | None, Option(help="TOML file with the server's settings.")] = None,
 ) -> None:
     """Answer a recorded request again, in this process, and compare with the recorded answer.

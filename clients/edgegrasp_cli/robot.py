@@ -5,28 +5,28 @@ import json
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option, Typer
 
-robot = typer.Typer(help="Make and check robot files.", no_args_is_help=True)
+robot = Typer(help="Make and check robot files.", no_args_is_help=True)
 
 NO_OFFSET = """
 [T_flange_hand]
 position = [0.0, 0.0, 0.0]
 quaternion = [0.0, 0.0, 0.0, 1.0]
 """
-GripperName = Annotated[str, typer.Option(help="Name of a gripper that ships, or its file.")]
-Links = Annotated[str, typer.Option(help="Link of the URDF.")]
+GripperName = Annotated[str, Option(help="Name of a gripper that ships, or its file.")]
+Links = Annotated[str, Option(help="Link of the URDF.")]
 
 
 @robot.command()
 def add(
-    urdf: Annotated[Path, typer.Argument(help="URDF or xacro of the arm.")],
+    urdf: Annotated[Path, Argument(help="URDF or xacro of the arm.")],
     base: Links,
     flange: Links,
-    output: Annotated[Path, typer.Option(help="Robot file to write, .toml.")],
+    output: Annotated[Path, Option(help="Robot file to write, .toml.")],
     gripper: GripperName = "panda",
-    srdf: Annotated[str, typer.Option(help="SRDF with links that may touch.")] = "",
-    packages: Annotated[list[str] | None, typer.Option(help="Folder that holds packages.")] = None,
+    srdf: Annotated[str, Option(help="SRDF with links that may touch.")] = "",
+    packages: Annotated[list[str] | None, Option(help="Folder that holds packages.")] = None,
 ) -> None:
     """Write a robot file for an arm's URDF, and check it.
 
@@ -51,8 +51,8 @@ def add(
 
 @robot.command()
 def check(
-    file: Annotated[Path, typer.Argument(help="Robot file, .toml, or a name of one that ships.")],
-    picture: Annotated[Path | None, typer.Option(help="Picture of it at its home, .png.")] = None,
+    file: Annotated[Path, Argument(help="Robot file, .toml, or a name of one that ships.")],
+    picture: Annotated[Path | None, Option(help="Picture of it at its home, .png.")] = None,
 ) -> None:
     """Load a robot file, print its facts, and draw the arm at its home.
 

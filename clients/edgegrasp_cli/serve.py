@@ -10,12 +10,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from edgegrasp_cli.flags import model_flags, takes_flags
 from edgegrasp_service.settings import Settings
-
-Option = typer.Option
 
 
 @takes_flags(settings=model_flags(Settings, panel="Settings"))
@@ -57,7 +55,7 @@ def serve(
 
 def view(
     file: Annotated[
-        Path | None, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
+        Path | None, Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
     ] = None,
     depth: Annotated[Path | None, Option(help="Depth image in place of a cloud: .png.")] = None,
     intrinsics: Annotated[str | None, Option(help="Camera of --depth: fx,fy,cx,cy.")] = None,

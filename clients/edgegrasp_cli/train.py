@@ -8,15 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from pydantic import Field
 from rich.progress import Progress, track
+from typer import Argument, Option
 
 from edgegrasp_cli.benchmark import Cluster, interruptible
 from edgegrasp_cli.flags import takes_flags
 from edgegrasp_training.options import GenerationOptions, TrainingOptions
-
-Option = typer.Option
 
 
 class DataFlags(GenerationOptions, Cluster):
@@ -29,7 +27,7 @@ class DataFlags(GenerationOptions, Cluster):
 
 @takes_flags()
 def generate_data(
-    output: Annotated[Path, typer.Argument(help="Folder for the views, one file each.")],
+    output: Annotated[Path, Argument(help="Folder for the views, one file each.")],
     *,
     asked: DataFlags,
 ) -> None:
@@ -80,7 +78,7 @@ class TrainFlags(TrainingOptions):
 @takes_flags()
 def train(
     data: Annotated[
-        list[Path] | None, typer.Argument(help="Folders of views from generate-data.")
+        list[Path] | None, Argument(help="Folders of views from generate-data.")
     ] = None,
     *,
     asked: TrainFlags,
@@ -127,7 +125,7 @@ def train(
 
 
 def generate_scenes(
-    output: Annotated[Path, typer.Argument(help="Folder for the images, 200 in a file.")],
+    output: Annotated[Path, Argument(help="Folder for the images, 200 in a file.")],
     objects: Annotated[Path, Option(help="Folder with packed/train and pile/train.")],
     files: Annotated[int, Option(min=1, help="Files of 50 scenes with 4 images each.")] = 110,
     seed: Annotated[int, Option(min=0, help="Seed of everything random.")] = 2,
@@ -151,7 +149,7 @@ def generate_scenes(
 
 
 def train_scene(
-    data: Annotated[Path, typer.Argument(help="Folder from generate-scenes.")],
+    data: Annotated[Path, Argument(help="Folder from generate-scenes.")],
     run: Annotated[Path, Option(help="Folder for checkpoints and the log.")],
     minutes: Annotated[float, Option(min=0.0, help="How long.")] = 70.0,
     threads: Annotated[int, Option(min=1, help="Threads of the processor.")] = 2,
@@ -171,9 +169,9 @@ def train_scene(
 
 
 def import_checkpoint(
-    directory: Annotated[Path, typer.Argument(help="Holds the authors' *-ckpt-N.pt files.")],
+    directory: Annotated[Path, Argument(help="Holds the authors' *-ckpt-N.pt files.")],
     output: Annotated[
-        Path | None, typer.Argument(help="File to write; else ARCHITECTURE.safetensors here.")
+        Path | None, Argument(help="File to write; else ARCHITECTURE.safetensors here.")
     ] = None,
 ) -> None:
     """Convert a checkpoint in the authors' layout to one safetensors file."""
