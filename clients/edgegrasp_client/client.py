@@ -16,7 +16,7 @@ from collections.abc import (
 )
 from concurrent.futures import Future
 from functools import partial, wraps
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec
 
 from typing_extensions import Self, Unpack
 
@@ -26,12 +26,11 @@ from edgegrasp_client.errors import DeadlineError, ServerUnavailableError, Worke
 from edgegrasp_client.over_grpc import GrpcTransport
 from edgegrasp_client.over_rest import RestTransport
 from edgegrasp_client.requests import Cloud, Request, RequestFields, StreamRequest
-from edgegrasp_client.results import Model, Robot, StreamAnswer
+from edgegrasp_client.results import Answer, Model, Robot, StreamAnswer
 from edgegrasp_results import Detection, Grasp, Scoring
 
 POLL_SECONDS = 0.1
 
-Answer = TypeVar("Answer")
 Parameters = ParamSpec("Parameters")
 
 _LOOPS: dict[int, asyncio.AbstractEventLoop] = {}  # by process

@@ -1,7 +1,7 @@
 """The gRPC transport: requests, answers and errors as messages."""
 
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import grpc.aio
 import numpy as np
@@ -21,10 +21,8 @@ from edgegrasp_client.requests import (
     is_point_cloud2,
     point_cloud2_fields,
 )
-from edgegrasp_client.results import Model, StreamAnswer, read_as
+from edgegrasp_client.results import Answer, Model, StreamAnswer, read_as
 from edgegrasp_results import Detection
-
-Answer = TypeVar("Answer")
 
 CHANNEL_OPTIONS = (
     ("grpc.max_receive_message_length", -1),

@@ -6,7 +6,7 @@ import operator
 import ssl
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import httpx
 import numpy as np
@@ -24,7 +24,7 @@ from edgegrasp_client.requests import (
     npy_bytes,
     point_cloud2_fields,
 )
-from edgegrasp_client.results import StreamAnswer, read_as
+from edgegrasp_client.results import Answer, StreamAnswer, read_as
 from edgegrasp_results import Detection
 
 MAX_QUERY = 4000  # characters; servers and proxies limit the length of an address
@@ -32,7 +32,6 @@ KIND_PREFIX = "urn:edgegrasp:error:"
 
 Call = dict[str, Any]  # arguments of httpx's `request`
 Part = tuple[str | None, bytes, str]  # of a form: file name, content, media type
-Answer = TypeVar("Answer")
 
 
 class RestTransport:

@@ -74,19 +74,19 @@ _STAGES = (
     *("reachable", "with_trajectory", "returned", "description", "network", "ranking", "arm"),
 )
 
-Record = TypeVar("Record")
+Answer = TypeVar("Answer")
 Read = Callable[[Any, str], Any]
 """read(answer, name): the field of that name of an object in an answer; None if it is absent."""
 
 
-def read_as(kind: type[Record], answer: Any, read: Read) -> Record:
+def read_as(kind: type[Answer], answer: Any, read: Read) -> Answer:
     """An answer, or an object in one, as one of the dataclasses above."""
     fields = _fields(cast("Any", kind))
     values = {name: value(read(answer, name), read) for name, value in fields}
     if kind is ArmTrajectory:  # gRPC has rows one behind the other
         for name in ("positions", "velocities"):
             values[name] = values[name].reshape(-1, len(values["joint_names"]))
-    return cast("Callable[..., Record]", kind)(**values)
+    return cast("Callable[..., Answer]", kind)(**values)
 
 
 @cache

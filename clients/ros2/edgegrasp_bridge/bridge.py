@@ -17,12 +17,11 @@ from edgegrasp_camera.clouds import read_point_cloud2
 from edgegrasp_camera.depth import intrinsics_of, metres, unproject
 from edgegrasp_camera.picture import fork
 from edgegrasp_client import GraspClient, GraspTracker, conversions, object_in_scene, on_mask
-from edgegrasp_client.conversions import pose_fields, xyz_fields
+from edgegrasp_client.conversions import Message, pose_fields, xyz_fields
 from edgegrasp_client.options import DetectOptions
 from edgegrasp_client.requests import option_of_text
 from edgegrasp_results import Detection, Grasp
 
-Message = dict[str, Any]
 Lookup = Callable[[str, str, Any], Float64]
 """lookup(target, source, stamp): T_target_source (4, 4), as tf2 has it; stamp None: the latest."""
 
