@@ -8,7 +8,9 @@ usage: scripts/from_options.py [FOLDER]    writes both below it; else into this 
 """
 
 import json
+import re
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any
 
@@ -116,20 +118,13 @@ def class_of(name: str, schema: dict[str, Any]) -> str:
     return f'\n\n{head}\n    """{doc}"""\n\n{"".join(lines)}'
 
 
-def in_order(name: str, schemas: dict[str, Any], found: dict[str, str]) -> None:
-    """Add a class to `found`, behind those that it names."""
-    for other in schemas:
-        if f"/{other}'" in str(schemas[name]) and other not in found:
-            in_order(other, schemas, found)
-    found[name] = class_of(name, schemas[name])
-
-
 def client_options() -> str:
-    """The client's types of the options."""
+    """The client's types of the options, each behind those that it names."""
     schema = DetectOptions.model_json_schema()
-    found: dict[str, str] = {}
-    in_order("DetectOptions", {**schema.pop("$defs"), "DetectOptions": schema}, found)
-    return HEAD + "".join(found.values())
+    schemas = {**schema.pop("$defs"), "DetectOptions": schema}
+    named = {name: re.findall(r"#/\$defs/(\w+)", str(each)) for name, each in schemas.items()}
+    order = TopologicalSorter(named).static_order()
+    return HEAD + "".join(class_of(name, schemas[name]) for name in order)
 
 
 if __name__ == "__main__":

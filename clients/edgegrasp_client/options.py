@@ -20,13 +20,6 @@ class Cone(TypedDict):
     max_angle: float
 
 
-class ApproachDirection(TypedDict, total=False):
-    """Directions in which the hand may move: those in any cone or in the preset."""
-
-    cones: Sequence[Cone]
-    preset: Literal["top-down", "side"] | None
-
-
 class AutoPlane(TypedDict):
     """The plane of the points near objects that are classified as support."""
 
@@ -50,18 +43,6 @@ class OrientedBox(TypedDict):
     quaternion: NotRequired[Numbers]
 
 
-class Collision(TypedDict, total=False):
-    """Collision checks of the hand and its motion: cloud, support plane and obstacles."""
-
-    mode: Literal["avoid", "penalise", "ignore"]
-    margin: float
-    opening: float | None
-    approach_length: float
-    retreat_length: float
-    retreat_direction: Literal["back", "up"]
-    obstacles: Sequence[Box | OrientedBox]
-
-
 class HandPart(TypedDict):
     """Boxes of the hand or of one finger, hand frame."""
 
@@ -73,61 +54,6 @@ class Linkage(TypedDict):
 
     radius: float
     reach: float
-
-
-class GripperGeometry(TypedDict):
-    """A parallel-jaw gripper; the fields of a gripper file. z toward the object, y closing."""
-
-    name: NotRequired[str]
-    max_opening: float
-    tip_z: float
-    contact_z: float
-    tcp_z: float
-    hand: HandPart
-    finger: HandPart
-    swing: NotRequired[Linkage | None]
-
-
-class ObjectChoice(TypedDict, total=False):
-    """Some of the objects that are found, by their numbers in an answer to the same cloud."""
-
-    include: Sequence[int] | NDArray[Any]
-    exclude: Sequence[int] | NDArray[Any]
-
-
-class PreviousGrasp(TypedDict):
-    """A grasp of an earlier answer."""
-
-    id: int
-    T_cloud_hand: Numbers
-    object: NotRequired[int | None]
-
-
-class PreviousObject(TypedDict):
-    """An object of an earlier answer."""
-
-    number: int
-    surface: Numbers
-    confidence: NotRequired[float | None]
-
-
-class Previous(TypedDict, total=False):
-    """Grasps and objects of an earlier answer, to be followed."""
-
-    gripper: str
-    next_id: int
-    grasps: Sequence[PreviousGrasp]
-    objects: Sequence[PreviousObject]
-    search: bool
-
-
-class RansacPlane(TypedDict):
-    """The largest plane in the cloud that is nearly level."""
-
-    kind: Literal["ransac"]
-    distance: NotRequired[float]
-    max_tilt: NotRequired[float]
-    min_share: NotRequired[float]
 
 
 class HalfSpace(TypedDict):
@@ -152,6 +78,45 @@ class Mask(TypedDict):
     mask: Sequence[bool] | NDArray[Any]
 
 
+class ObjectChoice(TypedDict, total=False):
+    """Some of the objects that are found, by their numbers in an answer to the same cloud."""
+
+    include: Sequence[int] | NDArray[Any]
+    exclude: Sequence[int] | NDArray[Any]
+
+
+class PlaceRegion(TypedDict):
+    """An axis-aligned box in the arm's base frame; an object is put on its bottom."""
+
+    min: Numbers
+    max: Numbers
+
+
+class PreviousGrasp(TypedDict):
+    """A grasp of an earlier answer."""
+
+    id: int
+    T_cloud_hand: Numbers
+    object: NotRequired[int | None]
+
+
+class PreviousObject(TypedDict):
+    """An object of an earlier answer."""
+
+    number: int
+    surface: Numbers
+    confidence: NotRequired[float | None]
+
+
+class RansacPlane(TypedDict):
+    """The largest plane in the cloud that is nearly level."""
+
+    kind: Literal["ransac"]
+    distance: NotRequired[float]
+    max_tilt: NotRequired[float]
+    min_share: NotRequired[float]
+
+
 class Segments(TypedDict):
     """Points by their segment in `segment_ids`, sent with the cloud."""
 
@@ -165,38 +130,6 @@ class Sphere(TypedDict):
     kind: Literal["sphere"]
     center: Numbers
     radius: float
-
-
-class Region(TypedDict, total=False):
-    """Points in any of `include` and in none of `exclude`."""
-
-    include: Sequence[Box | OrientedBox | Sphere | HalfSpace | Indices | Mask | Segments]
-    exclude: Sequence[Box | OrientedBox | Sphere | HalfSpace | Indices | Mask | Segments]
-
-
-class PlaceRegion(TypedDict):
-    """An axis-aligned box in the arm's base frame; an object is put on its bottom."""
-
-    min: Numbers
-    max: Numbers
-
-
-class Place(TypedDict, total=False):
-    """Where the arm puts the object down: in one pose, or anywhere in a region."""
-
-    T_base_object: Numbers | None
-    region: PlaceRegion | None
-
-
-class RobotArm(TypedDict):
-    """The arm that executes the grasp; each grasp in the answer has its joints and motion."""
-
-    name: str
-    T_base_cloud: Numbers
-    joints: Numbers
-    plan: NotRequired[Literal["reach", "motion"]]
-    place: NotRequired[Place | None]
-    avoid_unseen: NotRequired[bool]
 
 
 class SupportPlane(TypedDict):
@@ -220,6 +153,73 @@ class Workspace(TypedDict):
 
     min: Numbers
     max: Numbers
+
+
+class ApproachDirection(TypedDict, total=False):
+    """Directions in which the hand may move: those in any cone or in the preset."""
+
+    cones: Sequence[Cone]
+    preset: Literal["top-down", "side"] | None
+
+
+class Collision(TypedDict, total=False):
+    """Collision checks of the hand and its motion: cloud, support plane and obstacles."""
+
+    mode: Literal["avoid", "penalise", "ignore"]
+    margin: float
+    opening: float | None
+    approach_length: float
+    retreat_length: float
+    retreat_direction: Literal["back", "up"]
+    obstacles: Sequence[Box | OrientedBox]
+
+
+class GripperGeometry(TypedDict):
+    """A parallel-jaw gripper; the fields of a gripper file. z toward the object, y closing."""
+
+    name: NotRequired[str]
+    max_opening: float
+    tip_z: float
+    contact_z: float
+    tcp_z: float
+    hand: HandPart
+    finger: HandPart
+    swing: NotRequired[Linkage | None]
+
+
+class Place(TypedDict, total=False):
+    """Where the arm puts the object down: in one pose, or anywhere in a region."""
+
+    T_base_object: Numbers | None
+    region: PlaceRegion | None
+
+
+class Previous(TypedDict, total=False):
+    """Grasps and objects of an earlier answer, to be followed."""
+
+    gripper: str
+    next_id: int
+    grasps: Sequence[PreviousGrasp]
+    objects: Sequence[PreviousObject]
+    search: bool
+
+
+class Region(TypedDict, total=False):
+    """Points in any of `include` and in none of `exclude`."""
+
+    include: Sequence[Box | OrientedBox | Sphere | HalfSpace | Indices | Mask | Segments]
+    exclude: Sequence[Box | OrientedBox | Sphere | HalfSpace | Indices | Mask | Segments]
+
+
+class RobotArm(TypedDict):
+    """The arm that executes the grasp; each grasp in the answer has its joints and motion."""
+
+    name: str
+    T_base_cloud: Numbers
+    joints: Numbers
+    plan: NotRequired[Literal["reach", "motion"]]
+    place: NotRequired[Place | None]
+    avoid_unseen: NotRequired[bool]
 
 
 class DetectOptions(TypedDict, total=False):
