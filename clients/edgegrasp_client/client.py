@@ -123,8 +123,8 @@ class AsyncGraspClient:
         accepts them. Over REST, each request waits for the previous answer, on one connection.
 
         Args:
-            requests: Read as they can be sent; an exception from it ends the stream after the
-                earlier requests are answered.
+            requests: Read as they can be sent, in a separate thread unless asynchronously; an
+                exception from it ends the stream after the earlier requests are answered.
             timeout: Seconds for each request without its own; None: the client's.
 
         Yields:
@@ -133,7 +133,8 @@ class AsyncGraspClient:
         Raises:
             GraspClientError: The stream itself failed, so that no more answers come.
         """
-        return self._transport.detect_stream(_named(requests), self._seconds(timeout))
+        source = requests if isinstance(requests, AsyncIterable) else _from_thread(requests)
+        return self._transport.detect_stream(_named(source), self._seconds(timeout))
 
     async def models(self, *, timeout: float | None = None) -> list[Model]:
         """The weights that `model` can name."""
@@ -197,17 +198,13 @@ class AsyncGraspClient:
 
 
 async def _named(
-    requests: AsyncIterable[StreamRequest] | Iterable[StreamRequest],
+    requests: AsyncIterable[StreamRequest],
 ) -> AsyncIterator[tuple[str, StreamRequest]]:
     """The requests with their own names, or their numbers from 0."""
     number = 0
-    if isinstance(requests, AsyncIterable):
-        async for request in requests:
-            yield request.request_id or str(number), request
-            number += 1
-    else:
-        for number, request in enumerate(requests):
-            yield request.request_id or str(number), request
+    async for request in requests:
+        yield request.request_id or str(number), request
+        number += 1
 
 
 # The synchronous client
@@ -263,8 +260,8 @@ class GraspClient:
     def detect_stream(
         self, requests: Iterable[StreamRequest], *, timeout: float | None = None
     ) -> Iterator[StreamAnswer]:
-        """As `AsyncGraspClient.detect_stream`; the requests are read in a separate thread."""
-        answers = self._client.detect_stream(_from_thread(requests), timeout=timeout)
+        """As `AsyncGraspClient.detect_stream`."""
+        answers = self._client.detect_stream(requests, timeout=timeout)
 
         async def following() -> StreamAnswer | None:
             return await anext(answers, None)
