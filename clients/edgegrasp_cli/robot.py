@@ -14,7 +14,6 @@ NO_OFFSET = """
 position = [0.0, 0.0, 0.0]
 quaternion = [0.0, 0.0, 0.0, 1.0]
 """
-GripperName = Annotated[str, Option(help="Name of a gripper that ships, or its file.")]
 Links = Annotated[str, Option(help="Link of the URDF.")]
 
 
@@ -24,7 +23,7 @@ def add(
     base: Links,
     flange: Links,
     output: Annotated[Path, Option(help="Robot file to write, .toml.")],
-    gripper: GripperName = "panda",
+    gripper: Annotated[str, Option(help="Name of a gripper that ships, or its file.")] = "panda",
     srdf: Annotated[str, Option(help="SRDF with links that may touch.")] = "",
     packages: Annotated[list[str] | None, Option(help="Folder that holds packages.")] = None,
 ) -> None:

@@ -123,8 +123,8 @@ class AsyncGraspClient:
         accepts them. Over REST, each request waits for the previous answer, on one connection.
 
         Args:
-            requests: Read as they can be sent, in a separate thread unless asynchronously; an
-                exception from it ends the stream after the earlier requests are answered.
+            requests: Read as they can be sent, in a separate thread if they are no AsyncIterable;
+                an exception from it ends the stream after the earlier requests are answered.
             timeout: Seconds for each request without its own; None: the client's.
 
         Yields:
