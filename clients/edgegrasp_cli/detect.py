@@ -116,7 +116,7 @@ def detect(
     fields = _options(options_file, options) | _robot_option(asked)
     _check_outputs(asked, fields)
     images = _depth_images(file, asked)
-    colors = None if asked.color is None else pixels(asked.color)[..., :3]
+    colors = None if asked.color is None else _colors(asked.color)
     if asked.mask is not None:
         from edgegrasp_client import on_mask
 
@@ -250,7 +250,7 @@ def _robot_option(asked: DetectFlags) -> dict[str, Any]:
     """The option `robot` from the flags; empty if none of them is given."""
     given = {"--robot": asked.robot, "--joints": asked.joints, "--base": asked.base}
     missing = [flag for flag, value in given.items() if value is None]
-    if len(missing) == len(given):
+    if len(missing) == len(given) and asked.place is None and not asked.avoid_unseen:
         return {}
     if missing:
         raise ValueError(f"{missing[0]}: got nothing. Give {', '.join(given)} together.")
@@ -284,15 +284,24 @@ def _depth_images(file: Path | None, asked: DetectFlags) -> "list[DepthImage] | 
         raise ValueError(f"--intrinsics: got nothing. Give fx,fy,cx,cy of {depths[0]}, in pixels.")
     if len(intrinsics) == 1:
         intrinsics = intrinsics * len(depths)
-    if len(depths) > 1 and not len(poses) == len(intrinsics) == len(depths):
+    if len(intrinsics) != len(depths):
+        each = f"Give one for all, or one for each of {len(depths)} images."
+        raise ValueError(f"--intrinsics: got {len(intrinsics)}. {each}")
+    if len(poses) != len(depths) and (poses or len(depths) > 1):
         raise ValueError(f"--pose: got {len(poses)}. Give one for each of {len(depths)} images.")
     images: list[DepthImage] = []
-    for depth, camera, pose in zip_longest(depths, intrinsics, poses[: len(depths)]):
+    for depth, camera, pose in zip_longest(depths, intrinsics, poses):
         image: Any = {"depth": depth, "intrinsics": value_of_text("intrinsics", camera)}
         image |= {} if pose is None else {"T_cloud_camera": value_of_text("pose", pose)}
         image |= {} if asked.depth_scale is None else {"depth_scale": asked.depth_scale}
         images.append(image)
     return images
+
+
+def _colors(file: Path) -> Any:
+    """The colours (H, W, 3) of an image file; a grey one's are equal in all three."""
+    values = pixels(file)
+    return np.dstack([values] * 3) if values.ndim == 2 else values[..., :3]
 
 
 def _print_detection(detection: Any) -> None:

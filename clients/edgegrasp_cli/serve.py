@@ -82,10 +82,11 @@ def view(
         flags = []
         files = [each for each in (file, depth, color) if each is not None]
         if files:
-            sample = {"name": files[0].name, "files": [each.name for each in files]}
+            names = [f"{number}-{each.name}" for number, each in enumerate(files)]
+            sample = {"name": files[0].name, "files": names}
             sample |= {name: str(value) for name, value in given.items() if value is not None}
-            for each in files:
-                shutil.copy(each, folder)
+            for each, name in zip(files, names, strict=True):
+                shutil.copy(each, Path(folder) / name)
             (Path(folder) / "samples.json").write_text(json.dumps([sample]))
             flags = ["--samples", folder]
         starting = "Starting a server; the first one compiles for a minute…"

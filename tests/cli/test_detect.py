@@ -90,6 +90,13 @@ def test_a_picture_shows_the_cloud_its_grasps_and_the_region(
     assert cyan["region"].sum() > 200 > cyan["cloud"].sum()
 
 
+def test_grey_colours_are_those_of_their_pixels(camera_files, dummy_server, run) -> None:
+    depth, mask, _, *camera = camera_files
+    grey = mask.replace("--mask", "--color")
+    asked = ("detect", depth, grey, *camera, "--server", dummy_server.grpc_address, "--json")
+    assert json.loads(run(*asked))["counts"]["points"] == 24 * 32
+
+
 def test_a_picture_that_cannot_be_written_is_refused_before_any_work(refused, tmp_path) -> None:
     for name, message in (
         ("seen.gif", "Name a file .png or"),
@@ -115,6 +122,10 @@ def test_depth_images_that_cannot_be_read(camera_files, file, refused) -> None:
         ((), "give a cloud file, or --depth and --intrinsics"),
         ((file, *camera_files), "give a cloud file, or --depth and --intrinsics"),
         ((depth, "--intrinsics", "300,300,640,360"), "cx: got 640, outside of an image of 32 x 24"),
+        ((depth, *2 * ("--intrinsics", "300")), "--intrinsics: got 2. Give one for all, or one"),
+        ((depth, "--intrinsics", "300", *2 * ("--pose", "[]")), "--pose: got 2. Give one for each"),
+        ((file, "--place", "[0, 0, 0]"), "--robot: got nothing. Give --robot, --joints, --base"),
+        ((file, "--avoid-unseen"), "--robot: got nothing. Give --robot, --joints, --base"),
         ((depth, "--intrinsics", "300"), "depth_images.0.intrinsics: got 300"),
         ((depth.removeprefix("--depth="),), "a depth image as `depth` with `intrinsics`"),
         ((file, mask), "768 values for a cloud of 500 rows"),

@@ -138,15 +138,19 @@ def test_a_recorded_request_is_answered_again(transport, run, refused, tmp_path,
 
 
 def test_a_scene_is_viewed_until_ctrl_c(tmp_path: Path) -> None:
-    np.save(tmp_path / "depth.npy", np.full((4, 6), 500, np.uint16))
-    flags = ("--depth", tmp_path / "depth.npy", "--intrinsics", "30,30,3,2", "--no-browser")
+    depth, color = tmp_path / "frame.npy", tmp_path / "color" / "frame.npy"
+    color.parent.mkdir()
+    np.save(depth, np.full((4, 6), 500, np.uint16))
+    np.save(color, np.full((4, 6, 3), 90, np.uint8))
+    camera = ("--intrinsics", "30,30,3,2")
+    flags = ("--depth", depth, "--color", color, *camera, "--no-browser")
     with started(*EDGEGRASP, "view", *flags) as viewer:
         assert viewer.stdout is not None
         address = viewer.stdout.readline().split()[0]
         sample = httpx.get(f"{address}samples/samples.json").json()[0]
         assert sample["intrinsics"] == "30,30,3,2"
-        file = httpx.get(f"{address}samples/{sample['files'][0]}").content
-        assert file == (tmp_path / "depth.npy").read_bytes()
+        files = [httpx.get(f"{address}samples/{name}").content for name in sample["files"]]
+        assert files == [depth.read_bytes(), color.read_bytes()]
         assert httpx.get(address).status_code == 200
         viewer.send_signal(signal.SIGINT)
         assert viewer.wait(timeout=30) == 0
