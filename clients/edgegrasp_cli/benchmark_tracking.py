@@ -36,10 +36,11 @@ SUCCESSES = ("still", "open_loop", "followed")
 
 @dataclass(frozen=True)
 class Motion:
-    """How the object and the camera move between the first answer and the grasp."""
+    """How objects and the camera move between the first answer and the grasp."""
 
     seconds: float = 1.0
-    speed: float = 0.0  # of the object, level, metres a second
+    speed: float = 0.0  # of the object that is grasped, level, metres a second
+    belt: bool = False  # whether the others move with it
     shift: float = np.inf  # metres after which it stops
     turn: float = 0.0  # degrees about the vertical when it stops
     camera: float = 0.0  # speed at which the camera comes nearer, metres a second
@@ -48,9 +49,9 @@ class Motion:
 MOTIONS = {
     "still": Motion(seconds=10.0),
     "pushed": Motion(speed=0.1, shift=0.02, turn=20.0),
-    "belt-5": Motion(speed=0.05),
-    "belt-10": Motion(speed=0.1),
-    "belt-20": Motion(speed=0.2),
+    "belt-5": Motion(speed=0.05, belt=True),
+    "belt-10": Motion(speed=0.1, belt=True),
+    "belt-20": Motion(speed=0.2, belt=True),
     "hand-camera": Motion(camera=0.2),
 }
 
@@ -96,7 +97,7 @@ class RecordedScene:
 
 
 class SimulatedScene:
-    """Objects on a table, one of which moves, under a structured-light camera; world frame."""
+    """Objects on a table or a belt, under a structured-light camera; world frame."""
 
     def __init__(
         self, simulation: ClutterSimulation, motion: Motion, rng: np.random.Generator
@@ -142,11 +143,13 @@ class SimulatedScene:
         return success
 
     def _place(self, seconds: float) -> None:
-        """Move the object to its pose at a time."""
-        T, start = self.moved(seconds), self.start[self.held]
-        place = T[:3, :3] @ start.position + T[:3, 3]
-        turn = Rotation.from_matrix(T[:3, :3]) * Rotation.from_quat(start.quaternion_xyzw)
-        self.simulation.move(self.held, place.tolist(), turn.as_quat().tolist())
+        """Move objects to their poses at a time."""
+        T = self.moved(seconds)
+        for number, start in enumerate(self.start):
+            if self.motion.belt or number == self.held:
+                place = T[:3, :3] @ start.position + T[:3, 3]
+                turn = Rotation.from_matrix(T[:3, :3]) * Rotation.from_quat(start.quaternion_xyzw)
+                self.simulation.move(number, place.tolist(), turn.as_quat().tolist())
 
 
 Scene = RecordedScene | SimulatedScene

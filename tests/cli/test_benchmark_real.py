@@ -222,7 +222,11 @@ def test_the_grasp_of_an_object_on_a_belt_moves_with_it() -> None:
     client = OwnDetector()
     scenes = simulated(None, MOTIONS["belt-10"], 1)
     scene = next(scenes)
+    start = np.array([one.position for one in scene.simulation.placements])
     done = follow(client, scene, 0.2, clock=lambda: 0.0)
+    scene.look(0.2)
+    gone = [one.position for one in scene.simulation.placements] - start
+    assert np.allclose(gone, scene.moved(0.2)[:3, 3], atol=1e-6)  # all objects
     assert np.linalg.norm(scene.moved(0.2)[:3, 3]) == pytest.approx(0.02)
     assert len(done.off) >= 3
     # The last image was taken one thirtieth of a second before, 3 mm back.
