@@ -86,8 +86,7 @@ class Robot:
     scene: core.Scene  # for the free motion
     straight: core.Scene  # for straight ways, on which the hand may touch what it grasps
     carrying: core.Scene  # for the way to where an object is put
-    bare: core.Scene  # without shapes, where inverse kinematics takes a third of the time
-    ik: SimpleIk  # in that scene
+    ik: SimpleIk  # in a scene without shapes, where it takes a third of the time
 
     def joints_at(self, T_base_hand: Float64, start: Float64) -> Float64 | None:
         """Joints (J,) that bring the hand there, found from others (J,); None: not found."""
@@ -216,8 +215,8 @@ def _load(path: Path, file: RobotFile) -> Robot:
     for link in shaped:
         for shape in link.findall("collision"):
             link.remove(shape)
-    bare = replace(model, urdf=as_text(root), allowed=[])
-    scenes = [one.scene(file) for one in (model, model, model, bare)]
+    bare = replace(model, urdf=as_text(root), allowed=[]).scene(file)
+    scenes = [model.scene(file) for _ in range(3)]
     lower, upper = scenes[0].getPositionLimitVectors(GROUP)
     home = np.array(file.home) if file.home else np.clip(0.0, lower, upper)
     if ((home < lower) | (home > upper)).any():
@@ -228,7 +227,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
         scenes[0].forwardKinematics(home, HAND, file.flange_frame), joint_names, home, lower, upper,
         scenes[0].getVelocityLimitVectors(GROUP)[1],
         scenes[0].getAccelerationLimitVectors(GROUP)[1],
-        _kinematics(joints, scenes[0], file.base_frame), model, *scenes, SimpleIk(scenes[-1], IK),
+        _kinematics(joints, scenes[0], file.base_frame), model, *scenes, SimpleIk(bare, IK),
     )  # fmt: skip
     if scenes[0].hasCollisions(home):
         pair = touching(scenes[0], model, home)
