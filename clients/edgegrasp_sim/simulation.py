@@ -78,7 +78,7 @@ class ClutterSimulation:
         self._objects: list[SceneObject] = []
         self._obstacles: frozenset[int] = frozenset()
         self._gripper: Gripper | None = None
-        self._rest_state: int | None = None
+        self._rest_state: Any = None
 
     def __enter__(self) -> Self:
         return self

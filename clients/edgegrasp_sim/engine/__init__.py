@@ -7,7 +7,7 @@ import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, NamedTuple, Protocol, Self, TypeAlias
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,14 +155,14 @@ class World(Protocol):
     def detect_collisions(self) -> None:
         """Refresh the contact points without advancing time."""
 
-    def save_state(self) -> int:
+    def save_state(self) -> Any:
         """Keep the present state in memory; valid for the bodies that are there now."""
 
-    def restore_state(self, state: int) -> None:
+    def restore_state(self, state: Any) -> None:
         """Return to a saved state."""
 
-    def remove_state(self, state: int) -> None:
-        """Discard a saved state."""
+    def remove_state(self, state: Any) -> None:
+        """Discard a saved state that the engine keeps."""
 
     def load_urdf(
         self, path: Path, position: Vector, quaternion_xyzw: Vector, scale: float

@@ -93,7 +93,6 @@ class MujocoWorld(World):
         self._data: Any = mujoco.MjData(self._model)
         self._changed = False
         self._bodies = 0
-        self._states: dict[int, Any] = {}
         self._hand: MujocoHand | None = None
         self.substeps = SUBSTEPS
         self._uid_of_geom: list[int] = []
@@ -153,20 +152,15 @@ class MujocoWorld(World):
     def detect_collisions(self) -> None:
         mujoco.mj_forward(self.model, self.data)
 
-    def save_state(self) -> int:
+    def save_state(self) -> Any:
         kept = mujoco.MjData(self.model)
         mujoco.mj_copyData(kept, self.model, self.data)
-        number = max(self._states, default=0) + 1
-        self._states[number] = kept
-        return number
+        return kept
 
-    def restore_state(self, state: int) -> None:
-        mujoco.mj_copyData(self.data, self.model, self._states[state])
+    def restore_state(self, state: Any) -> None:
+        mujoco.mj_copyData(self.data, self.model, state)
         if self._hand is not None:
             self._hand.way = None
-
-    def remove_state(self, state: int) -> None:
-        del self._states[state]
 
     def load_urdf(
         self, path: Path, position: Vector, quaternion_xyzw: Vector, scale: float

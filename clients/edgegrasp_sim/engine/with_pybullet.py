@@ -74,13 +74,13 @@ class PybulletWorld(World):
     def detect_collisions(self) -> None:
         self.client.performCollisionDetection()
 
-    def save_state(self) -> int:
-        return int(self.client.saveState())
+    def save_state(self) -> Any:
+        return self.client.saveState()
 
-    def restore_state(self, state: int) -> None:
+    def restore_state(self, state: Any) -> None:
         self.client.restoreState(stateId=state)
 
-    def remove_state(self, state: int) -> None:
+    def remove_state(self, state: Any) -> None:
         self.client.removeState(state)
 
     def load_urdf(
