@@ -85,8 +85,8 @@ def run_grasp(
     touched = False
 
     def result(cause: FailureCause | None, held: SceneObject | None = None) -> GraspResult:
-        found = GraspResult(gripper.opening, start_contact, held, target, cause)
-        return replace(found, touched_on_the_way=touched)
+        seen = gripper.opening, start_contact, held, target, cause
+        return GraspResult(*seen, touched_on_the_way=touched)
 
     if _cut_into(gripper) & obstacles:
         return result(FailureCause.START_COLLISION)

@@ -123,22 +123,30 @@ class RoundDriver:
             protocol.scene.table_thickness,
         )
         self.view = -1
-        self.end: RoundEnd | None = None
         self._seen: Observation | None = None
         self._failures = 0
         self._planning_seconds = 0.0
         names = tuple(model.name for model in simulation.object_models)
         wide = tuple(model.name for model in simulation.too_wide)
         self._round = Round(seed, index, names, (), 0, RoundEnd.CLEARED, too_wide=wide)
-        self._update_end()
+
+    @property
+    def end(self) -> RoundEnd | None:
+        """Why the round has ended, None if it goes on."""
+        rules = self.protocol.round
+        if self.simulation.num_objects == 0:
+            return RoundEnd.CLEARED
+        if self._failures >= rules.max_consecutive_failures:
+            return RoundEnd.FAILURES
+        return RoundEnd.NO_GRASP if self._round.no_grasp >= rules.max_no_grasp else None
 
     def run(self, planner: Planner) -> Round:
         """Run the round to its end."""
-        while self.end is None:
+        while (end := self.end) is None:
             grasp = self.plan(planner, self.look())
             if grasp is not None:
                 self.execute(grasp)
-        return replace(self._round, end=self.end)
+        return replace(self._round, end=end)
 
     def look(self) -> Observation:
         """Take the next view."""
@@ -169,7 +177,6 @@ class RoundDriver:
         self._planning_seconds = time.perf_counter() - started
         if grasp is None:
             self._round = replace(self._round, no_grasp=self._round.no_grasp + 1)
-            self._update_end()
         return grasp
 
     def execute(self, grasp: PlannedGrasp) -> Attempt:
@@ -193,14 +200,4 @@ class RoundDriver:
         )
         self._failures = 0 if attempt.success else self._failures + 1
         self._round = replace(self._round, attempts=(*self._round.attempts, attempt))
-        self._update_end()
         return attempt
-
-    def _update_end(self) -> None:
-        rules = self.protocol.round
-        if self.simulation.num_objects == 0:
-            self.end = RoundEnd.CLEARED
-        elif self._failures >= rules.max_consecutive_failures:
-            self.end = RoundEnd.FAILURES
-        elif self._round.no_grasp >= rules.max_no_grasp:
-            self.end = RoundEnd.NO_GRASP
