@@ -97,7 +97,7 @@ def benchmark(*, asked: BenchmarkFlags, options: dict[str, Any]) -> None:
     if folder is not None and asked.report:
         from edgegrasp_sim.report import write_report
 
-        print(f"report: {write_report(folder)}")
+        print(f"report: {write_report(folder, summary)}")
     _print_summary(summary, planner_title(run["planner"]))
     if asked.gate is not None:
         if below := below_gate(summary, asked.gate):

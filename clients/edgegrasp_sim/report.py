@@ -88,11 +88,9 @@ class Replay:
         return repeated, seen
 
 
-def write_report(folder: ResultFolder) -> Path:
-    """Write `report.html` into a result folder."""
-    rounds = folder.rounds()
-    facts = folder.manifest()
-    summary = folder.finish(rounds)
+def write_report(folder: ResultFolder, summary: dict[str, Any]) -> Path:
+    """Write `report.html` into a finished result folder."""
+    rounds, facts = folder.rounds(), folder.manifest()
     pictures: list[str] = []
     if "arm" not in facts["run"]:
         with Replay(folder) as replay:
