@@ -97,7 +97,6 @@ class Maker:
             turn = yaw if standing else Rotation.random(rng=self.rng)
             scale, model = float(self.rng.uniform(0.65, 1.05)), models.sample(self.rng)
             x, y = self.rng.uniform(-1, 1, size=2) * half
-            state = self.world.save_state()
             new = load_object(self.world, model, (x, y, 2.0), turn.as_quat().tolist(), scale)
             lift = float(new.body.position[2] - new.body.bounds[0, 2]) + height
             new.body.set_pose((x, y, lift), turn.as_quat().tolist())
@@ -107,7 +106,6 @@ class Maker:
             else:
                 self.objects.append(new)
                 wait_for_rest(self.world, self.objects, 1.5)
-            self.world.remove_state(state)
 
     def table(self) -> Made:
         """Objects apart on a table that ends near them."""
