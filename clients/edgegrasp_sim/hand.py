@@ -1,4 +1,4 @@
-"""A floating hand, and a grasp with it: approach, close, retreat, and the outcome."""
+"""A hand, floating or on an arm, and a grasp with it: approach, close, retreat, the outcome."""
 
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, replace
@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from edgegrasp_sim.engine import TIME_STEP, Body, Hand, HandModel, Parts, World
+from edgegrasp_results import ArmTrajectory
+from edgegrasp_sim.engine import TIME_STEP, ArmModel, Body, Hand, HandModel, Parts, World
 from edgegrasp_sim.engine.urdf import read_obj
 from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
 from edgegrasp_sim.scene import SceneObject
@@ -18,6 +19,7 @@ SHAPES = Path(__file__).parent / "panda_hand.obj"
 FINGERTIP = 0.1122  # metres ahead of the panda_hand link, of the Panda
 CENTRE = 0.04  # of mass
 CLOSE_SECONDS = 0.5
+SETTLE_SECONDS = 0.25  # of an arm at the grasp and at the end, in which the joints arrive
 
 # Far above the table and out of the cameras' sight.
 _PARKED = translation(0.15, 0.15, 5.0)
@@ -185,6 +187,67 @@ class Gripper:
             self.body.move(position, quaternion)
             self.world.step()
             yield
+
+
+class ArmGripper(Gripper):
+    """The hand on an arm; `motion` is that of the next grasp."""
+
+    motion: ArmTrajectory | None = None
+
+    def __init__(
+        self, world: World, hand: HandModel, arm: ArmModel, min_opening: float = MIN_OPENING
+    ) -> None:
+        self.world, self.model, self.min_opening = world, hand, min_opening
+        self.body = self._arm = world.add_arm(arm, hand)
+
+    def park(self) -> None:
+        """Put the arm to its home, the hand open."""
+        self._arm.rest()
+
+    def start(self, T_world_hand: Matrix) -> None:
+        """Start at home, wherever the grasp is."""
+        self.park()
+
+    def approach(self, T_world_hand: Matrix) -> Iterator[None]:
+        """Follow the motion to the grasp."""
+        motion = self._planned
+        self.on_the_way = True
+        for seconds in self._follow(0, motion.grasp_row):
+            self.on_the_way = bool(seconds < motion.times[motion.pregrasp_row])
+            yield
+
+    def retreat(self, T_world_hand: Matrix) -> Iterator[None]:
+        """Follow the motion away from the grasp."""
+        motion = self._planned
+        for _ in self._follow(motion.grasp_row, len(motion.times) - 1):
+            yield
+
+    @property
+    def _planned(self) -> ArmTrajectory:
+        if self.motion is None:
+            raise ValueError("the grasp has no motion of the arm; plan it with a robot")
+        return self.motion
+
+    def _follow(self, first: int, last: int) -> Iterator[float]:
+        """Yields the time after every time step."""
+        motion, substeps = self._planned, self._arm.substeps
+        begin, end = motion.times[first], motion.times[last]
+        steps = int(np.ceil((end - begin + SETTLE_SECONDS) / TIME_STEP))
+        for step in range(steps):
+            times = begin + (step + np.arange(1, substeps + 1) / substeps) * TIME_STEP
+            times = times.clip(max=end)
+            rows = [
+                np.column_stack([np.interp(times, motion.times, joint) for joint in table.T])
+                for table in (motion.positions, motion.velocities)
+            ]
+            self._arm.drive(*rows)
+            self.world.step()
+            yield float(times[-1])
+
+
+def seconds_of(motion: ArmTrajectory) -> float:
+    """Seconds of the motion from home to the grasp, away, and back home the same way."""
+    return float(motion.times[-1] + motion.times[motion.pregrasp_row]) + CLOSE_SECONDS
 
 
 @cache

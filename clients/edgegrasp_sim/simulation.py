@@ -10,11 +10,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_camera.picture import lit
 from edgegrasp_results import ArmTrajectory
-from edgegrasp_sim.arm import ArmGripper
 from edgegrasp_sim.camera import CAMERA, FARTHEST, Observation, TableView, crop, points_of
 from edgegrasp_sim.engine import ArmModel, make_world
 from edgegrasp_sim.engine.urdf import least_width
-from edgegrasp_sim.hand import MIN_OPENING, GraspResult, Gripper, hand_of, panda, run_grasp
+from edgegrasp_sim.hand import (
+    MIN_OPENING,
+    ArmGripper,
+    GraspResult,
+    Gripper,
+    hand_of,
+    panda,
+    run_grasp,
+)
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import Matrix, require_pose
 from edgegrasp_sim.scene import STANDING_IN, Layout, SceneObject, load_object, settle

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_results import ArmTrajectory
-from edgegrasp_sim.arm import seconds_of
 from edgegrasp_sim.camera import Observation, crop
-from edgegrasp_sim.hand import FailureCause
+from edgegrasp_sim.hand import FailureCause, seconds_of
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import Protocol as BenchmarkProtocol
 from edgegrasp_sim.simulation import ClutterSimulation

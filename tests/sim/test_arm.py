@@ -10,9 +10,8 @@ from tests.robot.arms import picks_of
 
 from edgegrasp_cli.benchmark import benchmark_arm
 from edgegrasp_robot import load_robot
-from edgegrasp_sim.arm import ArmGripper
 from edgegrasp_sim.engine import make_world
-from edgegrasp_sim.hand import FailureCause, hand_of, panda, run_grasp
+from edgegrasp_sim.hand import ArmGripper, FailureCause, hand_of, panda, run_grasp
 from edgegrasp_sim.objects import ObjectModel
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.scene import load_object
