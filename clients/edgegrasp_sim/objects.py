@@ -51,12 +51,8 @@ class SceneKind(StrEnum):
     @property
     def objects(self) -> "SceneKind":
         """The kind whose objects it uses unless it has its own."""
-        match self:
-            case SceneKind.BIN | SceneKind.FULL_BIN | SceneKind.DEEP_BIN:
-                return SceneKind.PILE
-            case SceneKind.TABLE | SceneKind.SHELF:
-                return SceneKind.PACKED
-        return self
+        upright = self in (SceneKind.PACKED, SceneKind.TABLE, SceneKind.SHELF)
+        return SceneKind.PACKED if upright else SceneKind.PILE
 
     @classmethod
     def _missing_(cls, value: object) -> Never:
@@ -153,8 +149,7 @@ class ObjectSet:
     def builtin(cls, scene: SceneKind) -> "ObjectSet":
         """Graspable objects that need no files: boxes and cans, and for piles random shapes too."""
         folder = _kept_in(f"builtin-{LAYOUT}", _write_builtin)
-        counts = {family: sum(map(len, shapes)) for family, shapes in STANDING.items()}
-        names = [f"{family}-{k}" for family, count in counts.items() for k in range(count)]
+        names = [f"{family}-{k}" for family, shapes in STANDING.items() for k in range(len(shapes))]
         if scene.objects is SceneKind.PILE:
             names += [f"blob_{number:03d}" for number in range(_BLOBS)]
         models = tuple(ObjectModel(name, folder / f"{name}.urdf") for name in names)
@@ -282,27 +277,25 @@ def _prism(sides: int, size: Size) -> str:
     return as_obj([(corners, np.array(faces))])
 
 
-# The built-in objects that stand upright, by family: full extents of boxes, diameters and heights
-# of cans, metres, as they come into a scene. Large: 60 to 70 mm in a hand that opens 80 mm.
-STANDING: dict[str, tuple[tuple[Size, ...], tuple[tuple[float, float], ...]]] = {
+# The built-in objects that stand upright, by family: sides of the base and full extents of boxes
+# and cans, metres, as they come into a scene. Large: 60 to 70 mm in a hand that opens 80 mm.
+STANDING: dict[str, tuple[tuple[int, Size], ...]] = {
     "regular": (
-        ((0.03, 0.03, 0.08), (0.04, 0.04, 0.04), (0.03, 0.05, 0.07)),
-        ((0.03, 0.08), (0.04, 0.06), (0.05, 0.05)),
+        *((4, (0.03, 0.03, 0.08)), (4, (0.04, 0.04, 0.04)), (4, (0.03, 0.05, 0.07))),
+        *((10, (0.03, 0.03, 0.08)), (10, (0.04, 0.04, 0.06)), (10, (0.05, 0.05, 0.05))),
     ),
     "large": (
-        ((0.065, 0.065, 0.10), (0.06, 0.09, 0.12), (0.07, 0.07, 0.07)),
-        ((0.06, 0.12), (0.065, 0.10), (0.07, 0.08)),
+        *((4, (0.065, 0.065, 0.10)), (4, (0.06, 0.09, 0.12)), (4, (0.07, 0.07, 0.07))),
+        *((10, (0.06, 0.06, 0.12)), (10, (0.065, 0.065, 0.10)), (10, (0.07, 0.07, 0.08))),
     ),
 }
 _BLOBS = 12  # random shapes that the sets of piles hold besides
 
 
 def _write_builtin(folder: Path) -> None:
-    for family, (boxes, cans) in STANDING.items():
-        shapes = [_prism(4, size) for size in boxes]
-        shapes += [_prism(10, (diameter, diameter, height)) for diameter, height in cans]
+    for family, shapes in STANDING.items():
         for number, shape in enumerate(shapes):
-            write_object(f"{family}-{number}", shape, folder)
+            write_object(f"{family}-{number}", _prism(*shape), folder)
     for number in range(_BLOBS):
         blob(number, folder)
 
