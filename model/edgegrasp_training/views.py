@@ -15,14 +15,17 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from edgegrasp_camera.arrays import Array, Bools, Float32, Int64
+from edgegrasp_camera.arrays import Bools, Float32, Int64
 from edgegrasp_model.gripper import Gripper, gripper_from_fields, load_gripper
 from edgegrasp_model.options import SupportPlane, Workspace
 from edgegrasp_model.scene.scene import near_workspace_side
 
 UNTRIED = -1  # label of a candidate that was not tried
 TOGETHER = 0.009  # metres between points of one object: twice the edge of a voxel
+REQUIRED = ("points", "normals", "camera_position", "approach_index", "contact_index", "success")
 OPTIONAL = ("T_world_hand", "firm", "support", "at_side", "object_of_point")
+TYPES = {"normals": np.float32, "approach_index": np.int64, "contact_index": np.int64}
+STORED_TYPES = {"normals": np.float16, "approach_index": np.uint16, "contact_index": np.uint16}
 # The table and the limits of the simulated scenes, for views whose file does not have them.
 TABLE = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.05)
 WORKSPACE = Workspace(min=(0.02, 0.02, 0.055), max=(0.28, 0.28, 0.3))
@@ -51,19 +54,9 @@ class LabelledView:
 
     def save(self, path: Path) -> None:
         """Write the view; a reader sees the whole file or none."""
-        arrays: dict[str, Array] = {
-            "points": self.points,
-            "normals": self.normals.astype(np.float16),
-            "camera_position": self.camera_position,
-            "approach_index": self.approach_index.astype(np.uint16),
-            "contact_index": self.contact_index.astype(np.uint16),
-            "success": self.success,
-            "engine": np.array(self.engine),
-            "gripper": np.array(self.gripper),
-        }
-        for name in OPTIONAL:
-            if (array := getattr(self, name)) is not None:
-                arrays[name] = array
+        names = (*REQUIRED, "engine", "gripper", *OPTIONAL)
+        kept = {name: value for name in names if (value := getattr(self, name)) is not None}
+        arrays = {name: np.asarray(value, STORED_TYPES.get(name)) for name, value in kept.items()}
         if self.objects:
             arrays["objects"] = np.array(self.objects)
             arrays["object_digests"] = np.array(self.object_digests)
@@ -122,12 +115,7 @@ def load_view(path: Path) -> LabelledView:
     """Read a view."""
     with np.load(path, allow_pickle=False) as arrays:
         return LabelledView(
-            points=arrays["points"].astype(np.float32),
-            normals=arrays["normals"].astype(np.float32),
-            camera_position=arrays["camera_position"].astype(np.float32),
-            approach_index=arrays["approach_index"].astype(np.int64),
-            contact_index=arrays["contact_index"].astype(np.int64),
-            success=arrays["success"].astype(np.int8),
+            **{name: np.asarray(arrays[name], TYPES.get(name)) for name in REQUIRED},
             **{name: arrays.get(name) for name in OPTIONAL},
             engine=str(arrays.get("engine", LabelledView.engine)),
             gripper=str(arrays.get("gripper", "")),
