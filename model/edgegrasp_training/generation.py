@@ -35,7 +35,7 @@ from edgegrasp_sim.engine import choose_engine
 from edgegrasp_sim.hand import FINGERTIP
 from edgegrasp_sim.objects import CLUTTER, ObjectSet, SceneKind
 from edgegrasp_sim.poses import about_z
-from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
+from edgegrasp_sim.scene import STANDING_IN
 from edgegrasp_sim.sensor import random_sensor
 from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
@@ -205,7 +205,7 @@ def generate_scene(
         hand = "" if gripper is None else json.dumps(gripper)
         made_of = None if drawn is None else {kind: drawn}
         with ClutterSimulation(made_of, engine=options.engine, gripper=gripper) as simulation:
-            low, high = PACKED_SCALE if kind.objects is PACKED else PILE_SCALE
+            _, (low, high), _ = STANDING_IN[kind]
             sizes = low * WIDER_SCALES[0], high * WIDER_SCALES[1]
             sizes = HOUSEHOLD_SCALE if household else sizes
             from_side = household and kind in (PACKED, PILE, TABLE)
