@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float64
-from edgegrasp_sim.camera import look_at
+from edgegrasp_sim.camera import FARTHEST, look_at, points_of
 from edgegrasp_sim.engine import Intrinsics
 from edgegrasp_sim.engine.with_pybullet import PybulletWorld
 from edgegrasp_sim.objects import ObjectSet, SceneKind
@@ -190,11 +190,8 @@ def picture(maker: Maker, made: Made) -> dict[str, Float64]:
     T_world_camera[:3, :3] = T_world_camera[:3, :3] @ roll
     true, body = maker.world.render(T_world_camera, camera)
     depth = random_sensor(rng).apply(true, camera, rng)
-    rows, columns = np.indices(true.shape)
-    # The renderer samples a pixel at its lower left corner.
-    rays = np.stack([columns - width / 2, rows + 1 - height / 2, 0 * rows + focal], axis=-1) / focal
-    up = T_world_camera[2, :3]  # world z, camera frame
-    heights = (rays * true[..., None]) @ up + T_world_camera[2, 3]
+    heights = np.full(true.shape, np.inf)
+    heights[true < FARTHEST * FAR] = points_of(true, T_world_camera, camera)[:, 2]
     label = (np.isin(body, made.support) & (np.abs(heights) < FLAT)).astype(np.uint8)
     for number, item in enumerate(maker.objects):
         label[body == item.body.uid] = FIRST + number
@@ -207,7 +204,7 @@ def picture(maker: Maker, made: Made) -> dict[str, Float64]:
         "depth": millimetres,
         "intrinsics": np.array([focal, focal, width / 2, height / 2 - 1], dtype=np.float32),
         "labels": np.where(millimetres > 0, label, 0).astype(np.uint8),
-        "support_normal": up.astype(np.float32),
+        "support_normal": T_world_camera[2, :3].astype(np.float32),  # world z, camera frame
         "support_offset": np.float32(-T_world_camera[2, 3]),
     }
 
