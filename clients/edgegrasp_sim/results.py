@@ -115,10 +115,8 @@ def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
         "declutter_rate": _rate(counts["successes"], counts["objects"], seeds),
         "too_wide": {
             "objects": sum(len(item.too_wide) for item in rounds),
-            **{
-                f"{name}_of_others": _share(fitting["successes"], fitting[trials])
-                for name, trials in zip(RATE_LABELS, ("attempts", "objects"), strict=True)
-            },
+            "grasp_success_rate_of_others": _share(fitting["successes"], fitting["attempts"]),
+            "declutter_rate_of_others": _share(fitting["successes"], fitting["objects"]),
         },
         "failures": {
             **{cause.value: sum(a.cause is cause for a in attempts) for cause in FailureCause},

@@ -36,7 +36,7 @@ FINGER_SPEED = 0.2  # m/s, at which a finger moves where nothing stops it
 FINGER_INERTIA = 0.3  # kg, of a finger's drive
 FINGER_DAMPING = 400.0  # N s/m, with which the drive keeps to its speed
 _SHARES = np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS
-_OBJECTS, _HAND = 1, 2  # bits of what collides: objects with all, the hand not with itself
+_HAND = 2  # bit of a hand's shapes, which meet those of bit 1, MuJoCo's default, and no others
 # What MuJoCo would do to a URDF besides: join links that no joint moves, look for meshes nearby.
 _URDF_AS_IT_IS = (
     '<mujoco><compiler fusestatic="false" strippath="false" discardvisual="true"/></mujoco></robot>'
