@@ -273,13 +273,14 @@ def hold_connections(url: str, address: str, stop: Any) -> dict[str, int]:
             for _ in range(PAGES):
                 with contextlib.suppress(OSError):
                     came["pages"] += bool(stack.enter_context(connect(url)).send(page))
-            for number, path in enumerate([CHECK] * CHECKS + [STREAM] * STREAMS):
+            calls = [CHECK] * CHECKS + [STREAM] * STREAMS
+            for first in range(0, len(calls), CALLS_PER_CONNECTION):
                 with contextlib.suppress(OSError):
-                    if number % CALLS_PER_CONNECTION == 0:
-                        connection = stack.enter_context(connect(address))
-                        connection.sendall(http2_opening())
-                    connection.sendall(http2_headers(path, 2 * (number % CALLS_PER_CONNECTION) + 1))
-                    came["silent calls"] += 1
+                    connection = stack.enter_context(connect(address))
+                    connection.sendall(http2_opening())
+                    for number, path in enumerate(calls[first : first + CALLS_PER_CONNECTION]):
+                        connection.sendall(http2_headers(path, 2 * number + 1))
+                        came["silent calls"] += 1
             stop.wait(HELD_SECONDS)
     return dict(came)
 

@@ -43,8 +43,8 @@ class ResultFolder:
         known = self.path / "manifest.json"
         manifest = json.loads(json.dumps(manifest))  # tuples become lists, as in the file
         if known.is_file():
-            before = self.manifest()["run"]
-            changed = [key for key in manifest["run"] if before.get(key) != manifest["run"][key]]
+            before, now = self.manifest()["run"], manifest["run"]
+            changed = [key for key in before | now if before.get(key) != now.get(key)]
             if changed:
                 raise ValueError(
                     f"{self.path} holds another benchmark (different {', '.join(changed)}); "

@@ -97,6 +97,8 @@ def test_results_of_two_engines_are_kept_apart(tmp_path: Path) -> None:
         folder.add(ROUNDS[0])
     with pytest.raises(ValueError, match=r"different engine"):
         folders[0].open({"run": run | {"engine": "mujoco"}})
+    with pytest.raises(ValueError, match=r"different engine"):
+        folders[0].open({"run": run})
     with pytest.raises(ValueError, match=r"differ in engine"):
         compare(*folders)
     gate = gate_file(tmp_path, 90, 100)
