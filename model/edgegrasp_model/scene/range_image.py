@@ -13,7 +13,8 @@ from edgegrasp_model.scene.network import HEIGHT, MULTIPLE, WIDTH
 NEAREST = 0.05  # metres from the viewpoint
 COVERED = 0.5  # percent of the points that may lie beyond each side of the image
 COARSE = 40  # cells across the view in which the density of points is measured
-SPACING = 1.25  # pixels between neighbouring points, so that few pixels stay empty
+SPACING = 1.25  # side of a pixel, in distances of sparser points, so that few stay empty
+FILLED = 1.6  # pixels between neighbouring points up to which holes are filled from around them
 COARSEST = 0.003  # metres, of a pixel at the median depth; those of sparser clouds are divided
 DENSE = 2  # points per pixel; more add nothing
 SURFACE = 0.02  # metres; a point nearer by this much hides another of the same pixel
@@ -47,7 +48,8 @@ def range_image(
     in_view = apart @ turn.T
     low, high = _view(in_view)
     finest = float(np.sqrt((high - low).prod() / (WIDTH * HEIGHT)))
-    pixel_size = max(finest, _spacing(in_view, low, high, len(points)))
+    spacing = _spacing(in_view, low, high, len(points))
+    pixel_size = finest if spacing < FILLED * finest else SPACING * spacing
     width, height = (int(np.ceil(side / MULTIPLE)) * MULTIPLE for side in (high - low) / pixel_size)
     middle = (low + high) / 2
     image = np.full((height, width, 3), np.nan, dtype=np.float32)
@@ -93,12 +95,12 @@ def _view(points: Float64) -> tuple[Float64, Float64]:
 
 
 def _spacing(points: Float64, low: Float64, high: Float64, count: int) -> float:
-    """Side of a pixel at z = 1 that leaves few pixels without one of `count` points like (N, 3)."""
+    """Distance at z = 1 between neighbours of `count` points like (N, 3)."""
     ahead = points[points[:, 2] > NEAREST]
     cell = max(float((high - low).max()) / COARSE, 1e-6)
     place = ((ahead[:, :2] / ahead[:, 2:] - low) / cell).astype(np.int64)
     occupied = len(np.unique(place[:, 0] * 4096 + place[:, 1])) * cell * cell
-    return SPACING * float(np.sqrt(occupied / max(count, 1)))
+    return float(np.sqrt(occupied / max(count, 1)))
 
 
 def _enlarged(depth: Float32, times: int, corner: Float64, pixel_size: float) -> Float32:
