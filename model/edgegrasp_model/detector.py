@@ -14,7 +14,7 @@ import torch
 from scipy.special import expit
 from torch import nn
 
-from edgegrasp_camera.arrays import Array, Float32, Float64, Floats, Int64
+from edgegrasp_camera.arrays import Array, Float32, Int64
 from edgegrasp_model.candidates.sample import NOTHING, Sample, Sampler
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import (
@@ -60,7 +60,6 @@ from edgegrasp_model.tracking import (
     narrowed,
     relabelled,
     untracked,
-    with_surfaces,
 )
 from edgegrasp_results import Detection, Evaluation, GripperOutline, Scoring
 
@@ -98,10 +97,6 @@ class Prepared:
         yield
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
-    def total_seconds(self) -> dict[str, float]:
-        """Seconds of each stage and their total."""
-        return self.seconds | {"total": sum(self.seconds.values())}
-
 
 @dataclass(frozen=True)
 class Scored:
@@ -131,6 +126,11 @@ class GraspDetector:
         self.max_voxels = max_voxels
         self.network = network.to(device).eval()
         self.metadata = metadata
+        # Whether the network scores the hand pose itself rather than the edge.
+        self.sees_hands = metadata.network.architecture == "hand"
+        # Of calibrated logits, fitted to outcomes of a robot.
+        rescaled: tuple[float, float] = metadata.training.get("outcomes_scale_shift", (1.0, 0.0))
+        self._scale, self._shift = rescaled
         self.gripper = gripper
         self.device = torch.device(device)
         self.grippers = dict(grippers or {})
@@ -157,12 +157,53 @@ class GraspDetector:
         return self.finish(prepared, self.evaluate(prepared))
 
     def prepare(
-        self, cloud: object, options: DetectOptions, max_voxels: int | None = None
+        self,
+        cloud: object,
+        options: DetectOptions,
+        max_voxels: int | None = None,  # None: those of the detector
+        *,
+        thin: bool = True,  # leave out rows and columns of large images
     ) -> Prepared:
         """First stage: choose the gripper, and build the scene if enough of the cloud is left."""
         start = time.perf_counter()
-        sent = check_cloud(cloud, options.num_approach_points or 1, thin=True)
-        return self._with_scene(sent, options, start, max_voxels)
+        sent = check_cloud(cloud, options.num_approach_points or 1, thin)
+        counts: dict[str, int] = {}
+        gripper, warnings = choose_gripper(options, self.gripper, self.grippers), [*sent.warnings]
+        radius = self.metadata.network.crop_radius
+        if options.gripper is not None:  # the ball has to contain every contact within reach
+            radius = max(radius, gripper.max_opening / 2)
+        hands = self.metadata.training.get("training_hands", 1)
+        if gripper.name != self.gripper.name and hands < MANY_HANDS:
+            warnings.append(
+                f"the weights were trained for the gripper {self.gripper.name!r}: their scores are "
+                f"uncalibrated for {gripper.name!r}; use them for ranking only."
+            )
+        options = _with_viewpoint(sent, options, warnings)
+        previous, followed = options.previous, None
+        if previous is not None:
+            options = narrowed(options, gripper.name, sent.points)
+        selected = select_points(sent, options, counts, warnings)
+        voxel_size = self.metadata.voxel_size
+        scene = build_scene(
+            selected,
+            options,
+            voxel_size,
+            counts,
+            self.max_voxels if max_voxels is None else max_voxels,
+        )
+        if scene is None:
+            warnings.append(
+                "after removing the support plane, background and outliers, "
+                f"{counts['kept']} points remain: too few for a surface; see counts."
+            )
+        elif previous is not None:
+            scene, followed = follow(scene, previous, sent.segment_ids is not None)
+            labels = relabelled(selected.labels, followed.named)
+            selected = replace(selected, labels=labels)
+        seconds = {"cloud": time.perf_counter() - start}
+        return Prepared(
+            options, gripper, radius, selected, scene, counts, warnings, seconds, followed
+        )
 
     def evaluate(self, prepared: Prepared) -> Scored | None:
         """Second stage: sample candidates and score them; None if there is no scene.
@@ -212,8 +253,7 @@ class GraspDetector:
                 logits = self._before_outcomes(scored.logits)
                 if self.sees_hands:
                     logits = judged_together(logits, scored.sample, scene, gripper)
-            scale, shift = self._outcomes
-            score = expit(scale * logits + shift)
+            score = expit(self._scale * logits + self._shift)
             if scene is not None and not scene.approach_allowed.any():
                 prepared.warnings.append(NO_APPROACH_POINT)
             elif scored is not None and len(logits) == 0:
@@ -226,7 +266,8 @@ class GraspDetector:
                 grasps = grasps_in_cloud(scene, best, gripper, score[rows], free)
             if options.debug and scene is not None:
                 debug = debug_info(scene, sample, score, outcome, prepared.selected.labels)
-        tracking, objects = untracked(options.previous), []
+        tracking = None if options.previous is None else untracked(options.previous)
+        objects = []
         if scene is not None:
             if prepared.followed is not None:
                 score_poses = partial(self._score_poses, prepared, scene)
@@ -235,12 +276,13 @@ class GraspDetector:
             with prepared.timed("ranking"):
                 objects = detected_objects(scene, grasps, sample, score, gripper)
             if prepared.followed is not None:
-                objects = with_surfaces(objects, prepared.followed)
+                surface = prepared.followed.surface
+                objects = [replace(one, surface=surface.get(one.number)) for one in objects]
         counts["returned"] = len(grasps)
         return Detection(
             grasps,
             counts,
-            prepared.total_seconds(),
+            prepared.seconds | {"total": sum(prepared.seconds.values())},
             self.metadata.name,
             GripperOutline(gripper.name, gripper.palm_z, gripper.tip_z),
             prepared.warnings,
@@ -268,13 +310,13 @@ class GraspDetector:
         if (edges is None) == (hand_poses is None):
             value = "neither edges nor hand_poses" if edges is None else "edges and hand_poses"
             raise InvalidRequest("edges", value, "Send one of the two.")
-        start = time.perf_counter()
-        sent, options = check_cloud(cloud), options or DetectOptions()
+        options = options or DetectOptions()
+        unused = dict.fromkeys(("approach_region", "contact_region", "num_approach_points"))
+        prepared = self.prepare(cloud, options.model_copy(update=unused), thin=False)
+        rows_sent = len(prepared.selected.labels)
         asked: Array = (
-            check_hand_poses(hand_poses) if edges is None else check_edges(edges, sent.rows_sent)
+            check_hand_poses(hand_poses) if edges is None else check_edges(edges, rows_sent)
         )
-        no_region = {"approach_region": None, "contact_region": None}
-        prepared = self._with_scene(sent, options.model_copy(update=no_region), start)
         evaluations = [Evaluation(None, NoGrasp.NO_POINT)] * len(asked)
         if prepared.scene is not None:
             scene, gripper = prepared.scene, prepared.gripper
@@ -287,8 +329,8 @@ class GraspDetector:
                 evaluations = self._score_given(prepared, scene, given, options.collision)
         prepared.counts["given"] = len(asked)
         prepared.counts["scored"] = sum(each.grasp is not None for each in evaluations)
-        seconds, name = prepared.total_seconds(), self.metadata.name
-        return Scoring(evaluations, prepared.counts, seconds, name, prepared.warnings)
+        seconds = prepared.seconds | {"total": sum(prepared.seconds.values())}
+        return Scoring(evaluations, prepared.counts, seconds, self.metadata.name, prepared.warnings)
 
     def _score_poses(
         self, prepared: Prepared, scene: Scene, T_cloud_hand: Float32, request: Collision
@@ -307,74 +349,13 @@ class GraspDetector:
         sizes = prepared.crop_radius, self.metadata.network
         with prepared.timed("network"):
             for rows, batch in batches(scene, given.candidates, gripper, *sizes):
-                score[rows] = self._probability(self.run(batch))
+                score[rows] = expit(self.run(batch).astype(np.float64) / self.metadata.temperature)
             return evaluated(scene, given, score, gripper, request)
-
-    def _with_scene(
-        self,
-        sent: CheckedCloud,
-        options: DetectOptions,
-        start: float,  # of the stage, by time.perf_counter
-        max_voxels: int | None = None,
-    ) -> Prepared:
-        """Choose the gripper and the crop radius, and build the scene."""
-        counts: dict[str, int] = {}
-        gripper, warnings = choose_gripper(options, self.gripper, self.grippers), [*sent.warnings]
-        radius = self.metadata.network.crop_radius
-        if options.gripper is not None:  # the ball has to contain every contact within reach
-            radius = max(radius, gripper.max_opening / 2)
-        hands = self.metadata.training.get("training_hands", 1)
-        if gripper.name != self.gripper.name and hands < MANY_HANDS:
-            warnings.append(
-                f"the weights were trained for the gripper {self.gripper.name!r}: their scores are "
-                f"uncalibrated for {gripper.name!r}; use them for ranking only."
-            )
-        options = _with_viewpoint(sent, options, warnings)
-        previous, followed = options.previous, None
-        if previous is not None:
-            options = narrowed(options, gripper.name, sent.points)
-        selected = select_points(sent, options, counts, warnings)
-        voxel_size = self.metadata.voxel_size
-        scene = build_scene(
-            selected,
-            options,
-            voxel_size,
-            counts,
-            self.max_voxels if max_voxels is None else max_voxels,
-        )
-        if scene is None:
-            warnings.append(
-                "after removing the support plane, background and outliers, "
-                f"{counts['kept']} points remain: too few for a surface; see counts."
-            )
-        elif previous is not None:
-            scene, followed = follow(scene, previous, sent.segment_ids is not None)
-            labels = relabelled(selected.labels, followed.named)
-            selected = replace(selected, labels=labels)
-        seconds = {"cloud": time.perf_counter() - start}
-        return Prepared(
-            options, gripper, radius, selected, scene, counts, warnings, seconds, followed
-        )
-
-    def _probability(self, logits: Floats) -> Float64:
-        """Calibrated probabilities (E,) of logits (E,)."""
-        return np.asarray(expit(logits.astype(np.float64) / self.metadata.temperature))
-
-    @property
-    def _outcomes(self) -> tuple[float, float]:
-        """Scale and shift of calibrated logits, fitted to outcomes of a robot."""
-        scale, shift = self.metadata.training.get("outcomes_scale_shift", (1.0, 0.0))
-        return scale, shift
 
     def _before_outcomes(self, logits: Float32) -> Float32:
         """Calibrated logits (E,) as they were before outcomes of a robot rescaled them."""
-        scale, shift = self._outcomes
-        return ((logits / self.metadata.temperature - shift) / scale).astype(np.float32)
-
-    @property
-    def sees_hands(self) -> bool:
-        """Whether the network scores the hand pose itself rather than the edge."""
-        return self.metadata.network.architecture == "hand"
+        calibrated = logits / self.metadata.temperature
+        return ((calibrated - self._shift) / self._scale).astype(np.float32)
 
     def _score(self, prepared: Prepared, sample: Sample) -> Scored:
         """The logits of the candidates of a sample."""

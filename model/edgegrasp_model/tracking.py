@@ -27,7 +27,7 @@ from edgegrasp_model.ranking import COLLIDING, objects_first, ranked
 from edgegrasp_model.results import OBSTACLE, Following
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.segment import UNKNOWN
-from edgegrasp_results import DetectedObject, Evaluation, Grasp, Tracking
+from edgegrasp_results import Evaluation, Grasp, Tracking
 
 MARGIN = 0.1  # of the score, by which another grasp must be better
 ALIVE = 0.25  # score from which a followed grasp may stay the first
@@ -167,10 +167,8 @@ def merged(
     return [grasps[row] for row in order], replace(tracking, first=became)
 
 
-def untracked(previous: Previous | None) -> Tracking | None:
+def untracked(previous: Previous) -> Tracking:
     """The tracking state if nothing is seen."""
-    if previous is None:
-        return None
     became = Following.LOST if previous.grasps else Following.STARTED
     return Tracking(became, previous.next_id)
 
@@ -257,11 +255,6 @@ def sampled(points: Float32) -> Float32:
     """Up to MAX_SURFACE of points (N, 3), at even steps in their order."""
     rows = np.linspace(0, len(points) - 1, min(MAX_SURFACE, len(points))).astype(np.int64)
     return points[rows]
-
-
-def with_surfaces(objects: list[DetectedObject], followed: Followed) -> list[DetectedObject]:
-    """The objects with the surface points that `previous` finds them by."""
-    return [replace(one, surface=followed.surface.get(one.number)) for one in objects]
 
 
 def relabelled(labels: Int64, named: Mapping[int, int]) -> Int64:
