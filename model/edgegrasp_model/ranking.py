@@ -156,7 +156,11 @@ def grasps_in_cloud(
     """Grasps in the cloud's frame, of E candidates; all arrays are (E,)."""
     T_cloud_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     T_cloud_tcp = T_cloud_hand @ gripper.T_hand_tcp
-    width, hidden = openings(scene, candidates.T_cloud_hand, gripper)
+    met = met_first(scene.cloud, candidates.T_cloud_hand, gripper)
+    hidden = _far_side_hidden(scene, candidates.T_cloud_hand, met, gripper)
+    width = 2 * (np.abs(met).max(axis=1) + np.float32(FINGER_CLEARANCE))
+    widest = np.float32(gripper.max_opening)
+    width = np.where(hidden, widest, np.minimum(width, widest))
     clearance = clearances(scene, candidates.T_cloud_hand, gripper)
     number = scene.object_of_point[candidates.contact_index]
     return [
@@ -175,15 +179,6 @@ def grasps_in_cloud(
         )
         for row in range(len(candidates))
     ]
-
-
-def openings(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> tuple[Float32, Bools]:
-    """Opening (E,) to approach with, metres, the maximum if the far side is hidden (E,)."""
-    met = met_first(scene.cloud, T_cloud_hand, gripper)
-    width = 2 * (np.abs(met).max(axis=1) + np.float32(FINGER_CLEARANCE))
-    hidden = _far_side_hidden(scene, T_cloud_hand, met, gripper)
-    widest = np.float32(gripper.max_opening)
-    return np.where(hidden, widest, np.minimum(width, widest)), hidden
 
 
 def _far_side_hidden(scene: Scene, T_cloud_hand: Float32, met: Float32, gripper: Gripper) -> Bools:
