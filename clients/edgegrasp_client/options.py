@@ -29,9 +29,9 @@ class AutoPlane(TypedDict):
 class Box(TypedDict):
     """An axis-aligned box in the cloud's frame."""
 
-    kind: Literal["box"]
     min: Numbers
     max: Numbers
+    kind: Literal["box"]
 
 
 class OrientedBox(TypedDict):

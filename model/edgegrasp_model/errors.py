@@ -1,49 +1,12 @@
 """Errors that the model and the pipeline raise, all EdgeGraspErrors."""
 
 import reprlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from itertools import islice
 from typing import Any
 
-from pydantic import ValidationError
-
 from edgegrasp_camera import EdgeGraspError as EdgeGraspError
 from edgegrasp_camera import InvalidRequest as InvalidRequest
-
-
-def invalid_fields(
-    error: ValidationError, fields: object, prefix: str, known: Iterable[str] = ()
-) -> InvalidRequest:
-    """The first fault of pydantic in fields under `prefix`; top-level fields `known` are listed."""
-    first = error.errors(include_url=False)[0]
-    named = first["type"] in ("missing", "extra_forbidden")
-    path = _path(first["loc"], fields, named)
-    field = ".".join([prefix, *path])
-    if first["type"] == "extra_forbidden":
-        there = f"; the {prefix} are: {', '.join(known)}" if len(path) == 1 and known else ""
-        return InvalidRequest(field, "an unknown field", f"Remove it{there}.")
-    value = "nothing" if first["type"] == "missing" else brief(first["input"])
-    fix = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "union_tag_invalid":
-        fix = f"Set its kind to one of {first['ctx']['expected_tags']}"
-    if first["type"] == "union_tag_not_found":
-        fix = "Send an object that names its kind"
-    return InvalidRequest(field, value, f"{fix[:1].upper()}{fix[1:]}.")
-
-
-def _path(location: Sequence[str | int], fields: object, named: bool) -> list[str]:
-    """A location without names of unions' members; `named`: the last part is a field's name."""
-    path: list[str] = []
-    here: Any = fields
-    for place, part in enumerate(location):
-        if isinstance(part, int):
-            here = here[part] if isinstance(here, (list, tuple)) and part < len(here) else None
-        elif isinstance(here, Mapping) and part in here:
-            here = here[part]
-        elif not (named and place == len(location) - 1):
-            continue
-        path.append(str(part))
-    return path
 
 
 def brief(value: object) -> str:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgegrasp_camera.arrays import Bools, Float32, Floats, Int64
+from edgegrasp_camera.arrays import Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import (
     HandView,
     collides,
@@ -26,7 +26,7 @@ from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch, hand_batch
-from edgegrasp_model.options import MAX_CANDIDATES, Collision
+from edgegrasp_model.options import MAX_CANDIDATES, Collision, are_rigid
 from edgegrasp_model.ranking import grasps_in_cloud
 from edgegrasp_model.results import NoGrasp
 from edgegrasp_model.scene.scene import Scene, object_probability
@@ -121,11 +121,7 @@ def check_hand_poses(poses: object) -> Float32:
     if poses.dtype.kind != "f" or poses.shape[1:] != (4, 4):
         raise InvalidRequest("hand_poses", f"dtype {poses.dtype}, shape {poses.shape}", fix)
     _check_number("hand_poses", len(poses))
-    finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
-    turn = np.where(finite[:, None, None], poses[:, :3, :3], 0.0).astype(np.float64)
-    off = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-    rigid: Bools = finite & (off < 1e-3) & (np.linalg.det(turn) > 0)
-    rigid &= (np.abs(poses[:, 3] - [0, 0, 0, 1]) < 1e-6).all(axis=1)
+    rigid = are_rigid(poses)
     if not rigid.all():
         fix = "Send 4 x 4 matrices of a rotation and a translation in metres, last row 0 0 0 1."
         value = f"pose {int(np.argmin(rigid))}, which is no rigid transform"

@@ -6,7 +6,7 @@ made from these models; the gRPC messages have the same fields, which a test com
 
 import base64
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
@@ -25,7 +25,7 @@ from pydantic import (
     model_validator,
 )
 
-from edgegrasp_model.errors import InvalidRequest, invalid_fields
+from edgegrasp_model.errors import InvalidRequest, brief
 
 Pose = TypeVar("Pose", bound=tuple[Any, ...])
 Schema = TypeVar("Schema", bound=BaseModel)
@@ -105,10 +105,12 @@ def ordered(low: tuple[float, ...], high: tuple[float, ...]) -> None:
         raise ValueError("every coordinate of min must be below that of max")
 
 
-class Box(Strict):
-    """An axis-aligned box in the cloud's frame."""
+class Workspace(Strict):
+    """An axis-aligned box in the cloud's frame, where grasps may be.
 
-    kind: Literal["box"] = "box"
+    Points outside stay: as obstacles, and as what the network sees.
+    """
+
     min: Vector = Field(description="lower corner, metres")
     max: Vector = Field(description="upper corner, metres")
 
@@ -116,6 +118,12 @@ class Box(Strict):
     def _ordered(self) -> Self:
         ordered(self.min, self.max)
         return self
+
+
+class Box(Workspace):
+    """An axis-aligned box in the cloud's frame."""
+
+    kind: Literal["box"] = "box"
 
 
 class OrientedBox(Strict):
@@ -382,21 +390,6 @@ class GripperGeometry(Strict):
         )
 
 
-class Workspace(Strict):
-    """An axis-aligned box in the cloud's frame, where grasps may be.
-
-    Points outside stay: as obstacles, and as what the network sees.
-    """
-
-    min: Vector = Field(description="lower corner, metres")
-    max: Vector = Field(description="upper corner, metres")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        ordered(self.min, self.max)
-        return self
-
-
 class Suppression(Strict):
     """Drop a grasp that is nearer to a better one than both distances."""
 
@@ -460,15 +453,18 @@ def _row_by_row(value: object) -> object:
 
 def rigid(value: Pose) -> Pose:
     """A pose T (4, 4), row by row; raises ValueError unless it is a rotation and a translation."""
-    pose = np.reshape(value, (4, 4))
-    turn = pose[:3, :3]
-    if (
-        np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3
-        or np.linalg.det(turn) < 0
-        or np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6
-    ):
+    if not are_rigid(np.reshape(value, (1, 4, 4))).all():
         raise ValueError("must be a rotation and a translation, row-major, with last row 0 0 0 1")
     return value
+
+
+def are_rigid(poses: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which poses T (M, 4, 4) are a rotation and a translation, with last row 0 0 0 1."""
+    finite = np.isfinite(poses).all(axis=(1, 2), keepdims=True)
+    turn = np.where(finite, poses[:, :3, :3], 0.0).astype(np.float64)
+    off = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    last = (np.abs(poses[:, 3] - (0.0, 0.0, 0.0, 1.0)) <= 1e-6).all(axis=1)
+    return np.asarray(last & (off <= 1e-3) & (np.linalg.det(turn) > 0))
 
 
 def _in_threes(value: tuple[float, ...]) -> tuple[float, ...]:
@@ -770,11 +766,41 @@ def parse_options(fields: object) -> DetectOptions:
 
 
 def parse(schema: type[Schema], fields: object, name: str, known: Iterable[str] = ()) -> Schema:
-    """Check plain values against a schema; raises InvalidRequest that names the field."""
+    """Check plain values against a schema.
+
+    Raises InvalidRequest for the first fault, whose field is under `name`; where a top-level one is
+    unknown, `known` are listed.
+    """
     try:
         return schema.model_validate(fields)
     except ValidationError as error:
-        problem = invalid_fields(error, fields, name, known)
-        if problem.value.startswith(("'", "b'")) and problem.field.endswith(".data"):
-            problem = InvalidRequest(problem.field, "no base64", "Send base64 in JSON.")
-        raise problem from None
+        first = error.errors(include_url=False)[0]
+    kind, fix = first["type"], first["msg"].removeprefix("Value error, ")
+    path = _path(first["loc"], fields, kind in ("missing", "extra_forbidden"))
+    field = ".".join([name, *path])
+    if kind == "extra_forbidden":
+        there = f"; the {name} are: {', '.join(known)}" if len(path) == 1 and known else ""
+        raise InvalidRequest(field, "an unknown field", f"Remove it{there}.")
+    value = "nothing" if kind == "missing" else brief(first["input"])
+    if value.startswith(("'", "b'")) and field.endswith(".data"):
+        raise InvalidRequest(field, "no base64", "Send base64 in JSON.")
+    if kind == "union_tag_invalid":
+        fix = f"Set its kind to one of {first['ctx']['expected_tags']}"
+    if kind == "union_tag_not_found":
+        fix = "Send an object that names its kind"
+    raise InvalidRequest(field, value, f"{fix[:1].upper()}{fix[1:]}.")
+
+
+def _path(location: Sequence[str | int], fields: object, named: bool) -> list[str]:
+    """A location without names of unions' members; `named`: the last part is a field's name."""
+    path: list[str] = []
+    here: Any = fields
+    for place, part in enumerate(location):
+        if isinstance(part, int):
+            here = here[part] if isinstance(here, (list, tuple)) and part < len(here) else None
+        elif isinstance(here, Mapping) and part in here:
+            here = here[part]
+        elif not (named and place == len(location) - 1):
+            continue
+        path.append(str(part))
+    return path
