@@ -14,7 +14,7 @@ import torch
 from scipy.special import expit
 from torch import nn
 
-from edgegrasp_camera.arrays import Array, Float32, Int64
+from edgegrasp_camera.arrays import Array, Float32
 from edgegrasp_model.candidates.sample import NOTHING, Sample, Sampler
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import (
@@ -68,7 +68,7 @@ NO_APPROACH_POINT = (
     "list at least half of its points; to select around a single point, send a sphere."
 )
 NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
-# Rating from which an object gets no approach points in each round.
+# Rating of a grasp from which its object gets no approach points in each round.
 ROUNDS = (1.0, SURE_SCORE, GOOD_SCORE, GOOD_SCORE)
 MANY_HANDS = 30  # number of training grippers from which weights suit any gripper
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
@@ -217,7 +217,12 @@ class GraspDetector:
         sampler = self.sampler(prepared)
         for enough in ROUNDS:
             with prepared.timed("candidates"):
-                done = self._objects_with(prepared, scored, enough)
+                done = NOTHING
+                if scored is not None:
+                    held = expit(self._before_outcomes(scored.logits)) >= enough
+                    if prepared.options.collision.mode != "ignore":
+                        held &= scored.sample.collision_free
+                    done = scene.object_of_point[scored.sample.candidates.approach_index[held]]
                 sample = sampler.sample(done, last_resort=enough == GOOD_SCORE)
             if sample is not None:
                 found = self._score(prepared, sample)
@@ -381,16 +386,6 @@ class GraspDetector:
         with prepared.timed("network"):
             return Scored(sample, self.run(batch))
 
-    def _objects_with(self, prepared: Prepared, scored: Scored | None, least: float) -> Int64:
-        """The numbers of the objects that have a grasp of this rating."""
-        if scored is None or prepared.scene is None:
-            return NOTHING
-        held = expit(self._before_outcomes(scored.logits)) >= least
-        if prepared.options.collision.mode != "ignore":
-            held &= scored.sample.collision_free
-        approach_index = scored.sample.candidates.approach_index[held]
-        return np.asarray(prepared.scene.object_of_point[approach_index])
-
 
 def _with_viewpoint(
     sent: CheckedCloud, options: DetectOptions, warnings: list[str]
@@ -450,10 +445,6 @@ class ModelCatalogue:
             name: GraspDetector.load(file, device, own, max_voxels) for name, file in files.items()
         }
         return cls(detectors, default)
-
-    def names(self) -> list[str]:
-        """Names of the models, sorted."""
-        return sorted(self._detectors)
 
     def get(self, name: str = "") -> GraspDetector:
         """The detector of that name, or the default for an empty name; raises UnknownModel."""
@@ -515,7 +506,7 @@ class ModelCatalogue:
         )
 
 
-def choose_device(name: str = "auto") -> torch.device:
+def choose_device(name: str) -> torch.device:
     """The device of that name; `auto` is the first GPU if there is one, else the processor.
 
     Raises:

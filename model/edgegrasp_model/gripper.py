@@ -81,21 +81,17 @@ class Gripper:
         """Metres along z of a contact, inside the fingertips, by opening (...), metres."""
         return (self.contact_z + self.tip_advance(opening)).astype(np.float32)
 
-    def boxes(self, opening: ArrayLike, advance: ArrayLike | None = None) -> Float64:
-        """Boxes with the fingers `opening` (...) metres apart: hand, then both fingers.
+    def boxes(self, opening: float, advance: float | None = None) -> Float64:
+        """Boxes with the fingers `opening` metres apart: hand, then both fingers.
 
-        Least and greatest corners (..., B, 2, 3), hand frame. `advance` is metres that the
-        fingertips have moved forward; None: as the opening implies.
+        Least and greatest corners (B, 2, 3), hand frame. `advance` is metres that the fingertips
+        have moved forward; None: as the opening implies.
         """
-        opening = np.asarray(opening, dtype=np.float64)
-        ahead = self.tip_advance(opening) if advance is None else np.asarray(advance)
-        shift = np.stack(np.broadcast_arrays(np.float64(0.0), opening / 2, ahead), axis=-1)
-        right = np.asarray(self.finger_boxes) + shift[..., None, None, :]  # (..., F, 2, 3)
+        ahead = float(self.tip_advance(opening)) if advance is None else advance
+        right = np.add(self.finger_boxes, (0.0, opening / 2, ahead))  # (F, 2, 3)
         left = right.copy()
-        left[..., 0, 1], left[..., 1, 1] = -right[..., 1, 1], -right[..., 0, 1]
-        hand = np.asarray(self.hand_boxes)
-        hand = np.broadcast_to(hand, (*opening.shape, *hand.shape))
-        return np.concatenate([hand, right, left], axis=-3)
+        left[:, 0, 1], left[:, 1, 1] = -right[:, 1, 1], -right[:, 0, 1]
+        return np.concatenate([np.asarray(self.hand_boxes), right, left])
 
     @cached_property
     def open_boxes(self) -> Float64:
