@@ -105,11 +105,6 @@ class Scored:
     sample: Sample
     logits: Float32
 
-    def and_further(self, other: "Scored") -> "Scored":
-        """These joined with later ones."""
-        logits = np.concatenate([self.logits, other.logits])
-        return Scored(self.sample.and_further(other.sample), logits)
-
 
 class GraspDetector:
     """Detects grasps with one network; holds no state between requests."""
@@ -224,9 +219,13 @@ class GraspDetector:
                         held &= scored.sample.collision_free
                     done = scene.object_of_point[scored.sample.candidates.approach_index[held]]
                 sample = sampler.sample(done, last_resort=enough == GOOD_SCORE)
-            if sample is not None:
-                found = self._score(prepared, sample)
-                scored = found if scored is None else scored.and_further(found)
+            if sample is None:
+                continue
+            logits = self._score(prepared, sample)
+            if scored is not None:
+                sample = scored.sample.and_further(sample)
+                logits = np.concatenate([scored.logits, logits])
+            scored = Scored(sample, logits)
         return scored
 
     def sampler(self, prepared: Prepared) -> Sampler:
@@ -362,11 +361,11 @@ class GraspDetector:
         calibrated = logits / self.metadata.temperature
         return ((calibrated - self._shift) / self._scale).astype(np.float32)
 
-    def _score(self, prepared: Prepared, sample: Sample) -> Scored:
-        """The logits of the candidates of a sample."""
+    def _score(self, prepared: Prepared, sample: Sample) -> Float32:
+        """The logits (E,) of the candidates of a sample."""
         assert prepared.scene is not None
         if len(sample.candidates) == 0:
-            return Scored(sample, np.empty(0, dtype=np.float32))
+            return np.empty(0, dtype=np.float32)
         with prepared.timed("description"):
             scene, candidates, network = prepared.scene, sample.candidates, self.metadata.network
             batch: Batch
@@ -384,7 +383,7 @@ class GraspDetector:
                     network.k,
                 )
         with prepared.timed("network"):
-            return Scored(sample, self.run(batch))
+            return self.run(batch)
 
 
 def _with_viewpoint(
@@ -515,12 +514,9 @@ def choose_device(name: str) -> torch.device:
     if not DEVICE_NAMES.fullmatch(name):
         raise InvalidDevice(name, "Use auto, cpu, cuda, or cuda:N for one GPU of several.")
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if name == "auto":
-        return torch.device("cuda:0" if gpus else "cpu")
-    device = torch.device(name)
-    if device.type == "cpu":
-        return device
-    number = device.index or 0
+    if name == "cpu" or (name == "auto" and not gpus):
+        return torch.device("cpu")
+    number = int(name.partition(":")[2] or 0)
     if number < gpus:
         return torch.device("cuda", number)
     if gpus:

@@ -2,8 +2,6 @@
 
 import reprlib
 from collections.abc import Iterable
-from itertools import islice
-from typing import Any
 
 from edgegrasp_camera import EdgeGraspError as EdgeGraspError
 from edgegrasp_camera import InvalidRequest as InvalidRequest
@@ -15,25 +13,10 @@ def brief(value: object) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-class _Short(reprlib.Repr):
-    def __init__(self) -> None:
-        super().__init__()
-        self.maxlevel = 8
-        self.maxdict = self.maxlist = self.maxtuple = 20  # members
-        self.maxstring = self.maxlong = self.maxother = 90  # characters
-
-    def repr_dict(self, value: dict[Any, Any], level: int) -> str:
-        """In insertion order; the base class sorts."""
-        if level <= 0:
-            return "{...}"
-        members = [
-            f"{self.repr1(name, level - 1)}: {self.repr1(part, level - 1)}"
-            for name, part in islice(value.items(), self.maxdict)
-        ]
-        return "{" + ", ".join(members + ["..."] * (len(value) > self.maxdict)) + "}"
-
-
-_SHORT = _Short()
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel = 8
+_SHORT.maxdict = _SHORT.maxlist = _SHORT.maxtuple = 20  # members
+_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 90  # characters
 
 
 class StartCollision(InvalidRequest):
