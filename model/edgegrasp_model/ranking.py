@@ -206,19 +206,18 @@ def detected_objects(
     """The scene's objects, largest first, with their best grasp or why they have no good one."""
     number, count = np.unique(scene.object_of_point[scene.object_of_point >= 0], return_counts=True)
     best = {grasp.object: grasp.score for grasp in sorted(grasps, key=lambda grasp: grasp.score)}
-    order, objects = np.argsort(-count, kind="stable"), []
-    boxes = [_upright_box(scene, scene.object_of_point == number[row]) for row in order]
-    turns = np.array([T_cloud_box[:3, :3] for T_cloud_box, _ in boxes]).reshape(-1, 3, 3)
-    quaternions = Rotation.from_matrix(turns).as_quat().astype(np.float32)
-    for row, (T_cloud_box, half), quaternion in zip(order, boxes, quaternions, strict=True):
+    objects = []
+    for row in np.argsort(-count, kind="stable"):
         which = int(number[row])
+        T_cloud_box, half = _upright_box(scene, scene.object_of_point == which)
+        turn = Rotation.from_matrix(T_cloud_box[:3, :3])
         objects.append(
             DetectedObject(
                 number=which,
                 points=int(count[row]),
                 center=T_cloud_box[:3, 3],
                 half_extents=half,
-                quaternion=quaternion,
+                quaternion=turn.as_quat().astype(np.float32),
                 best_score=best.get(which),
                 confidence=scene.confidence.get(which),
                 reason=_why_ungraspable(scene, which, 2 * half, sample, score, gripper),
