@@ -17,15 +17,7 @@ from typing import Any
 import uvicorn
 
 from edgegrasp_service.errors import AddressInUse
-from edgegrasp_service.front.connections import (
-    ACCEPTED,
-    BACKLOG,
-    HEALTH_PLACES,
-    KEEP_ALIVE_SECONDS,
-    HttpProtocol,
-    Places,
-    trim_grpc,
-)
+from edgegrasp_service.front.connections import HttpProtocol, Places, trim_grpc
 from edgegrasp_service.front.grpc import GrpcServer
 from edgegrasp_service.front.http import HttpMiddleware, create_router
 from edgegrasp_service.front.service import GraspService
@@ -37,6 +29,12 @@ from edgegrasp_service.worker.pool import Launched, WorkerPool
 from edgegrasp_service.worker.process import PIECE
 
 logger = logging.getLogger(__name__)
+
+# Connections of HTTP
+HEALTH_PLACES = 16  # beside max_connections, never held by requests to /v1/
+BACKLOG = 1024  # waiting to be accepted; beyond that a client retries after a second
+ACCEPTED = 16  # in one turn of the event loop
+KEEP_ALIVE_SECONDS = 75  # longer than clients keep theirs: no request meets a closing one
 
 NOTICE_SECONDS = 0.25  # seconds; requests that arrive this soon after a stop are still answered
 CLOSE_SECONDS = 0.5  # seconds for answers being sent, and for health watchers

@@ -29,7 +29,8 @@ from tests.programs import run
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import DeadlineError, GraspClient, InvalidRequestError
-from edgegrasp_service.front.connections import HEALTH_PLACES, PAGES
+from edgegrasp_service.front.http import PAGES
+from edgegrasp_service.server import HEALTH_PLACES
 
 from .test_stream import request
 

@@ -35,26 +35,12 @@ from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.process import PIECE
 
 # Connections of HTTP
-HEALTH_PLACES = 16  # beside max_connections, never held by requests to /v1/
-BACKLOG = 1024  # waiting to be accepted; beyond that a client retries after a second
-ACCEPTED = 16  # in one turn of the event loop
-KEEP_ALIVE_SECONDS = 75  # longer than clients keep theirs: no request meets a closing one
 LINGER_SECONDS = 5.0  # seconds for a refused client to read its answer
 MANY_PIECES, SMALL_PIECE = 1024, 16  # more chunks than this, smaller than this, are refused
 MAX_HEADERS = 64  # or entries of gRPC's metadata
-PAGES = 16  # sent at a time
-PAGE_PAUSE_SECONDS = 0.001  # seconds between the beginnings of two pages
-PAGE_GRACE_SECONDS = 10.0  # seconds after which a page yields its place to another one
-
-# Calls of gRPC
-CALLS = 100  # calls of one connection at a time; further ones wait in the client
-SMALL_READS = 8  # messages of health checks and reflection read at a time
-SMALL_READ_SECONDS = 2.0
-WATCHERS = 64  # of health
-STREAM_IDLE_SECONDS = 300.0  # for which a stream may stay open without a message
-STREAM_GRACE_SECONDS = 10.0  # seconds after which an idle stream yields its place to another one
 
 # Connections of gRPC
+CALLS = 100  # calls of one connection at a time; further ones wait in the client
 LOOKAHEAD_BYTES = 2**20  # buffered bytes of a message that is not being read yet; 87,000 points
 SPARE_BYTES = 2**20  # an excess up to this is refused with field, value and fix
 SPARE_CONNECTIONS = 4  # times max_connections are accepted before the oldest are closed

@@ -42,18 +42,7 @@ from edgegrasp_service.errors import (
     RequestTimeout,
     report,
 )
-from edgegrasp_service.front.connections import (
-    MAX_HEADERS,
-    SMALL_READ_SECONDS,
-    SMALL_READS,
-    STREAM_GRACE_SECONDS,
-    STREAM_IDLE_SECONDS,
-    WATCHERS,
-    Places,
-    grpc_bounds,
-    receive,
-    send,
-)
+from edgegrasp_service.front.connections import MAX_HEADERS, Places, grpc_bounds, receive, send
 from edgegrasp_service.front.service import GraspService
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call
 from edgegrasp_service.settings import UNIX
@@ -67,8 +56,12 @@ CHECK = f"/{HEALTH}/Check"
 STATES = health_pb2.HealthCheckResponse.ServingStatus
 REFLECTION = tuple(f"grpc.reflection.{version}.ServerReflection" for version in ("v1", "v1alpha"))
 
+SMALL_READS = 8  # messages of health checks and reflection read at a time
+SMALL_READ_SECONDS = 2.0
+WATCHERS = 64  # of health
+STREAM_IDLE_SECONDS = 300.0  # for which a stream may stay open without a message
+STREAM_GRACE_SECONDS = 10.0  # seconds after which an idle stream yields its place to another one
 MOST_STREAM_FIELDS = 16  # in a message of a stream, which has three
-
 # Number and wire type, 2 of bytes and 1 of a double, of those of a DetectGraspsStreamRequest.
 STREAM_FIELDS = {(1, 2): "request_id", (2, 2): "request", (3, 1): "timeout"}
 

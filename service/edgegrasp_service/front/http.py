@@ -36,18 +36,16 @@ from edgegrasp_service.errors import (
     report,
 )
 from edgegrasp_service.front import connections
-from edgegrasp_service.front.connections import (
-    MAX_HEADERS,
-    PAGE_GRACE_SECONDS,
-    PAGE_PAUSE_SECONDS,
-    PAGES,
-    Places,
-)
+from edgegrasp_service.front.connections import MAX_HEADERS, Places
 from edgegrasp_service.front.service import GraspService
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics
 from edgegrasp_service.worker.process import PIECE, Job, Method
 
 logger = logging.getLogger(__name__)
+
+PAGES = 16  # sent at a time
+PAGE_PAUSE_SECONDS = 0.001  # seconds between the beginnings of two pages
+PAGE_GRACE_SECONDS = 10.0  # seconds after which a page yields its place to another one
 
 ASSETS = "/docs/assets"
 PLAYGROUND = "/playground/"
