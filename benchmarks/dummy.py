@@ -87,6 +87,7 @@ class DummyDetector:
         *,
         edges: Array | None = None,
         hand_poses: Array | None = None,
+        max_voxels: int = 0,
     ) -> Scoring:
         """Random scores; an edge from a row to itself defines no grasp."""
         checked = check_cloud(cloud)

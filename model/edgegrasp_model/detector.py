@@ -116,9 +116,7 @@ class GraspDetector:
         gripper: Gripper,  # that it was trained for, used if a request names none
         device: torch.device | str = "cpu",  # where the network runs
         grippers: Mapping[str, Gripper] | None = None,  # the user's own, by name
-        max_voxels: int = MAX_VOXELS,  # most that a request's cloud may have
     ) -> None:
-        self.max_voxels = max_voxels
         self.network = network.to(device).eval()
         self.metadata = metadata
         # Whether the network scores the hand pose itself rather than the edge.
@@ -136,11 +134,10 @@ class GraspDetector:
         path: Path,
         device: torch.device | str = "cpu",
         grippers: Mapping[str, Gripper] | None = None,
-        max_voxels: int = MAX_VOXELS,
     ) -> "GraspDetector":
         """Load a checkpoint and its gripper; raises InvalidCheckpoint or InvalidGripper."""
         network, metadata = load_checkpoint(path)
-        return cls(network, metadata, load_gripper(metadata.gripper), device, grippers, max_voxels)
+        return cls(network, metadata, load_gripper(metadata.gripper), device, grippers)
 
     def detect(self, cloud: object, options: DetectOptions | None = None) -> Detection:
         """Detect grasps in a cloud; an empty list is an answer whose counts and warnings say why.
@@ -155,7 +152,7 @@ class GraspDetector:
         self,
         cloud: object,
         options: DetectOptions,
-        max_voxels: int | None = None,  # None: those of the detector
+        max_voxels: int = MAX_VOXELS,  # most that the cloud may have
         *,
         thin: bool = True,  # leave out rows and columns of large images
     ) -> Prepared:
@@ -178,14 +175,7 @@ class GraspDetector:
         if previous is not None:
             options = narrowed(options, gripper.name, sent.points)
         selected = select_points(sent, options, counts, warnings)
-        voxel_size = self.metadata.voxel_size
-        scene = build_scene(
-            selected,
-            options,
-            voxel_size,
-            counts,
-            self.max_voxels if max_voxels is None else max_voxels,
-        )
+        scene = build_scene(selected, options, self.metadata.voxel_size, counts, max_voxels)
         if scene is None:
             warnings.append(
                 "after removing the support plane, background and outliers, "
@@ -304,6 +294,7 @@ class GraspDetector:
         *,
         edges: object | None = None,  # (M, 2) rows of the cloud as sent: approach and contact point
         hand_poses: object | None = None,  # (M, 4, 4) T_cloud_hand; exactly one of the two is given
+        max_voxels: int = MAX_VOXELS,  # most that the cloud may have
     ) -> Scoring:
         """Score the caller's edges or hand poses, in order (the paper's grasp evaluation function).
 
@@ -316,7 +307,8 @@ class GraspDetector:
             raise InvalidRequest("edges", value, "Send one of the two.")
         options = options or DetectOptions()
         unused = dict.fromkeys(("approach_region", "contact_region", "num_approach_points"))
-        prepared = self.prepare(cloud, options.model_copy(update=unused), thin=False)
+        options = options.model_copy(update=unused)
+        prepared = self.prepare(cloud, options, max_voxels, thin=False)
         rows_sent = len(prepared.selected.labels)
         asked: Array = (
             check_hand_poses(hand_poses) if edges is None else check_edges(edges, rows_sent)
@@ -426,7 +418,6 @@ class ModelCatalogue:
         default: str = "",  # name to use if a request names none; empty: the best one loaded
         device: torch.device | str = "cpu",  # where the networks run
         grippers: Sequence[Path] = (),  # files that requests may name by their stem
-        max_voxels: int = MAX_VOXELS,  # most that a request's cloud may have
     ) -> Self:
         """Load the shipped weights, then the user's own; each model has the name of its file.
 
@@ -440,9 +431,7 @@ class ModelCatalogue:
             files |= {
                 file.stem: file for file in found if source != WEIGHTS_FOLDER or file.exists()
             }
-        detectors = {
-            name: GraspDetector.load(file, device, own, max_voxels) for name, file in files.items()
-        }
+        detectors = {name: GraspDetector.load(file, device, own) for name, file in files.items()}
         return cls(detectors, default)
 
     def get(self, name: str = "") -> GraspDetector:

@@ -184,9 +184,8 @@ def test_an_unknown_viewpoint_and_table_still_give_grasps_and_a_warning() -> Non
 
 
 def test_a_cloud_of_too_many_voxels_is_refused() -> None:
-    small = GraspDetector(detector().network, detector().metadata, PANDA, max_voxels=100)
     with refusal("options.workspace"):
-        small.detect(CLOUD)
+        detector().prepare(CLOUD, DetectOptions(), 100)
 
 
 def test_debug_returns_the_cloud_and_every_candidate_with_what_became_of_it() -> None:

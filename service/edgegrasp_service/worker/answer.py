@@ -42,7 +42,7 @@ def load_catalogue(settings: Settings) -> "ModelCatalogue":
 
     device = choose_device(settings.device)
     catalogue = ModelCatalogue.load(
-        settings.weights, settings.default_model, device, settings.grippers, settings.max_voxels
+        settings.weights, settings.default_model, device, settings.grippers
     )
     catalogue.warm_up()
     load_robots(settings)
@@ -113,7 +113,8 @@ class _Work:
             self.facts.grasps = len(result.grasps)
         else:
             with self._stage("score"):
-                result = detector.score(cloud, options, **given)
+                most = self.settings.max_voxels
+                result = detector.score(cloud, options, **given, max_voxels=most)
             self.facts.grasps = len(result.evaluations)
         self.facts.model = result.model
         self.facts.counts = dict(result.counts)
