@@ -124,8 +124,6 @@ class HttpMiddleware:
 
             # With an app in the scope, the router raises HTTPException for an unknown path.
             scope = {**scope, "app": self, "call": call}
-            if scope["method"] == "HEAD":  # the protocol leaves the body out
-                scope["method"] = "GET"
             try:
                 self._check(scope, call, headers)
                 async with self._page(call.client) if method == "Docs" else nullcontext():
