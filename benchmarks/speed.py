@@ -20,6 +20,7 @@ from benchmarks.measuring import RESULTS, RUNS, interleaved, machine, memory, se
 from examples.your_planner import plan
 
 from edgegrasp_cli.real_scenes import load_scenes
+from edgegrasp_model.candidates.sample import Sampler
 from edgegrasp_model.detector import ModelCatalogue
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_sim.camera import EVALUATION_VIEWS, Observation, TableView
@@ -159,7 +160,8 @@ def simulator(kind: SceneKind) -> dict[str, dict[str, float]]:
             ours = ModelCatalogue.load().get("edgegrasp-small")
             prepared = ours.prepare(observation.cloud, options)
             assert prepared.scene is not None
-            sample = ours.sampler(prepared).all()
+            hands = prepared.gripper, prepared.crop_radius, {}, ours.sees_hands
+            sample = Sampler(prepared.scene, options, *hands).all()
             poses = prepared.scene.frame.poses_in_cloud(sample.candidates.T_cloud_hand)
             begin = time.process_time()
             for pose in poses:

@@ -199,7 +199,14 @@ class GraspDetector:
         scene, scored = prepared.scene, None
         if scene is None or not scene.approach_allowed.any() or prepared.options.follows_only:
             return None
-        sampler = self.sampler(prepared)
+        sampler = Sampler(
+            scene,
+            prepared.options,
+            prepared.gripper,
+            prepared.crop_radius,
+            prepared.counts,
+            sees_hands=self.sees_hands,
+        )
         for enough in ROUNDS:
             with prepared.timed("candidates"):
                 done = NOTHING
@@ -217,18 +224,6 @@ class GraspDetector:
                 logits = np.concatenate([scored.logits, logits])
             scored = Scored(sample, logits)
         return scored
-
-    def sampler(self, prepared: Prepared) -> Sampler:
-        """The sampler of a request that has a scene."""
-        assert prepared.scene is not None
-        return Sampler(
-            prepared.scene,
-            prepared.options,
-            prepared.gripper,
-            prepared.crop_radius,
-            prepared.counts,
-            sees_hands=self.sees_hands,
-        )
 
     def run(self, batch: Batch) -> Float32:
         """The network's logits of a batch.  # (E,)."""
