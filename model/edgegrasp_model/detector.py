@@ -15,10 +15,10 @@ from scipy.special import expit
 from torch import nn
 
 from edgegrasp_camera.arrays import Array, Float32
+from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import NOTHING, Sample, Sampler
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import (
-    Batch,
     Given,
     batches,
     check_edges,
@@ -28,10 +28,8 @@ from edgegrasp_model.given import (
     from_hand_poses,
 )
 from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
-from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import check_reference_logits, load_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
-from edgegrasp_model.networks.hand import hand_batch
 from edgegrasp_model.options import Collision, DetectOptions
 from edgegrasp_model.ranking import (
     GOOD_SCORE,
@@ -218,18 +216,12 @@ class GraspDetector:
                 sample = sampler.sample(done, last_resort=enough == GOOD_SCORE)
             if sample is None:
                 continue
-            logits = self._score(prepared, sample)
+            logits = self._logits(prepared, scene, sample.candidates)
             if scored is not None:
                 sample = scored.sample.and_further(sample)
                 logits = np.concatenate([scored.logits, logits])
             scored = Scored(sample, logits)
         return scored
-
-    def run(self, batch: Batch) -> Float32:
-        """The network's logits of a batch.  # (E,)."""
-        with torch.inference_mode():
-            logits: Float32 = self.network(batch.to(self.device)).float().cpu().numpy()
-        return logits
 
     def finish(self, prepared: Prepared, scored: Scored | None) -> Detection:
         """Last stage: scores, ranking, suppression, poses."""
@@ -336,41 +328,29 @@ class GraspDetector:
         self, prepared: Prepared, scene: Scene, given: Given, request: Collision
     ) -> list[Evaluation]:
         """An evaluation of each given edge or hand pose."""
-        gripper, score = prepared.gripper, np.empty(len(given.candidates))
-        sizes = prepared.crop_radius, self.metadata.network
+        logits = self._logits(prepared, scene, given.candidates).astype(np.float64)
         with prepared.timed("network"):
-            for rows, batch in batches(scene, given.candidates, gripper, *sizes):
-                score[rows] = expit(self.run(batch).astype(np.float64) / self.metadata.temperature)
-            return evaluated(scene, given, score, gripper, request)
+            score = expit(logits / self.metadata.temperature)
+            return evaluated(scene, given, score, prepared.gripper, request)
 
     def _before_outcomes(self, logits: Float32) -> Float32:
         """Calibrated logits (E,) as they were before outcomes of a robot rescaled them."""
         calibrated = logits / self.metadata.temperature
         return ((calibrated - self._shift) / self._scale).astype(np.float32)
 
-    def _score(self, prepared: Prepared, sample: Sample) -> Float32:
-        """The logits (E,) of the candidates of a sample."""
-        assert prepared.scene is not None
-        if len(sample.candidates) == 0:
-            return np.empty(0, dtype=np.float32)
-        with prepared.timed("description"):
-            scene, candidates, network = prepared.scene, sample.candidates, self.metadata.network
-            batch: Batch
-            if self.sees_hands:
-                batch = hand_batch(scene, candidates, prepared.gripper, network)
-            else:
-                batch = BallBatch.from_cloud(
-                    scene.cloud.points,
-                    scene.cloud.normals,
-                    sample.approach_index,
-                    sample.crop,
-                    candidates.pair,
-                    candidates.approach,
-                    candidates.depth,
-                    network.k,
-                )
-        with prepared.timed("network"):
-            return self.run(batch)
+    def _logits(self, prepared: Prepared, scene: Scene, candidates: Candidates) -> Float32:
+        """The network's logits (E,) of candidates."""
+        logits = np.empty(len(candidates), np.float32)
+        sizes = prepared.crop_radius, self.metadata.network
+        parts = batches(scene, candidates, prepared.gripper, *sizes)
+        while True:
+            with prepared.timed("description"):
+                part = next(parts, None)
+            if part is None:
+                return logits
+            rows, batch = part
+            with prepared.timed("network"), torch.inference_mode():
+                logits[rows] = self.network(batch.to(self.device)).float().cpu().numpy()
 
 
 def _with_viewpoint(
