@@ -14,13 +14,12 @@ import torch
 from scipy.special import expit
 from torch import nn
 
-from edgegrasp_camera.arrays import Array, Float32
-from edgegrasp_model.candidates.edge_grasps import Candidates
+from edgegrasp_camera.arrays import Array, Float32, Int64
+from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls
 from edgegrasp_model.candidates.sample import NOTHING, Sample, Sampler
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import (
     Given,
-    batches,
     check_edges,
     check_hand_poses,
     evaluated,
@@ -28,8 +27,10 @@ from edgegrasp_model.given import (
     from_hand_poses,
 )
 from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
+from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import check_reference_logits, load_checkpoint
-from edgegrasp_model.networks.config import CheckpointMetadata
+from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
+from edgegrasp_model.networks.hand import HandBatch, hand_batch
 from edgegrasp_model.options import Collision, DetectOptions
 from edgegrasp_model.ranking import (
     GOOD_SCORE,
@@ -68,6 +69,7 @@ NO_APPROACH_POINT = (
 NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
 # Rating of a grasp from which its object gets no approach points in each round.
 ROUNDS = (1.0, SURE_SCORE, GOOD_SCORE, GOOD_SCORE)
+BALLS_AT_A_TIME = 64
 MANY_HANDS = 30  # number of training grippers from which weights suit any gripper
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 PREFERRED = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
@@ -342,7 +344,7 @@ class GraspDetector:
         """The network's logits (E,) of candidates."""
         logits = np.empty(len(candidates), np.float32)
         sizes = prepared.crop_radius, self.metadata.network
-        parts = batches(scene, candidates, prepared.gripper, *sizes)
+        parts = _batches(scene, candidates, prepared.gripper, *sizes)
         while True:
             with prepared.timed("description"):
                 part = next(parts, None)
@@ -351,6 +353,35 @@ class GraspDetector:
             rows, batch = part
             with prepared.timed("network"), torch.inference_mode():
                 logits[rows] = self.network(batch.to(self.device)).float().cpu().numpy()
+
+
+def _batches(
+    scene: Scene,
+    candidates: Candidates,  # E of them
+    gripper: Gripper,
+    crop_radius: float,  # of the balls, metres
+    network: NetworkConfig,
+) -> Iterator[tuple[Int64, BallBatch | HandBatch]]:
+    """Inputs of the network and the rows of their candidates: of hands at once, or of some balls.
+
+    There is one ball for each approach point.
+    """
+    if network.architecture == "hand":
+        yield np.arange(len(candidates)), hand_batch(scene, candidates, gripper, network)
+        return
+    points, normals = scene.cloud.points, scene.cloud.normals
+    balls = np.unique(candidates.approach_index)
+    for start in range(0, len(balls), BALLS_AT_A_TIME):
+        some = balls[start : start + BALLS_AT_A_TIME]
+        crop = crop_balls(points, some, crop_radius)
+        rows = np.flatnonzero(np.isin(candidates.approach_index, some))
+        here = candidates.take(rows)
+        size = len(points)
+        keys = crop.ball_of_point * size + crop.ball_rows  # ascending
+        ball = np.searchsorted(some, here.approach_index)
+        contact = np.searchsorted(keys, ball * size + here.contact_index).astype(np.int64)
+        edges = contact, here.approach, here.depth
+        yield rows, BallBatch.from_cloud(points, normals, some, crop, *edges, network.k)
 
 
 def _with_viewpoint(

@@ -1,6 +1,5 @@
 """Score edges and hand poses given by the caller (the paper's grasp evaluation function)."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,28 +15,20 @@ from edgegrasp_model.candidates.edge_grasps import (
     MIN_DEPTH,
     MIN_EDGE,
     Candidates,
-    crop_balls,
     edge_grasps,
     measure_edges,
     retract,
 )
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.networks.balls import BallBatch
-from edgegrasp_model.networks.config import NetworkConfig
-from edgegrasp_model.networks.hand import HandBatch, hand_batch
 from edgegrasp_model.options import MAX_CANDIDATES, Collision, are_rigid
 from edgegrasp_model.ranking import grasps_in_cloud
 from edgegrasp_model.results import NoGrasp
 from edgegrasp_model.scene.scene import Scene, object_probability
 from edgegrasp_results import Evaluation
 
-BALLS_AT_A_TIME = 64
 FIRST_TOUCH = 0.004  # metres behind the outermost point within which points count as touched first
 FLIP = np.diag(np.array([-1.0, -1.0, 1.0, 1.0], dtype=np.float32))  # the same hand, y reversed
-
-
-Batch = BallBatch | HandBatch
 
 
 @dataclass(frozen=True)
@@ -67,35 +58,6 @@ def evaluated(
     for number, grasp in zip(candidates.pair.tolist(), grasps, strict=True):
         evaluations[number] = Evaluation(grasp, None)
     return evaluations
-
-
-def batches(
-    scene: Scene,
-    candidates: Candidates,  # E of them
-    gripper: Gripper,
-    crop_radius: float,  # of the balls, metres
-    network: NetworkConfig,
-) -> Iterator[tuple[Int64, Batch]]:
-    """Inputs of the network and the rows of their candidates: of hands at once, or of some balls.
-
-    There is one ball for each approach point.
-    """
-    if network.architecture == "hand":
-        yield np.arange(len(candidates)), hand_batch(scene, candidates, gripper, network)
-        return
-    points, normals = scene.cloud.points, scene.cloud.normals
-    balls = np.unique(candidates.approach_index)
-    for start in range(0, len(balls), BALLS_AT_A_TIME):
-        some = balls[start : start + BALLS_AT_A_TIME]
-        crop = crop_balls(points, some, crop_radius)
-        rows = np.flatnonzero(np.isin(candidates.approach_index, some))
-        here = candidates.take(rows)
-        size = len(points)
-        keys = crop.ball_of_point * size + crop.ball_rows  # ascending
-        ball = np.searchsorted(some, here.approach_index)
-        contact = np.searchsorted(keys, ball * size + here.contact_index).astype(np.int64)
-        edges = contact, here.approach, here.depth
-        yield rows, BallBatch.from_cloud(points, normals, some, crop, *edges, network.k)
 
 
 def check_edges(edges: object, rows: int) -> Int64:
