@@ -15,17 +15,11 @@ from scipy.special import expit
 from torch import nn
 
 from edgegrasp_camera.arrays import Array, Float32, Int64
+from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls
 from edgegrasp_model.candidates.sample import NOTHING, Sample, Sampler
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
-from edgegrasp_model.given import (
-    Given,
-    check_edges,
-    check_hand_poses,
-    evaluated,
-    from_edges,
-    from_hand_poses,
-)
+from edgegrasp_model.given import Given, check_edges, check_hand_poses, from_edges, from_hand_poses
 from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import check_reference_logits, load_checkpoint
@@ -52,14 +46,7 @@ from edgegrasp_model.scene.scene import (
     object_probability,
     select_points,
 )
-from edgegrasp_model.tracking import (
-    Followed,
-    follow,
-    merged,
-    narrowed,
-    relabelled,
-    untracked,
-)
+from edgegrasp_model.tracking import Followed, follow, merged, narrowed, relabelled, untracked
 from edgegrasp_results import Detection, Evaluation, GripperOutline, Scoring
 
 NO_APPROACH_POINT = (
@@ -329,11 +316,20 @@ class GraspDetector:
     def _score_given(
         self, prepared: Prepared, scene: Scene, given: Given, request: Collision
     ) -> list[Evaluation]:
-        """An evaluation of each given edge or hand pose."""
-        logits = self._logits(prepared, scene, given.candidates).astype(np.float64)
+        """An evaluation of each given edge or hand pose, in order."""
+        candidates, gripper = given.candidates, prepared.gripper
+        logits = self._logits(prepared, scene, candidates).astype(np.float64)
         with prepared.timed("network"):
             score = expit(logits / self.metadata.temperature)
-            return evaluated(scene, given, score, prepared.gripper, request)
+            score *= object_probability(scene, candidates.contact_index)
+            free = ~collides(scene, candidates.T_cloud_hand, gripper, request)
+            if given.T_cloud_hand is not None:
+                candidates = replace(candidates, T_cloud_hand=given.T_cloud_hand)
+            grasps = grasps_in_cloud(scene, candidates, gripper, score, free)
+        evaluations = [Evaluation(None, reason) for reason in given.reason]
+        for number, grasp in zip(candidates.pair.tolist(), grasps, strict=True):
+            evaluations[number] = Evaluation(grasp, None)
+        return evaluations
 
     def _before_outcomes(self, logits: Float32) -> Float32:
         """Calibrated logits (E,) as they were before outcomes of a robot rescaled them."""

@@ -1,15 +1,11 @@
-"""Score edges and hand poses given by the caller (the paper's grasp evaluation function)."""
+"""Edges and hand poses given by the caller, as candidates to score."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from edgegrasp_camera.arrays import Float32, Floats, Int64
-from edgegrasp_model.candidates.collision import (
-    HandView,
-    collides,
-    hand_views,
-)
+from edgegrasp_model.candidates.collision import HandView, hand_views
 from edgegrasp_model.candidates.edge_grasps import (
     EDGE_MARGIN,
     MIN_DEPTH,
@@ -21,11 +17,9 @@ from edgegrasp_model.candidates.edge_grasps import (
 )
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.options import MAX_CANDIDATES, Collision, are_rigid
-from edgegrasp_model.ranking import grasps_in_cloud
+from edgegrasp_model.options import MAX_CANDIDATES, are_rigid
 from edgegrasp_model.results import NoGrasp
-from edgegrasp_model.scene.scene import Scene, object_probability
-from edgegrasp_results import Evaluation
+from edgegrasp_model.scene.scene import Scene
 
 FIRST_TOUCH = 0.004  # metres behind the outermost point within which points count as touched first
 FLIP = np.diag(np.array([-1.0, -1.0, 1.0, 1.0], dtype=np.float32))  # the same hand, y reversed
@@ -38,26 +32,6 @@ class Given:
     candidates: Candidates  # E of them; `pair` ascends and says which of the M each is
     reason: list[NoGrasp | None]  # M: why it defines no edge grasp
     T_cloud_hand: Float32 | None = None  # (E, 4, 4) as given, canonical frame
-
-
-def evaluated(
-    scene: Scene,
-    given: Given,  # edges or hand poses as candidates
-    score: Floats,  # (E,) probabilities of the candidates
-    gripper: Gripper,
-    request: Collision,
-) -> list[Evaluation]:
-    """An evaluation of each given edge or pose, in order."""
-    candidates = given.candidates
-    score = score * object_probability(scene, candidates.contact_index)
-    free = ~collides(scene, candidates.T_cloud_hand, gripper, request)
-    if given.T_cloud_hand is not None:
-        candidates = replace(candidates, T_cloud_hand=given.T_cloud_hand)
-    grasps = grasps_in_cloud(scene, candidates, gripper, score, free)
-    evaluations = [Evaluation(None, reason) for reason in given.reason]
-    for number, grasp in zip(candidates.pair.tolist(), grasps, strict=True):
-        evaluations[number] = Evaluation(grasp, None)
-    return evaluations
 
 
 def check_edges(edges: object, rows: int) -> Int64:
