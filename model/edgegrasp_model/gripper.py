@@ -124,7 +124,12 @@ def gripper_from_fields(fields: Mapping[str, Any] | GripperGeometry) -> Gripper:
     try:
         geometry = GripperGeometry.model_validate(fields)
     except ValidationError as error:
-        raise InvalidGripper(f"gripper{_first_fault(error)}; see grippers/panda.toml.") from None
+        first = error.errors(include_url=False)[0]
+        fault, path = first["msg"].removeprefix("Value error, "), first["loc"]
+        if path and first["type"] not in ("missing", "extra_forbidden"):
+            fault = f"got {repr(first['input'])[:80]}. {fault}"
+        field = ".".join(map(str, ("gripper", *path)))
+        raise InvalidGripper(f"{field}: {fault}; see grippers/panda.toml.") from None
     palm_z, pad = geometry.palm_z, geometry.pad
     assert palm_z is not None
     assert pad is not None
@@ -167,15 +172,6 @@ def gripper_fields(name_or_path: str | Path) -> dict[str, Any]:
 def gripper_names() -> list[str]:
     """Names of the grippers that ship with the package, sorted."""
     return sorted(file.stem for file in GRIPPER_FOLDER.glob("*.toml"))
-
-
-def _first_fault(error: ValidationError) -> str:
-    first = error.errors(include_url=False)[0]
-    path = "".join(f".{part}" for part in first["loc"])
-    message = first["msg"].removeprefix("Value error, ")
-    if first["type"] in ("missing", "extra_forbidden") or not path:
-        return f"{path}: {message}"
-    return f"{path}: got {repr(first['input'])[:80]}. {message}"
 
 
 def choose_gripper(options: DetectOptions, default: Gripper, own: Mapping[str, Gripper]) -> Gripper:
