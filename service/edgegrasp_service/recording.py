@@ -10,9 +10,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
-import orjson
 from pydantic import BaseModel, ConfigDict, Field
 
 from edgegrasp_service.errors import DiskFull, InvalidSettings, PayloadTooLarge
@@ -93,20 +91,6 @@ class TriedGrasp(BaseModel):
     score: float = Field(ge=0.0, le=1.0, description="as it was answered")
     held: bool = Field(description="whether it held")
     request_id: str = Field("", max_length=200, description="of the request that found it")
-
-
-def append_outcome(tried: TriedGrasp, catalogue: Any, path: Path) -> None:
-    """Append a grasp and the digest of its weights.
-
-    Raises:
-        UnknownModel: There are no such weights.
-        PayloadTooLarge: The file is full.
-        DiskFull: The disk is, or the file cannot be written.
-    """
-    catalogue.get(tried.model)
-    digest = {row["name"]: row["digest"] for row in catalogue.describe()}[tried.model]
-    line = tried.model_dump() | {"digest": digest, "time": datetime.now(UTC).isoformat()}
-    append_line(path, orjson.dumps(line) + b"\n")
 
 
 def append_line(path: Path, line: bytes) -> None:

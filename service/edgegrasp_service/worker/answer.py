@@ -9,9 +9,11 @@ import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import orjson
 
 from edgegrasp_camera.arrays import Array
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
@@ -123,13 +125,19 @@ class _Work:
         return body
 
     def _record_outcome(self) -> None:
+        """Append a tried grasp, the digest of its weights and the time to the outcomes' file."""
         kind, path = self.job.content_type, self.settings.outcomes_file
         if not kind.lower().startswith(http_bodies.JSON):  # foreign web pages cannot send it
             fix = f"Send {http_bodies.JSON}."
             raise UnsupportedMediaType("Content-Type", repr(kind[:40]), fix)
         assert path is not None
         fields = http_bodies.read_json("body", self.job.body)
-        recording.append_outcome(parse(recording.TriedGrasp, fields, "body"), self.catalogue, path)
+        tried = parse(recording.TriedGrasp, fields, "body")
+        self.catalogue.get(tried.model)  # raises UnknownModel
+        digests = {row["name"]: row["digest"] for row in self.catalogue.describe()}
+        line = tried.model_dump() | {"digest": digests[tried.model]}
+        line["time"] = datetime.now(UTC).isoformat()
+        recording.append_line(path, orjson.dumps(line) + b"\n")
 
     def _detect(self, detector: Any, cloud: CloudInput, options: DetectOptions) -> Detection:
         """Detect, and plan an arm's motions where the request names a robot."""
