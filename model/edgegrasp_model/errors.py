@@ -23,15 +23,12 @@ class StartCollision(InvalidRequest):
     """In the request's joints the arm touches itself or the scene."""
 
 
-class UnknownModel(EdgeGraspError):  # noqa: N818
+class UnknownModel(InvalidRequest):
     """No weights of that name are loaded."""
 
     def __init__(self, name: str, known: Iterable[str]) -> None:
-        self.name = name
-        self.known = sorted(known)
-        super().__init__(
-            f"model: got {brief(name)}. Use one of: {', '.join(self.known) or 'none loaded'}."
-        )
+        fix = f"Use one of: {', '.join(sorted(known))}."
+        super().__init__("options.model", brief(name), fix)
 
 
 class InvalidCheckpoint(EdgeGraspError):  # noqa: N818

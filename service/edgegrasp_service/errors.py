@@ -7,13 +7,7 @@ import orjson
 
 from edgegrasp_camera import PayloadTooLarge as PayloadTooLarge
 from edgegrasp_camera import UnsupportedMediaType as UnsupportedMediaType
-from edgegrasp_model.errors import (
-    EdgeGraspError,
-    InvalidRequest,
-    StartCollision,
-    UnknownModel,
-    brief,
-)
+from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, StartCollision, UnknownModel
 
 STOPPING = "The server is stopping. Try another one."  # the message of a NotReady
 
@@ -133,12 +127,8 @@ def report(error: Exception) -> Problem:
         error = DetectorFailed("The server failed; its log says why.")
     code, status = STATUS[type(error)]
     field, value, fix = "", "", ""
-    if isinstance(error, UnknownModel):
-        field, value = "options.model", brief(error.name)
-        fix = f"Use one of: {', '.join(error.known)}."
-    elif isinstance(error, InvalidRequest):
-        field, value, fix = error.field, error.value, error.fix
-    field, value = _sendable(field), _sendable(value)
+    if isinstance(error, InvalidRequest):
+        field, value, fix = _sendable(error.field), _sendable(error.value), error.fix
     detail = f"{field}: got {value}. {fix}" if field else str(error)
     retry_after = error.retry_after if isinstance(error, Overloaded) else None
     kind = kind_of(type(error))
