@@ -502,16 +502,17 @@ def choose_device(name: str) -> torch.device:
     Raises:
         InvalidDevice: It is no device's name, or there is no such device here.
     """
-    if not DEVICE_NAMES.fullmatch(name):
-        raise InvalidDevice(name, "Use auto, cpu, cuda, or cuda:N for one GPU of several.")
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if name == "cpu" or (name == "auto" and not gpus):
+    if not DEVICE_NAMES.fullmatch(name):
+        fix = "Use auto, cpu, cuda, or cuda:N for one GPU of several."
+    elif name == "cpu" or (name == "auto" and not gpus):
         return torch.device("cpu")
-    number = int(name.partition(":")[2] or 0)
-    if number < gpus:
+    elif (number := int(name.partition(":")[2] or 0)) < gpus:
         return torch.device("cuda", number)
-    if gpus:
+    elif gpus:
         here = "cuda:0" if gpus == 1 else f"cuda:0 to cuda:{gpus - 1}"
-        raise InvalidDevice(name, f"PyTorch sees {here} here: use one of them, auto or cpu.")
-    built = "sees no GPU" if torch.version.cuda else "is built without CUDA"
-    raise InvalidDevice(name, f"PyTorch {torch.__version__} {built} here: use cpu or auto.")
+        fix = f"PyTorch sees {here} here: use one of them, auto or cpu."
+    else:
+        built = "sees no GPU" if torch.version.cuda else "is built without CUDA"
+        fix = f"PyTorch {torch.__version__} {built} here: use cpu or auto."
+    raise InvalidDevice("device", repr(name), fix)

@@ -39,8 +39,5 @@ class InvalidGripper(EdgeGraspError):  # noqa: N818
     """A gripper file cannot be used."""
 
 
-class InvalidDevice(EdgeGraspError):  # noqa: N818
-    """The requested device does not exist; `fix` is an imperative sentence."""
-
-    def __init__(self, name: str, fix: str) -> None:
-        super().__init__(f"device: got {brief(name)}. {fix}")
+class InvalidDevice(InvalidRequest):
+    """The device to compute on does not exist."""
