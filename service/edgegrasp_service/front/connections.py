@@ -265,7 +265,9 @@ class HttpProtocol(HttpToolsProtocol):
         self._refuse(self._refusal or InvalidRequest("request", "malformed HTTP", fix))
 
     def _refuse(self, error: EdgeGraspError) -> None:
-        """Send an error without the application, and close."""
+        """Send an error without the application, and close; no more if it is closing."""
+        if self.transport.is_closing():
+            return
         pending = self.cycle is not None and not self.cycle.response_complete
         if pending and self.cycle.response_started:
             self.transport.abort()  # it has half an answer
@@ -287,12 +289,8 @@ class HttpProtocol(HttpToolsProtocol):
         self._in_headers = True
         if self._header_timer is None:
             seconds = self._settings.read_seconds
-            self._header_timer = self.loop.call_later(seconds, self._headers_late)
-
-    def _headers_late(self) -> None:
-        if not self.transport.is_closing():
-            value = f"not whole in {self._settings.read_seconds:g} s"
-            self._refuse(RequestTimeout("headers", value, "Send them at once."))
+            late = RequestTimeout("headers", f"not whole in {seconds:g} s", "Send them at once.")
+            self._header_timer = self.loop.call_later(seconds, self._refuse, late)
 
 
 @dataclass
