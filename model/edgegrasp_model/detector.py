@@ -430,9 +430,7 @@ class ModelCatalogue:
         files: dict[str, Path] = {}
         for source in (WEIGHTS_FOLDER, *weights):
             found = sorted(source.glob("*.safetensors")) if source.is_dir() else [source]
-            files |= {
-                file.stem: file for file in found if source != WEIGHTS_FOLDER or file.exists()
-            }
+            files |= {file.stem: file for file in found}
         detectors = {name: GraspDetector.load(file, device, own) for name, file in files.items()}
         return cls(detectors, default)
 
