@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edgegrasp_camera.arrays import Bools, Float32, Floats, Int64
+from edgegrasp_camera.arrays import Bools, Float32, Int64
 from edgegrasp_model.candidates.collision import APPROACH_LENGTH, NEAR, HandView
 from edgegrasp_model.candidates.edge_grasps import Candidates, support_clearance
 from edgegrasp_model.gripper import Gripper
@@ -141,13 +141,6 @@ def points_around_fingers(
 def seen_part(gripper: Gripper) -> Gripper:
     """The hand with a palm at most SEEN_LENGTH behind its tips, as if its fingers were short."""
     return replace(gripper, palm_z=max(gripper.palm_z, gripper.tip_z - SEEN_LENGTH))
-
-
-def without_support(description: Floats) -> Floats:
-    """The description (E, F) of the same hands without a known support plane."""
-    unknown = description.copy()
-    unknown[:, HEIGHTS] = UNKNOWN_HEIGHT
-    return unknown
 
 
 class _Seen(NamedTuple):

@@ -17,7 +17,7 @@ from torch import Tensor
 from edgegrasp_camera.arrays import Float32, Int64
 from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls, edge_grasps, retract
 from edgegrasp_model.candidates.outline import outline_grasps, outlines
-from edgegrasp_model.hand_description import Surroundings, without_support
+from edgegrasp_model.hand_description import HEIGHTS, UNKNOWN_HEIGHT, Surroundings
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.networks.config import NetworkConfig
@@ -51,7 +51,8 @@ class TriedGrasps:
         """The same grasps, described as for a request without a support plane."""
         if self.seen is None:
             return self
-        unknown = torch.from_numpy(without_support(self.seen.description.numpy())).half()
+        unknown = self.seen.description.clone()
+        unknown[:, HEIGHTS] = UNKNOWN_HEIGHT
         return replace(self, seen=replace(self.seen, description=unknown))
 
     def balls(self) -> Int64:
