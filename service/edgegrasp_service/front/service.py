@@ -65,7 +65,6 @@ class GraspService:
         self._deaths: dict[bytes, tuple[float, int]] = {}
         self._reloads = metrics.reloads
         self._reloading = asyncio.Lock()
-        self._tasks: set[asyncio.Task[Any]] = set()
 
     @property
     def ready(self) -> bool:
@@ -202,9 +201,7 @@ class GraspService:
             except EdgeGraspError as error:
                 logger.warning("SIGHUP: %s", error)
 
-        task = asyncio.get_running_loop().create_task(reload())
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self.pool.spawn(reload())
 
     async def reload(self, call: Call | None = None) -> list[dict[str, Any]]:
         """Reload weights, tokens and certificates; the old ones stay in use meanwhile.

@@ -126,10 +126,10 @@ class WorkerPool:
         self.models, self.robots = workers[0].ready.models, workers[0].ready.robots
         nursery.watch(lambda: self._nursery_lost(nursery))
         for worker in workers:
-            self._spawn(self._tend(worker))
+            self.spawn(self._tend(worker))
         self._answered = time.monotonic()
         if old_nursery is None:
-            self._spawn(self._beat())
+            self.spawn(self._beat())
         else:
             old_nursery.close()
         for worker in old_workers:
@@ -142,6 +142,12 @@ class WorkerPool:
             worker = await self._idle.get()
             if worker in self._workers:  # and not dead
                 return worker
+
+    def spawn(self, work: Any) -> None:
+        """Run a coroutine beside the requests, until it ends or the pool is closed."""
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     def close(self) -> None:
         """Kill every worker."""
@@ -205,7 +211,7 @@ class WorkerPool:
             raise
         if nursery is self._nursery:
             self._workers.add(worker)
-        self._spawn(self._tend(worker))
+        self.spawn(self._tend(worker))
 
     async def _until_done(self, nursery: "_Nursery", start: Callable[[], Awaitable[None]]) -> None:
         """Retry a start until it succeeds or there is a newer nursery."""
@@ -219,12 +225,7 @@ class WorkerPool:
     def _nursery_lost(self, nursery: "_Nursery") -> None:
         """Load the weights again in a new nursery; the workers continue meanwhile."""
         logger.error("the process that workers fork from died; weights are loaded again")
-        self._spawn(self._until_done(nursery, self.start))
-
-    def _spawn(self, work: Any) -> None:
-        task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self.spawn(self._until_done(nursery, self.start))
 
 
 class _Nursery:
