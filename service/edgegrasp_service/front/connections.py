@@ -289,8 +289,10 @@ class HttpProtocol(HttpToolsProtocol):
         self._in_headers = True
         if self._header_timer is None:
             seconds = self._settings.read_seconds
-            late = RequestTimeout("headers", f"not whole in {seconds:g} s", "Send them at once.")
-            self._header_timer = self.loop.call_later(seconds, self._refuse, late)
+            late = "headers", f"not whole in {seconds:g} s", "Send them at once."
+            self._header_timer = self.loop.call_later(
+                seconds, lambda: self._refuse(RequestTimeout(*late))
+            )
 
 
 @dataclass
