@@ -6,7 +6,7 @@ made from these models; the gRPC messages have the same fields, which a test com
 
 import base64
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
@@ -21,14 +21,12 @@ from pydantic import (
     PlainSerializer,
     StrictBool,
     Tag,
-    ValidationError,
     model_validator,
 )
 
-from edgegrasp_model.errors import InvalidRequest, brief
+from edgegrasp_model.errors import parse
 
 Pose = TypeVar("Pose", bound=tuple[Any, ...])
-Schema = TypeVar("Schema", bound=BaseModel)
 
 FARTHEST = 1e7  # metres from the origin, any way: beyond every place on Earth
 
@@ -763,44 +761,3 @@ class DetectOptions(Strict):
 def parse_options(fields: object) -> DetectOptions:
     """Build options from decoded JSON; raises InvalidRequest, which names the field."""
     return parse(DetectOptions, fields, "options", DetectOptions.model_fields)
-
-
-def parse(schema: type[Schema], fields: object, name: str, known: Iterable[str] = ()) -> Schema:
-    """Check plain values against a schema.
-
-    Raises InvalidRequest for the first fault, whose field is under `name`; where a top-level one is
-    unknown, `known` are listed.
-    """
-    try:
-        return schema.model_validate(fields)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-    kind, fix = first["type"], first["msg"].removeprefix("Value error, ")
-    path = _path(first["loc"], fields, kind in ("missing", "extra_forbidden"))
-    field = ".".join([name, *path])
-    if kind == "extra_forbidden":
-        there = f"; the {name} are: {', '.join(known)}" if len(path) == 1 and known else ""
-        raise InvalidRequest(field, "an unknown field", f"Remove it{there}.")
-    value = "nothing" if kind == "missing" else brief(first["input"])
-    if value.startswith(("'", "b'")) and field.endswith(".data"):
-        raise InvalidRequest(field, "no base64", "Send base64 in JSON.")
-    if kind == "union_tag_invalid":
-        fix = f"Set its kind to one of {first['ctx']['expected_tags']}"
-    if kind == "union_tag_not_found":
-        fix = "Send an object that names its kind"
-    raise InvalidRequest(field, value, f"{fix[:1].upper()}{fix[1:]}.")
-
-
-def _path(location: Sequence[str | int], fields: object, named: bool) -> list[str]:
-    """A location without names of unions' members; `named`: the last part is a field's name."""
-    path: list[str] = []
-    here: Any = fields
-    for place, part in enumerate(location):
-        if isinstance(part, int):
-            here = here[part] if isinstance(here, (list, tuple)) and part < len(here) else None
-        elif isinstance(here, Mapping) and part in here:
-            here = here[part]
-        elif not (named and place == len(location) - 1):
-            continue
-        path.append(str(part))
-    return path

@@ -19,7 +19,7 @@ from edgegrasp_camera.arrays import Array
 from edgegrasp_camera.clouds import CloudInput, read_point_cloud2, too_many
 from edgegrasp_camera.depth import ENCODINGS, fuse_depth_images, intrinsics_of
 from edgegrasp_camera.files import read_file, read_npy, read_png
-from edgegrasp_model.errors import InvalidRequest, brief
+from edgegrasp_model.errors import InvalidRequest, brief, parse
 from edgegrasp_model.options import (
     FARTHEST,
     MAX_VIEWS,
@@ -28,7 +28,6 @@ from edgegrasp_model.options import (
     Integer,
     Strict,
     numeric,
-    parse,
     rigid,
 )
 

@@ -16,8 +16,8 @@ import numpy as np
 import orjson
 
 from edgegrasp_camera.arrays import Array
-from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
-from edgegrasp_model.options import DetectOptions, parse, parse_options
+from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, parse
+from edgegrasp_model.options import DetectOptions, parse_options
 from edgegrasp_model.request_cloud import GIVEN, decode_array, decode_cloud
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Detection
