@@ -47,9 +47,7 @@ APPROACH_STREAM, CANDIDATE_STREAM = 0, 1  # random streams of one request
 class Sample:
     """Candidates to score, around some approach points; canonical frame."""
 
-    approach_index: Int64  # (A,) rows of the cloud
-    crop: BallCrop
-    candidates: Candidates  # E of them; `pair` is their contact's row in `crop`
+    candidates: Candidates  # E of them
     collision_free: Bools  # (E,)
     drawn: Candidates  # all of them, C
     outcome: NDArray[np.int8]  # (C,) CODE of each one's outcome; RETURNED: it is to be scored
@@ -57,21 +55,10 @@ class Sample:
 
     def and_further(self, other: "Sample") -> "Sample":
         """This sample joined with a later one."""
-        ball = other.crop.ball_of_point + len(self.approach_index)
-        crop = BallCrop(
-            np.concatenate([self.crop.ball_rows, other.crop.ball_rows]),
-            np.concatenate([self.crop.ball_of_point, ball]),
-        )
-        further, drawn = (
-            replace(candidates, pair=candidates.pair + len(self.crop.ball_rows))
-            for candidates in (other.candidates, other.drawn)
-        )
         return Sample(
-            np.concatenate([self.approach_index, other.approach_index]),
-            crop,
-            Candidates.concatenate([self.candidates, further]),
+            Candidates.concatenate([self.candidates, other.candidates]),
             np.concatenate([self.collision_free, other.collision_free]),
-            Candidates.concatenate([self.drawn, drawn]),
+            Candidates.concatenate([self.drawn, other.drawn]),
             np.concatenate([self.outcome, other.outcome]),
             np.concatenate([self.row, other.row + len(self.drawn)]),
         )
@@ -136,7 +123,7 @@ class Sampler:
         row, free = row[scored], free[scored]
         outcome[row] = CODE[Outcome.RETURNED]
         self._count("scored", len(row))
-        return Sample(approach_index, crop, drawn.take(row), free, drawn, outcome, row)
+        return Sample(drawn.take(row), free, drawn, outcome, row)
 
     def _constrained(
         self, approach_index: Int64, crop: BallCrop, *, last_resort: bool
