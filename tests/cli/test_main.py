@@ -142,8 +142,7 @@ def test_a_scene_is_viewed_until_ctrl_c(tmp_path: Path) -> None:
     color.parent.mkdir()
     np.save(depth, np.full((4, 6), 500, np.uint16))
     np.save(color, np.full((4, 6, 3), 90, np.uint8))
-    camera = ("--intrinsics", "30,30,3,2")
-    flags = ("--depth", depth, "--color", color, *camera, "--no-browser")
+    flags = ("--depth", depth, "--color", color, "--intrinsics", "30,30,3,2", "--no-browser")
     with started(*EDGEGRASP, "view", *flags) as viewer:
         assert viewer.stdout is not None
         address = viewer.stdout.readline().split()[0]

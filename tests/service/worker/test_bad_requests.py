@@ -86,12 +86,6 @@ def shape(**fields: Any) -> dict[str, Any]:
     return {"include": [fields]}
 
 
-def spoiled(row: int, value: float) -> np.ndarray:
-    cloud = POINTS.copy()
-    cloud[row, 0] = value
-    return cloud
-
-
 POSE = np.eye(4).ravel().tolist()
 HELD = {"id": 7, "T_cloud_hand": POSE}
 
@@ -103,7 +97,7 @@ def previous(**fields: Any) -> dict[str, Any]:
 CASES = {
     # The cloud.
     "no cloud": Malformed("", "nothing", "Se"),
-    "NaN": Malformed("cloud", "row 17", "finite", points=spoiled(17, NAN)),
+    "NaN": Malformed("cloud", "row 17", "finite", points=np.insert(POINTS, 17, NAN, axis=0)),
     # PointCloud2.
     "PointCloud2 of integers": Malformed(
         "point_cloud2.fields", "z of type 5", "float32",
