@@ -21,7 +21,14 @@ from typing import Any, Concatenate, ParamSpec
 from typing_extensions import Self, Unpack
 
 from edgegrasp_camera.arrays import Array
-from edgegrasp_client.connection import DEFAULT_ADDRESS, RETRIES, Tls, is_rest, retry_delay
+from edgegrasp_client.connection import (
+    DEFAULT_ADDRESS,
+    RETRIES,
+    Tls,
+    is_rest,
+    retry_delay,
+    seconds_of,
+)
 from edgegrasp_client.errors import DeadlineError, ServerUnavailableError, WorkerLostError, invalid
 from edgegrasp_client.over_grpc import GrpcTransport
 from edgegrasp_client.over_rest import RestTransport
@@ -65,7 +72,7 @@ class AsyncGraspClient:
         token: str | None = None,
         tls: Tls | None = None,
     ) -> None:
-        self._timeout = timeout
+        self._timeout = seconds_of(timeout)
         self._retry = retry
         kind: type[GrpcTransport | RestTransport]
         kind = RestTransport if is_rest(address) else GrpcTransport
@@ -157,7 +164,7 @@ class AsyncGraspClient:
 
     async def wait_until_ready(self, timeout: float = 60.0) -> None:
         """Wait until the server can answer; raises DeadlineError after `timeout` seconds."""
-        end = time.monotonic() + timeout
+        end = time.monotonic() + seconds_of(timeout)
         while not await self.ready(timeout=max(POLL_SECONDS, end - time.monotonic())):
             if time.monotonic() >= end:
                 raise DeadlineError(f"The server was not ready within {timeout:g} s.")
@@ -175,7 +182,7 @@ class AsyncGraspClient:
         await self.close()
 
     def _seconds(self, timeout: float | None) -> float:
-        return self._timeout if timeout is None else timeout
+        return self._timeout if timeout is None else seconds_of(timeout)
 
     async def _retried(
         self, call: Callable[[float], Awaitable[Answer]], timeout: float | None

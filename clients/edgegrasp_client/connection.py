@@ -1,5 +1,6 @@
 """Addresses, TLS, tokens and retries of a client; and a local server."""
 
+import math
 import random
 import subprocess
 import sysconfig
@@ -17,6 +18,7 @@ HTTP_OVER_UNIX = "http+unix:"
 RETRIES = 4  # attempts for a server that is away; a busy one is retried until the timeout
 FIRST_DELAY, LONGEST_DELAY = 0.1, 2.0  # seconds; each is twice the one before
 STOP_SECONDS = 15.0  # for a local server to drain
+LONGEST_TIMEOUT = 1e6  # seconds; gRPC cannot count much longer ones
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,17 @@ class Tls:
 def is_rest(address: str) -> bool:
     """Whether an address names the REST transport."""
     return address.startswith(("http://", "https://", HTTP_OVER_UNIX))
+
+
+def seconds_of(timeout: float) -> float:
+    """A timeout, cut to LONGEST_TIMEOUT; raises InvalidRequestError for what is no number."""
+    try:
+        seconds = float(timeout)
+    except (TypeError, ValueError):
+        seconds = math.nan
+    if math.isnan(seconds):
+        raise invalid("timeout", repr(timeout), "Give seconds.")
+    return min(seconds, LONGEST_TIMEOUT)
 
 
 def retry_delay(error: ServerUnavailableError, attempt: int) -> float | None:

@@ -19,6 +19,7 @@ from edgegrasp_camera.arrays import Array, Float32
 from edgegrasp_camera.clouds import PointCloud2
 from edgegrasp_camera.depth import ENCODINGS, intrinsics_of
 from edgegrasp_camera.files import FILE_FORMATS
+from edgegrasp_client.connection import seconds_of
 from edgegrasp_client.errors import invalid
 from edgegrasp_client.options import DetectOptions
 
@@ -121,7 +122,7 @@ class StreamRequest:
     ) -> None:
         self.request = Request(cloud, fields)
         self.request_id = request_id
-        self.timeout = timeout
+        self.timeout = None if timeout is None else seconds_of(timeout)
 
 
 def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:

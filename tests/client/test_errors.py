@@ -260,6 +260,17 @@ def test_a_deadline_ends_a_call_or_one_request_of_a_stream(start_dummy, make_cli
             assert patient.error is None
 
 
+def test_a_timeout_may_be_endless_but_is_a_number(client, cloud) -> None:
+    endless = float("inf")
+    (answer,) = client.detect_stream([StreamRequest(cloud, timeout=endless)], timeout=endless)
+    assert answer.result().grasps
+    assert client.detect(cloud, timeout=endless).grasps
+    assert client.ready(timeout=endless)
+    for call in (client.detect, StreamRequest):
+        with pytest.raises(InvalidRequestError, match="timeout: got nan"):
+            call(cloud, timeout=float("nan"))
+
+
 @pytest.mark.parametrize("size", [4_200_000, 9_000_000])  # the latter is over what gRPC reads
 def test_a_cloud_that_is_too_large_is_refused(size: int, client) -> None:
     with pytest.raises(PayloadTooLargeError):
