@@ -14,7 +14,7 @@ from collections.abc import (
     Iterable,
     Iterator,
 )
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from functools import partial, wraps
 from typing import Any, Concatenate, ParamSpec
 
@@ -29,7 +29,13 @@ from edgegrasp_client.connection import (
     retry_delay,
     seconds_of,
 )
-from edgegrasp_client.errors import DeadlineError, ServerUnavailableError, WorkerLostError, invalid
+from edgegrasp_client.errors import (
+    DeadlineError,
+    GraspClientError,
+    ServerUnavailableError,
+    WorkerLostError,
+    invalid,
+)
 from edgegrasp_client.over_grpc import GrpcTransport
 from edgegrasp_client.over_rest import RestTransport
 from edgegrasp_client.requests import Cloud, Request, RequestFields, StreamRequest
@@ -37,6 +43,7 @@ from edgegrasp_client.results import Answer, Model, Robot, StreamAnswer
 from edgegrasp_results import Detection, Grasp, Scoring
 
 POLL_SECONDS = 0.1
+CLOSED = "This client is closed. Make a new one."
 
 Parameters = ParamSpec("Parameters")
 
@@ -73,7 +80,7 @@ class AsyncGraspClient:
         tls: Tls | None = None,
     ) -> None:
         self._timeout = seconds_of(timeout)
-        self._retry = retry
+        self._retry, self._closed = retry, False
         kind: type[GrpcTransport | RestTransport]
         kind = RestTransport if is_rest(address) else GrpcTransport
         self._transport = kind(address, token, tls)
@@ -172,7 +179,7 @@ class AsyncGraspClient:
 
     async def close(self) -> None:
         """Close the connection."""
-        self._retry = False  # calls cancelled here have no connection to retry on
+        self._retry, self._closed = False, True
         await self._transport.close()
 
     async def __aenter__(self) -> Self:
@@ -182,6 +189,9 @@ class AsyncGraspClient:
         await self.close()
 
     def _seconds(self, timeout: float | None) -> float:
+        """The timeout of a call; raises GraspClientError if it cannot be made any more."""
+        if self._closed:
+            raise GraspClientError(CLOSED)
         return self._timeout if timeout is None else seconds_of(timeout)
 
     async def _retried(
@@ -201,7 +211,7 @@ class AsyncGraspClient:
                 # The request itself may have killed the worker, so it is retried only once.
                 attempt += RETRIES if isinstance(error, WorkerLostError) else 1
             await asyncio.sleep(delay)
-            left = max(end - time.monotonic(), 0.0)
+            left = self._seconds(max(end - time.monotonic(), 0.0))
 
 
 async def _named(
@@ -300,6 +310,8 @@ def _run(work: Coroutine[Any, Any, Answer]) -> Answer:
     running = asyncio.run_coroutine_threadsafe(work, _loop())
     try:
         return running.result()
+    except CancelledError:  # by close() in another thread
+        raise GraspClientError(CLOSED) from None
     except BaseException:
         running.cancel()
         raise

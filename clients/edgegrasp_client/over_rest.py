@@ -96,7 +96,7 @@ class RestTransport:
             response = await self._http.request(**call | {"headers": headers}, timeout=timeout)
         except httpx.TimeoutException as error:
             raise errors.DeadlineError(f"No answer in time ({type(error).__name__}).") from None
-        except httpx.HTTPError as error:
+        except (httpx.HTTPError, RuntimeError) as error:  # the latter of a closed client
             why = f"No connection: {error or type(error).__name__}"
             raise errors.ServerUnavailableError(why) from None
         try:

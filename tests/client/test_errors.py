@@ -260,6 +260,19 @@ def test_a_deadline_ends_a_call_or_one_request_of_a_stream(start_dummy, make_cli
             assert patient.error is None
 
 
+def test_a_closed_client_says_so(client, cloud) -> None:
+    begun = client.detect_stream(itertools.repeat(StreamRequest(cloud)))
+    next(begun)
+    client.close()
+    with pytest.raises(GraspClientError, match="closed"):
+        all(answer.result() for answer in begun)
+    stream = client.detect_stream([StreamRequest(cloud)])
+    for call in (client.models, client.ready, client.wait_until_ready, lambda: next(stream)):
+        with pytest.raises(GraspClientError, match="closed"):
+            call()
+    client.close()
+
+
 def test_a_timeout_may_be_endless_but_is_a_number(client, cloud) -> None:
     endless = float("inf")
     (answer,) = client.detect_stream([StreamRequest(cloud, timeout=endless)], timeout=endless)
