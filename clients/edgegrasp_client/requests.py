@@ -290,7 +290,8 @@ def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
         raise invalid(f"{path}.intrinsics", repr(image["intrinsics"])[:80], fix) from None
     fields = {"depth": depth, "intrinsics": intrinsics}
     fields["T_cloud_camera"] = pose.astype(float).tolist()
-    return fields | ({"depth_scale": image["depth_scale"]} if "depth_scale" in image else {})
+    scale = _plain(image.get("depth_scale"))
+    return fields if scale is None else fields | {"depth_scale": scale}
 
 
 def _depth_fields(depth: object, path: str) -> dict[str, Any]:

@@ -80,7 +80,8 @@ def test_depth_files_are_read_with_their_scale(client, tmp_path) -> None:
     np.save(tmp_path / "depth.npy", tenths[..., None])
     np.save(tmp_path / "metres.npy", (tenths / 10000).astype(np.float32))
     expected = contacts(client.detect(depth_images=[depth_image(depth=tenths / 10000)]))
-    for name, scale in (("depth.png", 0.0001), ("depth.npy", 0.0001), ("metres.npy", 1.0)):
+    one = np.float32(1)
+    for name, scale in (("depth.png", 0.0001), ("depth.npy", 0.0001), ("metres.npy", one)):
         image = depth_image(depth=tmp_path / name, depth_scale=scale)
         found = contacts(client.detect(depth_images=[image]))
         np.testing.assert_allclose(found, expected, atol=1e-6)
