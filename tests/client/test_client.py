@@ -70,7 +70,7 @@ ALL_OPTIONS: dict[str, Any] = MANY | {
     },
     "num_approach_points": np.int64(12),
     "viewpoint": np.array([0.1, 0.2, 0.7], np.float32),
-    "objects": {"include": np.array([0, 2]), "exclude": (1,)},
+    "objects": {"include": np.array([0, 2]), "exclude": range(1, 2)},
     "at": (3, 4.5),
     "near": np.array([0.1, 0.2, 0.3]),
     "max_object_size": 0.3,
