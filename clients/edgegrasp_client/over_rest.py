@@ -42,12 +42,15 @@ class RestTransport:
         if address.startswith(HTTP_OVER_UNIX):
             transport = httpx.AsyncHTTPTransport(uds=address.removeprefix(HTTP_OVER_UNIX))
             address = "http://localhost"
-        self._http = httpx.AsyncClient(
-            base_url=address,
-            headers=dict(token_metadata(token)),
-            verify=_ssl_context(tls),
-            transport=transport,
-        )
+        try:
+            self._http = httpx.AsyncClient(
+                base_url=address,
+                headers=dict(token_metadata(token)),
+                verify=_ssl_context(tls),
+                transport=transport,
+            )
+        except httpx.InvalidURL as error:
+            raise invalid("address", f"{address!r} ({error})", "Give http://host:port.") from None
 
     async def ask(self, kind: type[Answer], request: Request, timeout: float) -> Answer:
         """The answer to a request."""

@@ -15,6 +15,7 @@ from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import (
     AccessDeniedError,
     DeadlineError,
+    GraspClient,
     GraspClientError,
     InvalidRequestError,
     OverloadedError,
@@ -258,6 +259,12 @@ def test_a_deadline_ends_a_call_or_one_request_of_a_stream(start_dummy, make_cli
             hasty, patient = client.detect_stream(requests, timeout=20.0)
             assert isinstance(hasty.error, DeadlineError)
             assert patient.error is None
+
+
+@pytest.mark.parametrize("address", ["http://[::1", "http://host:port"])
+def test_an_address_that_is_none_is_refused(address: str) -> None:
+    with pytest.raises(InvalidRequestError, match="address: got "):
+        GraspClient(address)
 
 
 def test_a_closed_client_says_so(client, cloud) -> None:
