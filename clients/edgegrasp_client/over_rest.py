@@ -39,6 +39,8 @@ class RestTransport:
 
     def __init__(self, address: str, token: str | None, tls: Tls | None) -> None:
         transport = None
+        if tls is not None and not address.startswith("https:"):
+            raise invalid("tls", f"a Tls for {address}", "Give an https:// address.")
         if address.startswith(HTTP_OVER_UNIX):
             transport = httpx.AsyncHTTPTransport(uds=address.removeprefix(HTTP_OVER_UNIX))
             address = "http://localhost"
