@@ -300,8 +300,8 @@ def _depth_images(file: Path | None, asked: DetectFlags) -> "list[DepthImage] | 
 
 def _colors(file: Path) -> Any:
     """The colours (H, W, 3) of an image file; a grey one's are equal in all three."""
-    values = pixels(file)
-    return np.dstack([values] * 3) if values.ndim == 2 else values[..., :3]
+    values = np.atleast_3d(pixels(file))
+    return values[..., :3] if values.shape[2] > 2 else values[..., [0, 0, 0]]
 
 
 def _print_detection(detection: Any) -> None:

@@ -159,10 +159,11 @@ def on_mask(mask: Array, options: Mapping[str, Any] | None = None) -> DetectOpti
     """Options that allow approach and contact points only where a mask is not 0.
 
     The mask is (H, W) or (H, W, C), for each pixel of the depth image or row of the cloud, as a
-    segmentation network gives it; a fourth channel, transparency, is ignored. Regions in `options`
-    are narrowed; points outside stay obstacles.
+    segmentation network gives it; transparency, the last of two or four channels, is ignored.
+    Regions in `options` are narrowed; points outside stay obstacles.
     """
-    kept = mask[..., :3].any(axis=2) if mask.ndim == 3 else mask != 0
+    colors = mask[..., : 1 if mask.shape[2:] == (2,) else 3]
+    kept = colors.any(axis=2) if mask.ndim == 3 else mask != 0
     asked = dict(options or {})
     for name in ("approach_region", "contact_region"):
         region = asked.get(name) or {}

@@ -92,9 +92,11 @@ def test_a_picture_shows_the_cloud_its_grasps_and_the_region(
 
 def test_grey_colours_are_those_of_their_pixels(camera_files, dummy_server, run) -> None:
     depth, mask, _, *camera = camera_files
-    grey = mask.replace("--mask", "--color")
-    asked = ("detect", depth, grey, *camera, "--server", dummy_server.grpc_address, "--json")
-    assert json.loads(run(*asked))["counts"]["points"] == 24 * 32
+    file = mask.removeprefix("--mask=")
+    for mode in ("L", "LA"):
+        Image.open(file).convert(mode).save(file)
+        asked = ("detect", depth, f"--color={file}", *camera, "--server", dummy_server.grpc_address)
+        assert json.loads(run(*asked, "--json"))["counts"]["points"] == 24 * 32
 
 
 def test_a_picture_that_cannot_be_written_is_refused_before_any_work(refused, tmp_path) -> None:

@@ -159,6 +159,9 @@ def test_a_mask_narrows_the_regions_that_are_asked_for() -> None:
     for name in ("approach_region", "contact_region"):
         (outside,) = options[name]["exclude"]
         np.testing.assert_array_equal(outside["mask"], [[True, False, True], [True] * 3])
+    grey = np.dstack([mask.any(axis=2), np.ones((2, 3))])  # which cannot be seen through
+    (outside,) = on_mask(grey)["approach_region"]["exclude"]
+    np.testing.assert_array_equal(outside["mask"], [[True, False, True], [True, True, False]])
     assert "exclude" not in asked["contact_region"]
 
 
