@@ -279,6 +279,9 @@ def _depth_images(file: Path | None, asked: DetectFlags) -> "list[DepthImage] | 
     if (file is None) != bool(depths):
         raise ValueError("give a cloud file, or --depth and --intrinsics")
     if file is not None:
+        of_image = {"intrinsics": intrinsics, "pose": poses, "depth-scale": asked.depth_scale}
+        if beside := [flag for flag, value in of_image.items() if value]:
+            raise ValueError(f"--{beside[0]}: got a cloud beside it. Give --depth instead.")
         return None
     if not intrinsics:
         raise ValueError(f"--intrinsics: got nothing. Give fx,fy,cx,cy of {depths[0]}, in pixels.")

@@ -126,6 +126,7 @@ def test_depth_images_that_cannot_be_read(camera_files, file, refused) -> None:
         ((depth, "--intrinsics", "300,300,640,360"), "cx: got 640, outside of an image of 32 x 24"),
         ((depth, *2 * ("--intrinsics", "300")), "--intrinsics: got 2. Give one for all, or one"),
         ((depth, "--intrinsics", "300", *2 * ("--pose", "[]")), "--pose: got 2. Give one for each"),
+        ((file, "--pose", "[]"), "--pose: got a cloud beside it. Give --depth instead."),
         ((file, "--place", "[0, 0, 0]"), "--robot: got nothing. Give --robot, --joints, --base"),
         ((file, "--avoid-unseen"), "--robot: got nothing. Give --robot, --joints, --base"),
         ((depth, "--intrinsics", "300"), "depth_images.0.intrinsics: got 300"),
