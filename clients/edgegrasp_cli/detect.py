@@ -254,7 +254,8 @@ def _robot_option(asked: DetectFlags) -> dict[str, Any]:
         return {}
     if missing:
         raise ValueError(f"{missing[0]}: got nothing. Give {', '.join(given)} together.")
-    joints = [float(part) for part in str(asked.joints).split(",") if part]
+    joints = value_of_text("--joints", str(asked.joints))
+    joints = joints if isinstance(joints, list) else [joints]  # of an arm with one
     pose = value_of_text("--base", str(asked.base))
     robot = {"name": asked.robot, "joints": joints, "T_base_cloud": pose}
     robot["avoid_unseen"] = asked.avoid_unseen

@@ -117,6 +117,9 @@ def test_several_depth_images_are_one_cloud(camera_files, dummy_server, run, ref
     assert "Give one for each of 2 images" in " ".join(refused(*asked).split())
 
 
+ARM = ("--robot", "fr3", "--base", "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1")
+
+
 def test_depth_images_that_cannot_be_read(camera_files, file, refused) -> None:
     depth, mask, *_ = camera_files
     for flags, sentence in (
@@ -127,6 +130,7 @@ def test_depth_images_that_cannot_be_read(camera_files, file, refused) -> None:
         ((depth, *2 * ("--intrinsics", "300")), "--intrinsics: got 2. Give one for all, or one"),
         ((depth, "--intrinsics", "300", *2 * ("--pose", "[]")), "--pose: got 2. Give one for each"),
         ((file, "--pose", "[]"), "--pose: got a cloud beside it. Give --depth instead."),
+        ((file, *ARM, "--joints", "0,a"), "options.robot.joints.0: got '0,a'"),
         ((file, "--place", "[0, 0, 0]"), "--robot: got nothing. Give --robot, --joints, --base"),
         ((file, "--avoid-unseen"), "--robot: got nothing. Give --robot, --joints, --base"),
         ((depth, "--intrinsics", "300"), "depth_images.0.intrinsics: got 300"),
