@@ -226,12 +226,13 @@ def _check_outputs(asked: DetectFlags, fields: Mapping[str, Any]) -> None:
     """Raise ValueError, before any work, if a picture or trajectory could not be written."""
     if asked.trajectory is not None and "robot" not in fields:
         raise ValueError("--trajectory: got no robot. Give --robot, --joints and --base.")
+    for flag, file in (("--picture", asked.picture), ("--trajectory", asked.trajectory)):
+        if file is not None and not file.absolute().parent.is_dir():
+            raise ValueError(f"{flag}: there is no folder {file.parent}. Make it first.")
     if (path := asked.picture) is None:
         return
     if path.suffix.lower() not in PICTURES:
         raise ValueError(f"--picture: got {path.name!r}. Name a file {' or '.join(PICTURES)}.")
-    if not path.absolute().parent.is_dir():
-        raise ValueError(f"--picture: there is no folder {path.parent}. Make it first.")
     importlib.import_module("matplotlib")  # fails before the work
 
 

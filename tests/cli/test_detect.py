@@ -107,6 +107,8 @@ def test_a_picture_that_cannot_be_written_is_refused_before_any_work(refused, tm
     ):
         shown = refused("detect", tmp_path / "no.npy", "--picture", tmp_path / name)
         assert message in " ".join(shown.split())
+    moved = (*ARM, "--joints", "0", "--trajectory", tmp_path / "nowhere/motion.json")
+    assert "--trajectory: there is no folder" in refused("detect", tmp_path / "no.npy", *moved)
 
 
 def test_several_depth_images_are_one_cloud(camera_files, dummy_server, run, refused) -> None:
