@@ -158,6 +158,8 @@ def models(*, asked: DetectorFlags) -> None:
 def open_client(asked: DetectorFlags) -> AbstractContextManager[Any]:
     """A client of a server, or an OwnDetector if no server is given."""
     if asked.server:
+        for name in sorted(asked.model_fields_set & {"weights", "device"}):
+            raise ValueError(f"--{name}: got --server beside it. Set it at the server.")
         return asked.connect(asked.server)
     return nullcontext(OwnDetector(asked.weights, asked.grippers, asked.device))
 

@@ -50,6 +50,8 @@ def open_planner(
         yield ChosenPlanner(make, {"name": choice.planner})
         return
     weights, model = [path.resolve() for path in choice.weights], choice.model
+    if choice.server and (weights or choice.planner == "in-process"):
+        raise ValueError(f"server is {choice.server}; leave out --weights and --planner in-process")
     if model.endswith(SUFFIX):
         if choice.server:
             raise ValueError(f"model is {model}; name one of the server's own weights")

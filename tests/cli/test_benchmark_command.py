@@ -185,6 +185,12 @@ def test_a_model_may_be_a_file_of_weights(tmp_path: Path) -> None:
     with open_planner(file, PAPER, {}) as made:
         assert len(made.facts["digest"]) == len(made.facts["scene_digest"]) == 64
     assert planned(model=str(ablation)).score == planned().score
+    for changes in ({"planner": "in-process"}, {"weights": (ablation,)}):
+        with (
+            pytest.raises(ValueError, match="leave out --weights and --planner in-process"),
+            open_planner(PlannerFlags(server="127.0.0.1:1", **changes), PAPER, {}),
+        ):
+            pass
 
 
 def test_a_view_in_which_the_arm_touches_the_table_is_told_from_other_errors() -> None:
