@@ -15,6 +15,7 @@ from edgegrasp_results import DetectedObject, Detection
 
 FOLLOWED = 4  # grasps on one object, of which the first is the one to keep
 MOST = 64  # objects that a request may name
+FOUND = ("auto", "ransac")  # kinds of support that are looked for
 DROP = 0.7  # share of a grasp's score when it was found, below which others are looked for
 
 
@@ -97,7 +98,9 @@ class GraspTracker:
                     "normal": last.support.normal.tolist(),
                     "offset": last.support.offset,
                 }
-                options |= {"support": options.get("support", plane), "up": last.up}
+                asked = options.get("support", "auto")
+                kind = asked.get("kind") if isinstance(asked, Mapping) else asked
+                options |= {"support": plane if kind in FOUND else asked, "up": last.up}
             if options.keys() & {"at", "near"} and object_ in self._objects:
                 options |= {"at": None, "near": self._objects[object_].center}
         return cast("DetectOptions", options | {"previous": cast("Previous", previous)})

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,7 +18,9 @@ from edgegrasp_client import (
     StreamAnswer,
     Tracking,
 )
+from edgegrasp_results import FoundSupport
 
+UP = [0.0, 0.0, 1.0]
 CLOUD = np.zeros((5, 3), np.float32)
 
 
@@ -53,6 +56,14 @@ def test_it_searches_first_then_follows_and_searches_again_after_some_images() -
         assert sent["next_id"] == 20
     assert searched == [False, False, True] * 2
     assert tracker.options()["at"] is None
+
+
+@pytest.mark.parametrize("asked", ["auto", {"kind": "ransac"}, None, {"normal": UP, "offset": 0}])
+def test_a_support_that_is_looked_for_is_the_last_answers_while_it_follows(asked: Any) -> None:
+    tracker = GraspTracker(support=asked)
+    tracker.take(replace(answer(), support=FoundSupport(np.float32(UP), 0.5, None, 1.0)))
+    found = asked == "auto" or asked == {"kind": "ransac"}
+    assert tracker.options()["support"] == ({"normal": UP, "offset": 0.5} if found else asked)
 
 
 @pytest.mark.parametrize("bad", [answer("lost"), answer(grasps=0), answer(score=0.4)])
