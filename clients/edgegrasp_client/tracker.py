@@ -27,7 +27,7 @@ class GraspTracker:
 
     Args:
         search_every: Images after which others are looked for.
-        **options: Those of `GraspClient.detect`; the tracker sets `previous` and `seed`.
+        **options: Those of `GraspClient.detect`; the tracker sets `previous`.
     """
 
     def __init__(self, search_every: int = 30, **options: Unpack[DetectOptions]) -> None:
