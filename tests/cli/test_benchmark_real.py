@@ -205,12 +205,11 @@ def test_labels_are_compared_object_by_object(answer, pixels, overlap, called, s
 # `edgegrasp benchmark-tracking`: what it reports of scenes that stand still and that move.
 
 
-def test_the_grasp_of_a_recorded_scene_stays_where_it_is(run, tmp_path: Path) -> None:
+def test_the_grasp_of_a_recorded_scene_stays_where_it_is(run, refused, tmp_path: Path) -> None:
     np.savez(tmp_path / "box.npz", **seen_scene())
-    shown = run(
-        "benchmark-tracking", "--scenes", tmp_path, "--seconds", 0.2, "--output", tmp_path / "out"
-    )
-    assert "box" in shown
+    asked = ("benchmark-tracking", "--scenes", tmp_path, "--output", tmp_path / "out")
+    assert "box" in run(*asked, "--seconds", 0.2)
+    assert "which stand still" in refused(*asked, "--motion", "still", "--motion", "pushed")
     figures = json.loads((tmp_path / "out" / "results.json").read_text())["box"]
     assert (figures["scenes"], figures["switches"]) == (1, 0)
     assert figures["mm_95"] < 3.0
