@@ -2,6 +2,7 @@
 
 import json
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -82,7 +83,9 @@ def answer_again(file: Path, settings: "Settings") -> "tuple[Job, Answer, Answer
     from edgegrasp_service.worker import answer as worker
     from edgegrasp_service.worker.process import Answer, Job, receive
 
-    with file.open("rb") as stream:
+    job = recorded = None
+    wrong = LookupError, MemoryError, OverflowError, TypeError, ValueError  # of another file
+    with file.open("rb") as stream, suppress(*wrong):
         job, recorded = receive(stream), receive(stream)
     if not isinstance(job, Job) or not isinstance(recorded, Answer):
         raise ValueError(f"{file} is not a recorded request")

@@ -42,6 +42,10 @@ async def test_recorded_requests_are_replayed(serve, transport, cloud, tmp_path,
         cut = recorded.body.index(b'"seconds"')
         assert again.body[:cut] == recorded.body[:cut]
     assert answer_again(bad, settings)[-1].error.kind == "invalid-request"
+    for other in (b"", b"\xff" * 64, fine.read_bytes()[:-9000], bad.read_bytes()[12:]):
+        fine.write_bytes(other)
+        with pytest.raises(ValueError, match="is not a recorded request"):
+            answer_again(fine, settings)
 
 
 async def test_the_oldest_are_deleted_with_those_of_earlier_runs(serve, cloud, tmp_path) -> None:
