@@ -216,6 +216,9 @@ def batches(data: Path, images: list[SceneImage], rng: np.random.Generator) -> I
             new = [path for path in _files(data)[HELD_OUT:] if path not in read]
             read.update(new)
             images += read_images(new)
+            if len(images) < BATCH:
+                value = f"{data} with {len(images)} images beside {HELD_OUT} files held out"
+                raise ValueError(f"data: got {value}. Make more with edgegrasp generate-scenes.")
             order = orders.permutation(len(images))
             for start in range(0, len(order) - BATCH + 1, BATCH):
                 chosen = [images[k] for k in order[start : start + BATCH].tolist()]
