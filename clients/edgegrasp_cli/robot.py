@@ -40,7 +40,7 @@ def add(
         "packages": [str(Path(folder).absolute()) for folder in packages or ()],
         "base_frame": base,
         "flange_frame": flange,
-        "gripper": gripper,
+        "gripper": str(Path(gripper).absolute()) if gripper.endswith(".toml") else gripper,
     }
     lines = [f"{name} = {json.dumps(value)}\n" for name, value in fields.items()]
     output.write_text("".join([*lines, NO_OFFSET]))

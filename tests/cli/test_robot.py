@@ -1,5 +1,6 @@
 """`edgegrasp robot`, and a robot's flags."""
 
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,16 @@ def test_a_robot_file_of_a_urdf_loads(run, tmp_path: Path) -> None:
     assert "hand at home: 0.817 0.191" in shown
     assert load_robot(file).joint_names == load_robot("ur5").joint_names
     assert load_robot(file).max_velocity[0] == 3.15  # the URDF's
+
+
+def test_a_robot_files_gripper_is_found_from_any_folder(run, tmp_path: Path, monkeypatch) -> None:
+    mine = resources.files("edgegrasp_model") / "grippers" / "robotiq-2f-85.toml"
+    (tmp_path / "mine.toml").write_text(mine.read_text())
+    (tmp_path / "robots").mkdir()
+    monkeypatch.chdir(tmp_path)
+    run("robot", "add", UR5, *LINKS, "--gripper", "mine.toml", "--output", "robots/arm.toml")
+    monkeypatch.chdir("/")
+    assert load_robot(tmp_path / "robots" / "arm.toml").gripper.name == "robotiq-2f-85"
 
 
 def test_a_picture_of_a_robot(run, tmp_path: Path) -> None:
