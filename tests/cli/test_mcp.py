@@ -133,6 +133,9 @@ async def test_a_mask_is_sent_and_most_grasps_fit_a_context(dummy_server, folder
         assert shown.content[1].type == "image"
 
 
+MASKED_CLOUD = {"point_cloud_file": "cloud.npy", "mask_file": "mask.png"}
+
+
 @pytest.mark.parametrize(
     ("tool", "arguments", "told"),
     [
@@ -146,7 +149,8 @@ async def test_a_mask_is_sent_and_most_grasps_fit_a_context(dummy_server, folder
         (CLOUD, {"options": {"tok_k": 1}}, "options.tok_k"),
         (DEPTH, {"depth_file": "depth.png", "intrinsics": [1]}, "fx, fy"),
         (DEPTH, IMAGE | {"robot": {"name": "fr3"}}, "give T_base_camera"),
-        ("visualize_grasps", {}, "Give point_cloud_file, or depth_file"),
+        ("visualize_grasps", {}, "Give point_cloud_file alone, or depth_file"),
+        ("visualize_grasps", MASKED_CLOUD, "Give point_cloud_file alone, or depth_file"),
     ],
 )
 async def test_what_is_wrong_reaches_the_agent(dummy_server, folder, tool, arguments, told) -> None:
