@@ -201,10 +201,14 @@ def grpc_server(models: Models, address: str) -> Iterator[int]:
     }
     methods = {name: partial(_grpc_answer, name, fields_of) for name, fields_of in calls.items()}
     servicer: Any = SimpleNamespace(**methods)
-    options = [("grpc.max_receive_message_length", MAX_BODY_BYTES)]
+    # Otherwise a second gateway at the port would get some of the calls.
+    options = [("grpc.max_receive_message_length", MAX_BODY_BYTES), ("grpc.so_reuseport", 0)]
     server = grpc.server(ThreadPoolExecutor(PARALLEL_CALLS), options=options)
     service.add_GRPCInferenceServiceServicer_to_server(servicer, server)
-    port = server.add_insecure_port(address)
+    try:
+        port = server.add_insecure_port(address)
+    except RuntimeError as error:
+        raise OSError(f"gRPC: got {address}, where it cannot listen. {error}") from None
     server.start()
     try:
         yield port

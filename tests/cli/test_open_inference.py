@@ -134,6 +134,12 @@ def test_what_cannot_be_served(post, cloud, changes, model, status, told) -> Non
     assert told in answer.json()["error"]
 
 
+def test_two_gateways_do_not_share_a_port(gateway) -> None:
+    taken = pytest.raises(OSError, match="cannot listen")
+    with taken, grpc_server(Any, gateway["grpc"]):
+        pass
+
+
 def test_the_command_serves_both_transports(dummy_server) -> None:
     ports = [str(port) for port in free_ports(2)]
     flags = ["--server", dummy_server.grpc_address]
