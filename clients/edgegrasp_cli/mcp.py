@@ -68,13 +68,16 @@ def mcp(
     """
     if not folder.is_dir():
         raise ValueError(f"--folder: {folder} is no folder. Name one with clouds or images.")
+    host, _, port = (http or "0").rpartition(":")
+    if not (port.isdecimal() and int(port) < 2**16):
+        raise ValueError(f"--http: got {http!r}. Give HOST:PORT, such as 127.0.0.1:8090.")
     with asked.connect(asked.server) as client:
         tools = grasp_tools(client, folder.resolve())
         if http is None:
             tools.run()
         else:
-            host, _, port = http.rpartition(":")
-            tools.run("streamable-http", host=host or "127.0.0.1", port=int(port))
+            where = host.strip("[]") or "127.0.0.1"  # IPv6 is in brackets
+            tools.run("streamable-http", host=where, port=int(port))
 
 
 def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":

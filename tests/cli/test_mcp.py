@@ -123,6 +123,11 @@ def test_a_folder_that_is_not_there_is_refused() -> None:
     assert "/nonexistent is no folder" in done.stderr
 
 
+@pytest.mark.parametrize("http", ["somewhere", "127.0.0.1:", "127.0.0.1:99999"])
+def test_an_address_without_a_port_is_named(http: str, refused) -> None:
+    assert f"--http: got '{http}'. Give HOST:PORT" in refused("mcp", "--http", http)
+
+
 async def test_a_mask_is_sent_and_most_grasps_fit_a_context(dummy_server, folder: Path) -> None:
     async with agent(dummy_server.http_url, folder) as client:
         asked = IMAGE | {"num_grasps": 20}
