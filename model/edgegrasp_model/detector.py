@@ -170,8 +170,9 @@ class GraspDetector:
             )
         elif previous is not None:
             scene, followed = follow(scene, previous, sent.segment_ids is not None)
-            labels = relabelled(selected.labels, followed.named)
-            selected = replace(selected, labels=labels)
+            if options.debug:
+                labels = relabelled(selected.labels, followed.named)
+                selected = replace(selected, labels=labels)
         seconds = {"cloud": time.perf_counter() - start}
         return Prepared(
             options, gripper, radius, selected, scene, counts, warnings, seconds, followed

@@ -259,9 +259,7 @@ def sampled(points: Float32) -> Float32:
 
 def relabelled(labels: Int64, named: Mapping[int, int]) -> Int64:
     """Labels (R,) of rows by the answer's object numbers; OBSTACLE where there is none."""
-    table = np.full(labels.max(initial=0) + 1, OBSTACLE)
+    renamed = np.where(labels >= 0, OBSTACLE, labels)
     for before, now in named.items():
-        table[before] = now
-    held, renamed = np.flatnonzero(labels >= 0), labels.copy()
-    renamed[held] = table[labels[held]]
+        renamed[labels == before] = now
     return renamed

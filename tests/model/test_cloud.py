@@ -63,6 +63,7 @@ def test_holes_of_an_organised_cloud_are_dropped_with_all_that_belongs_to_them()
         (CloudInput(GOOD, colors=GOOD.astype(str)), "colors", "dtype"),
         (CloudInput(GOOD, segment_ids=np.zeros(11, int)), "segment_ids", "shape (11,)"),
         (CloudInput(GOOD, segment_ids=np.zeros(12)), "segment_ids", "dtype float64"),
+        (CloudInput(GOOD, segment_ids=np.full(12, 2**40)), "segment_ids", "1099511627776"),
         (CloudInput(GOOD, view_ids=[0] * 12), "view_ids", "a list"),
     ],
 )

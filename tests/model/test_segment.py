@@ -1,5 +1,7 @@
 """What is found in a view without further options: the support, and the objects on it."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -136,13 +138,20 @@ def test_a_workspace_is_where_grasps_are_and_what_is_beyond_stays() -> None:
 
 
 def test_segments_are_the_objects_where_they_are_sent() -> None:
+    number = 2**31 - 1000
     boxes, T_world_camera = boxes_on_table(5), camera(0.8, -1.5, 0.7)
     cloud = render([table(), *boxes], T_world_camera)
     near = np.nan_to_num(to_world(T_world_camera, cloud.reshape(-1, 3)), nan=9.0)
-    segment = np.where(boxes[2].distance(near) < 0.004, 2**31 - 1, 0).reshape(cloud.shape[:2])
-    found = detect(CloudInput(cloud, segment_ids=segment))
-    assert {grasp.object for grasp in found.grasps} == {2**31 - 1}
-    assert [each.number for each in found.objects] == [2**31 - 1]
+    segment = np.where(boxes[2].distance(near) < 0.004, number, 0).reshape(cloud.shape[:2])
+    tracemalloc.start()
+    found = detect(CloudInput(cloud, segment_ids=segment), previous={}, debug=True)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 2**30  # bytes, however high the numbers are
+    assert {grasp.object for grasp in found.grasps} == {number}
+    assert [each.number for each in found.objects] == [number]
+    assert found.debug is not None
+    assert found.debug.labels.max() == number
 
 
 def test_a_segment_for_every_pixel_takes_no_more_approach_points() -> None:

@@ -166,7 +166,11 @@ def _beside(
     if array.size != width * size or (width > 1 and array.shape[-1:] != (width,)):
         raise InvalidRequest(field, f"shape {array.shape}", fix)
     if width == 1:
-        return array.reshape(-1)[row].astype(np.int64)
+        ids = array.reshape(-1)[row]
+        for end in (int(ids.min(initial=0)), int(ids.max(initial=0))):
+            if not -(2**31) <= end < 2**31:
+                raise InvalidRequest(field, f"the number {end}", "Send numbers of 32 bits.")
+        return ids.astype(np.int64)
     values = np.ascontiguousarray(array.reshape(-1, width)[row], dtype=np.float32)
     if not np.isfinite(values).all():
         bad = int(row[np.argmin(np.isfinite(values).all(axis=1))])
