@@ -57,7 +57,7 @@ NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
 # Rating of a grasp from which its object gets no approach points in each round.
 ROUNDS = (1.0, SURE_SCORE, GOOD_SCORE, GOOD_SCORE)
 BALLS_AT_A_TIME = 64
-MANY_HANDS = 30  # number of training grippers from which weights suit any gripper
+MANY_HANDS = 20  # grippers in the last training run from which weights suit any gripper
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 PREFERRED = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
 DEVICE_NAMES = re.compile(r"auto|cpu|cuda(:\d+)?")

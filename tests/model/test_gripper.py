@@ -11,7 +11,7 @@ from tests.many_options import OWN_GRIPPER
 
 from edgegrasp_model.candidates.edge_grasps import TIP_MARGIN, support_clearance
 from edgegrasp_model.candidates.outline import MAX_INSERTION
-from edgegrasp_model.detector import GraspDetector
+from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.errors import InvalidGripper
 from edgegrasp_model.gripper import (
     GRIPPER_FOLDER,
@@ -141,6 +141,16 @@ def test_weights_trained_with_many_hands_warn_about_no_gripper() -> None:
     found = of_many.detect(box_on_table(), DetectOptions(viewpoint=VIEW, gripper="wsg-50"))
     assert found.grasps
     assert not any("trained for" in warning for warning in found.warnings)
+
+
+def test_only_the_default_weights_were_trained_with_many_hands(catalogue: ModelCatalogue) -> None:
+    options = DetectOptions(viewpoint=VIEW, support=None, gripper="wsg-50")
+    warned = [
+        row["name"]
+        for row in catalogue.describe()
+        if catalogue.get(row["name"]).detect(box_on_table(), options).warnings
+    ]
+    assert warned == ["edgegrasp", "edgegrasp-small", "vn-edgegrasp"]
 
 
 def test_a_wider_gripper_reaches_contacts_beyond_the_ball_of_the_weights() -> None:
