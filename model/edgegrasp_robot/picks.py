@@ -67,7 +67,7 @@ def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
 def plan_picks(
     detection: Detection,  # made with the options of `with_robot`
     scene: Scene | None,  # the detection's; None: too little is left of the cloud
-    points: object,  # (..., 3) metres, the whole cloud as it was sent; NaN: no reading
+    points: object,  # (..., 3) metres, the whole cloud as sent; NaN: no reading
     options: DetectOptions,  # as they were sent
     robot: Robot,
     until: float = float("inf"),  # when to stop, on `time.monotonic()`
@@ -83,6 +83,7 @@ def plan_picks(
     if scene is None:
         return detection
     start = time.perf_counter()
+    points = points if scene.corrected is None else scene.corrected
     picks: list[_Pick] = []
     failures: Counter[str] = Counter()
     with surrounded(robot, scene, points, asked, options.collision.obstacles) as around:

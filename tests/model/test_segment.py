@@ -425,6 +425,9 @@ def built(points: np.ndarray, **support: object) -> tuple[np.ndarray, list[str]]
     selected = select_points(check_cloud(points.astype(np.float32)), options, {}, warnings)
     found = build_scene(selected, options, 0.004, {})
     assert found is not None
+    if found.corrected is not None:  # whole, whatever the workspace
+        assert len(found.corrected) == len(points)
+        assert found.corrected[:, 2].min() > 0.04 or "taken as" in warnings[0]
     return found.points_in_cloud, warnings
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("roboplan", reason="the extra robot is not installed")
 
 from tests.checks import refusal
-from tests.robot.arms import BOXES, HALF, TURNED, picks_of, surface
+from tests.robot.arms import BOXES, HALF, TURNED, picks_of, scene_of, surface
 
 from edgegrasp_model.options import parse_options
 from edgegrasp_robot import load_robot
@@ -161,6 +161,15 @@ def test_a_lid_over_an_object_is_a_collision_of_the_arm(fr3):
     )
     assert detection.counts["arm_collision"] == 1
     assert "arm's reach" in detection.warnings[0]
+
+
+def test_the_arm_meets_the_cloud_as_its_depths_were_corrected(fr3):
+    sheet = np.stack(np.meshgrid(np.arange(0.4, 0.6, 0.008), np.arange(-0.1, 0.1, 0.008), 0.2), -1)
+    as_sent = {"boxes": BOXES[:1], "more": [sheet.reshape(-1, 3)]}
+    _, corrected, _ = scene_of(fr3, boxes=BOXES[:1])
+    assert picks_of(fr3, **as_sent).counts["reachable"] == 0
+    found = picks_of(fr3, changed=lambda s, d: (replace(s, corrected=corrected), d), **as_sent)
+    assert found.counts["reachable"] == 1
 
 
 BELOW_SIGN, ABOVE = (0.5, -0.8, 0.1), (0.5, 0.0, 1.2)

@@ -79,6 +79,7 @@ class Scene:
     at_side: Bools | None = None  # (V,) where a side of the workspace cuts the cloud off
     # (3, 4) point to place in the image that was sent, its sides at -1 and 1; None: not known
     P_image_cloud: Float64 | None = None
+    corrected: Float32 | None = None  # (N, 3) all points, cloud frame, if depths were corrected
 
     @cached_property
     def depths(self) -> list[DepthMap]:
@@ -97,6 +98,7 @@ class SelectedPoints:
     viewpoints: Float64 | None  # (W, 3) the cameras
     labels: Int64  # (R,) of the rows of the cloud as sent, as in `DebugInfo`
     confidence: dict[int, float]  # of each object that the network found
+    corrected: Float32 | None = None  # (N, 3) all points, if their depths were corrected
 
 
 def select_points(
@@ -108,9 +110,10 @@ def select_points(
     """Correct depths, segment, remove the support, and drop what no hand at an object can reach."""
     viewpoints = camera_positions(sent, options)
     check_regions(sent, options)
-    counts["points"] = len(sent.points)
+    counts["points"], corrected = len(sent.points), None
     if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
         sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
+        corrected = sent.points
     if options.workspace is not None:
         reach = FOLLOWED_REACH if options.follows_only else REACH
         sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
@@ -154,7 +157,7 @@ def select_points(
     number = chosen_objects(number, sent, options, warnings)
     kept = near_objects_along(plan, number)
     near, number = sent.take(kept), number[kept]
-    return SelectedPoints(near, number, support, up, viewpoints, labels, confidence)
+    return SelectedPoints(near, number, support, up, viewpoints, labels, confidence, corrected)
 
 
 def _objects_given(sent: CheckedCloud, options: DetectOptions) -> bool:
@@ -278,6 +281,7 @@ def build_scene(
         confidence=selected.confidence,
         obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
         P_image_cloud=_projection(sent, viewpoints, frame),
+        corrected=selected.corrected,
     )
 
 
