@@ -15,6 +15,7 @@ from roboplan.toppra import PathParameterizerTOPPRA, SplineFittingMode, TOPPRAOp
 from edgegrasp_camera.arrays import Float64
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions, Place, RobotArm
+from edgegrasp_model.results import Following
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_results import ArmPlan, ArmTrajectory, DetectedObject, Detection, Grasp
 from edgegrasp_robot.held import Held, can_leave, held_by, load_of, places_for
@@ -86,6 +87,7 @@ def plan_picks(
     points = points if scene.corrected is None else scene.corrected
     picks: list[_Pick] = []
     failures: Counter[str] = Counter()
+    kept = _kept(detection)
     with surrounded(robot, scene, points, asked, options.collision.obstacles) as around:
         grasps = [grasp for grasp in detection.grasps if grasp.object not in around.own]
         failures["on_arm"] = len(detection.grasps) - len(grasps)
@@ -97,7 +99,7 @@ def plan_picks(
             if not tried:
                 break
             failures.update(pick.outcome for pick in tried)
-            tried.sort(key=lambda pick: _rank(pick, np.array(asked.joints), options))
+            tried.sort(key=lambda pick: _rank(pick, np.array(asked.joints), options, kept))
             for pick in tried:
                 if moves and missing > 0 and pick.line and time.monotonic() <= until:
                     pick = arm.motion(pick)
@@ -354,8 +356,18 @@ def _straight(T_base_hand: Float64, direction: Float64, begin: float, end: float
     return poses
 
 
-def _rank(pick: _Pick, joints: Float64, options: DetectOptions) -> tuple[int, float]:
-    """Reachable grasps first; by score minus the cost of the motion, or in the order asked for."""
+def _kept(detection: Detection) -> int | None:
+    """The id of the grasp that is kept from an earlier answer, the first; None: there is none."""
+    state = detection.tracking
+    return detection.grasps[0].id if state is not None and state.first == Following.KEPT else None
+
+
+def _rank(
+    pick: _Pick, joints: Float64, options: DetectOptions, kept: int | None
+) -> tuple[int, float]:
+    """Reachable grasps first, of them the kept one; by score and motion, or in the order asked."""
+    if kept is not None and pick.grasp.id == kept:
+        return pick.tier, -np.inf
     if pick.plan.pregrasp_joints is None or options.order != "score":
         return pick.tier, 0.0
     travel = np.abs(pick.plan.pregrasp_joints - joints).max()
@@ -394,9 +406,13 @@ def _told(
     best: dict[int | None, float] = {}
     for grasp in grasps:
         best[grasp.object] = max(grasp.score, best.get(grasp.object, 0.0))
-    total = detection.seconds.get("total", 0.0) + seconds
+    total, tracking = detection.seconds.get("total", 0.0) + seconds, detection.tracking
+    if tracking is not None and (kept := _kept(detection)) is not None:
+        still = bool(grasps) and grasps[0].id == kept and tiers[0] < 3
+        tracking = tracking if still else replace(tracking, first=Following.LOST)
     return replace(
         detection,
+        tracking=tracking,
         grasps=grasps,
         counts=counts,
         seconds=detection.seconds | {"arm": seconds, "total": total},

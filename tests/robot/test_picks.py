@@ -14,6 +14,7 @@ from tests.checks import refusal
 from tests.robot.arms import BOXES, HALF, TURNED, picks_of, scene_of, surface
 
 from edgegrasp_model.options import parse_options
+from edgegrasp_results import Tracking
 from edgegrasp_robot import load_robot
 from edgegrasp_robot.surroundings import _near_robot
 
@@ -170,6 +171,19 @@ def test_the_arm_meets_the_cloud_as_its_depths_were_corrected(fr3):
     assert picks_of(fr3, **as_sent).counts["reachable"] == 0
     found = picks_of(fr3, changed=lambda s, d: (replace(s, corrected=corrected), d), **as_sent)
     assert found.counts["reachable"] == 1
+
+
+@pytest.mark.parametrize(("x", "objects", "first"), [(0.55, [2, 0], "kept"), (1.5, [0, 2], "lost")])
+def test_a_kept_grasp_stays_first_where_the_arm_reaches_it(fr3, x, objects, first):
+    def followed(scene, detection):
+        best, other, third = (replace(g, id=g.object) for g in detection.grasps)
+        tracking = Tracking("kept", 3)
+        return scene, replace(detection, grasps=[third, best, other], tracking=tracking)
+
+    boxes = (*BOXES[:2], (x, -0.2, 0.04))
+    found = picks_of(fr3, np.eye(4), boxes=boxes, changed=followed)
+    assert [grasp.object for grasp in found.grasps if grasp.object != 1] == objects
+    assert found.tracking == Tracking(first, 3)
 
 
 BELOW_SIGN, ABOVE = (0.5, -0.8, 0.1), (0.5, 0.0, 1.2)
