@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.hand_kernels import non_max_suppression
+from edgegrasp_model.hand_kernels import mean_of_alike, non_max_suppression
 from edgegrasp_model.options import (
     MAX_SURFACE,
     Collision,
@@ -151,7 +151,8 @@ def merged(
     if options.collision.mode == "avoid":
         kept = [grasp for grasp in kept if grasp.collision_free]
     new = [replace(grasp, id=followed.next_id + row) for row, grasp in enumerate(found)]
-    grasps = [grasp for grasp in [*kept, *new] if grasp.score >= options.min_score]
+    kept = [grasp for grasp in kept if grasp.score >= options.min_score]
+    grasps = [*kept, *(grasp for grasp in new if grasp.score >= options.min_score)]
     order = _order(grasps, options, up, len(kept))[: options.top_k]
     tracking = Tracking(Following.STARTED, followed.next_id + len(new))
     if not previous.grasps:
@@ -180,7 +181,13 @@ def _order(grasps: list[Grasp], options: DetectOptions, up: Float64, kept: int) 
     rule = options.suppression or Suppression()
     T_cloud_tcp = np.stack([grasp.T_cloud_tcp for grasp in grasps])
     rows = np.arange(len(grasps), dtype=np.int64)
-    rows, _ = non_max_suppression(T_cloud_tcp, rows, rule.translation, rule.rotation, len(rows))
+    near = rule.translation, rule.rotation
+    if options.suppression is None:  # a grasp near a kept one is the same; all others stay
+        of_kept = (rows < kept).astype(np.float32)
+        like_kept = mean_of_alike(of_kept, T_cloud_tcp, np.zeros_like(rows), *near) > 0.0
+        rows = rows[(rows < kept) | ~like_kept]
+    else:
+        rows, _ = non_max_suppression(T_cloud_tcp, rows, *near, len(rows))
     score = np.array([grasps[row].score for row in rows])
     free = np.array([grasps[row].collision_free for row in rows])
     clearance = np.array([grasps[row].clearance for row in rows])

@@ -68,6 +68,13 @@ def test_what_is_found_at_the_place_of_a_followed_grasp_is_that_grasp() -> None:
     assert ([one.id for one in grasps], tracking.first) == ([7], "kept")
 
 
+@pytest.mark.parametrize(("suppression", "ids"), [({}, [7, 9]), (None, [7, 9, 10])])
+def test_new_grasps_near_each_other_stay_without_suppression(suppression: Any, ids: Any) -> None:
+    found = [grasp(0.95, 0.001), grasp(0.6, 0.2), grasp(0.55, 0.201)]
+    grasps, _ = answer(found, grasp(0.9, 0.0), suppression=suppression)
+    assert [one.id for one in grasps] == ids
+
+
 @pytest.mark.parametrize("now", [None, grasp(0.1, 0.0), grasp(0.9, 0.0, free=False)])
 def test_a_grasp_that_is_gone_fails_or_collides_is_lost(now: Grasp | None) -> None:
     grasps, tracking = answer([grasp(0.6, 0.2)], now)
