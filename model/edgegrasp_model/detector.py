@@ -169,7 +169,8 @@ class GraspDetector:
                 f"{counts['kept']} points remain: too few for a surface; see counts."
             )
         elif previous is not None:
-            scene, followed = follow(scene, previous, sent.segment_ids is not None)
+            chosen = not isinstance(options.objects, str) or bool(options.at or options.near)
+            scene, followed = follow(scene, previous, sent.segment_ids is not None, chosen)
             if options.debug:
                 labels = relabelled(selected.labels, followed.named)
                 selected = replace(selected, labels=labels)

@@ -26,7 +26,7 @@ from edgegrasp_model.options import (
 from edgegrasp_model.ranking import COLLIDING, objects_first, ranked
 from edgegrasp_model.results import OBSTACLE, Following
 from edgegrasp_model.scene.scene import Scene
-from edgegrasp_model.scene.segment import UNKNOWN
+from edgegrasp_model.scene.segment import FIXED, UNKNOWN
 from edgegrasp_results import Evaluation, Grasp, Tracking
 
 MARGIN = 0.1  # of the score, by which another grasp must be better
@@ -87,10 +87,14 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
     return options.model_copy(update={**unused, "workspace": box, "objects": "off"})
 
 
-def follow(scene: Scene, previous: Previous, given: bool) -> tuple[Scene, Followed]:
-    """Find the objects of an earlier answer again; `given`: the caller gave their numbers."""
+def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple[Scene, Followed]:
+    """Find the objects of an earlier answer again.
+
+    `given`: the caller gave their numbers; `chosen`: the request leaves some of them out, and what
+    is left must not be taken for those.
+    """
     points, number = scene.points_in_cloud, scene.object_of_point
-    seen = np.flatnonzero(number >= 0)
+    seen = np.flatnonzero((number >= 0) | (chosen & (number == FIXED)))
     cloud = Surface(
         points[seen],
         scene.frame.directions_in_cloud(scene.cloud.normals[seen]),
@@ -98,7 +102,8 @@ def follow(scene: Scene, previous: Previous, given: bool) -> tuple[Scene, Follow
     )
     moved: dict[int, Float64] = {}
     surface: dict[int, Float32] = {}
-    named = {int(one): int(one) for one in np.unique(number[seen])} if given else {}
+    found = np.unique(number[number >= 0])
+    named = {int(one): int(one) for one in found} if given else {}
     renamed = number.copy() if given or previous.search else np.full_like(number, UNKNOWN)
     for one in previous.objects:
         before = np.reshape(one.surface, (-1, 3)).astype(np.float64)
@@ -107,6 +112,9 @@ def follow(scene: Scene, previous: Previous, given: bool) -> tuple[Scene, Follow
             continue
         now = before @ T[:3, :3].T + T[:3, 3]
         near = seen[cloud.near(now)]
+        if np.median(number[near]) < 0:
+            continue
+        near = near[number[near] >= 0]
         moved[one.number], surface[one.number] = T, now.astype(np.float32)
         if not given:
             which = int(np.bincount(number[near]).argmax())
@@ -115,7 +123,7 @@ def follow(scene: Scene, previous: Previous, given: bool) -> tuple[Scene, Follow
         if share < GOOD:
             surface[one.number] = sampled(points[renamed == one.number])
     next_id = max([previous.next_id, *(1 + one for one in [*moved, *named.values()])])
-    for which in np.unique(number[seen]) if previous.search else ():
+    for which in found if previous.search else ():
         if which not in named:
             named[int(which)], next_id = next_id, next_id + 1
             renamed[number == which] = named[which]

@@ -154,6 +154,19 @@ def test_segments_are_the_objects_where_they_are_sent() -> None:
     assert found.debug.labels.max() == number
 
 
+def test_a_chosen_object_is_not_taken_for_one_beside_it_that_was_left_out() -> None:
+    boxes = [box((0.045 * row, 0.0, 0.03), (0.015, 0.015, 0.03)) for row in range(3)]
+    cloud = render([table(), *boxes], camera(0.8, -1.5, 0.7))
+    before = detect(cloud, previous={})
+    objects = [
+        {"number": one.number, "surface": np.ravel(one.surface).tolist()} for one in before.objects
+    ]
+    assert len(objects) == 3
+    for one in before.objects:
+        now = detect(cloud, near=one.center.tolist(), previous={"objects": objects})
+        assert [each.number for each in now.objects] == [one.number]
+
+
 def test_a_segment_for_every_pixel_takes_no_more_approach_points() -> None:
     cloud = render([table(), *boxes_on_table(5)], camera(0.8, -1.5, 0.7))
     segment = np.arange(1, cloud.shape[0] * cloud.shape[1] + 1).reshape(cloud.shape[:2])
