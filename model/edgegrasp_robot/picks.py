@@ -16,6 +16,7 @@ from edgegrasp_camera.arrays import Float64
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions, Place, RobotArm
 from edgegrasp_model.results import Following
+from edgegrasp_model.scene.cloud import unit
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_results import ArmPlan, ArmTrajectory, DetectedObject, Detection, Grasp
 from edgegrasp_robot.held import Held, can_leave, held_by, load_of, places_for
@@ -334,7 +335,7 @@ class _Arm:
             return None
         if straight:
             hand = np.array([self._robot.hand_pose(row)[:3, 3] for row in (*rows, joints[-1])])
-            along = (hand[-1] - hand[0]) / np.linalg.norm(hand[-1] - hand[0])
+            along = unit(hand[-1] - hand[0])
             if np.linalg.norm(np.cross(hand - hand[0], along), axis=1).max() > OFF_LINE:
                 return None
         return None if _touches(scene, rows, FINE) else found

@@ -152,6 +152,11 @@ def test_what_is_out_of_reach_is_counted_and_comes_last(fr3):
     assert detection.grasps[0].object == 1  # of a lower score
 
 
+def test_a_motion_may_have_no_straight_approach(fr3):
+    found = picks_of(fr3, np.eye(4), options={"collision": {"approach_length": 0.0}})
+    assert found.counts["with_trajectory"] == len(BOXES)
+
+
 def test_a_lid_over_an_object_is_a_collision_of_the_arm(fr3):
     lid = {"min": (0.4, -0.1, 0.2), "max": (0.6, 0.1, 0.22)}
     detection = picks_of(
