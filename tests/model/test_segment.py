@@ -422,6 +422,7 @@ def test_the_floor_of_a_bin_counts_and_not_the_table_beside_it(seed: int) -> Non
     found = choose_support(seen, inside, shown, number == 0, parse_options({}), [])
     assert found is not None
     assert np.abs(found.plane.heights(floor[np.abs(floor[:, 0]) < 0.1])).max() < 0.001
+    assert found.share == pytest.approx(8000 / len(points), abs=0.01)  # of all points
 
 
 def seen_wrong(points: np.ndarray, factor: float, camera: np.ndarray = CAMERA) -> np.ndarray:

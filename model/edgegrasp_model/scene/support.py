@@ -171,7 +171,9 @@ def _fitted(
         return None
     found = measured(part, _close_to(plane, part.points[apart < CLOSE]), THICK)
     places = found.frame.points(part.points)
-    return found if _area(places[np.abs(places[:, 2]) < MOST_MARGIN]) > LEAST_AREA else None
+    if _area(places[np.abs(places[:, 2]) < MOST_MARGIN]) <= LEAST_AREA:
+        return None
+    return replace(found, share=found.share * len(on) / len(seen.points))  # of all that is seen
 
 
 def _assumed(
