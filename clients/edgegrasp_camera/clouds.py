@@ -115,7 +115,8 @@ def read_point_cloud2(cloud: PointCloud2, max_points: int = sys.maxsize) -> Clou
     shape, strides = (cloud.height, cloud.width), (cloud.row_step, cloud.point_step)
     if 0 in shape:
         return CloudInput(np.empty((0, 3), np.float32))
-    rows = np.ndarray(shape, record, cloud.data, strides=strides).astype(record.newbyteorder("="))
+    data = bytes(cloud.data) if isinstance(cloud.data, (list, tuple)) else cloud.data
+    rows = np.ndarray(shape, record, data, strides=strides).astype(record.newbyteorder("="))
     return cloud_of_records(rows[0] if cloud.height == 1 else rows)
 
 
@@ -130,6 +131,9 @@ def _record(cloud: PointCloud2) -> np.dtype[Any]:
         wanted = f"Send {', '.join(missing)} too, as 7 (float32) or 8 (float64), metres."
         raise InvalidRequest("point_cloud2.fields", value[:80], wanted)
     for field in found:  # NumPy adds them in 32 bits
+        if field.datatype not in POINT_TYPES:
+            value = f"{field.name} of type {field.datatype}"
+            raise InvalidRequest("point_cloud2.fields", value, "Send types from 1 to 8.")
         end = field.offset + np.dtype(POINT_TYPES[field.datatype]).itemsize
         if end > cloud.point_step:
             raise InvalidRequest("point_cloud2.fields", f"{field.name} up to byte {end}", fix)

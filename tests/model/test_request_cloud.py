@@ -1,4 +1,5 @@
 import base64
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -183,6 +184,17 @@ def test_normals_and_colours(kind: str) -> None:
         cloud = read(point_cloud2(rows, big=big))
         np.testing.assert_array_equal(cloud.normals, xyz(rows, names))
         np.testing.assert_array_equal(cloud.colors[0, 2], [0x11, 0x22, 0x02])
+
+
+def test_messages_of_other_programs_are_read_without_a_schema() -> None:
+    rows = cloud_of((1, 4))
+    fields = point_cloud2(rows)
+    layout = [SimpleNamespace(**({"count": 1} | field)) for field in fields.pop("fields")]
+    message = SimpleNamespace(**fields | {"data": list(fields["data"])}, fields=layout)
+    np.testing.assert_array_equal(read_point_cloud2(message).points, xyz(rows)[0])
+    message.fields.append(SimpleNamespace(name="rgb", offset=0, datatype=9, count=1))
+    with refusal("point_cloud2.fields", "rgb of type 9"):
+        read_point_cloud2(message)
 
 
 # NumPy adds the size to this offset in 32 bits: it read 2 GB behind the data.
