@@ -75,12 +75,35 @@ def draw_scene(
     kind = int(rng.choice(len(shares), p=shares / shares.sum()))
     scene = SceneMeshes(rng, pool)
     (_table, _bin, _shelf, _tray, _floor)[kind](scene)
-    if arms and rng.random() < (0.25, 0.15, 0.1, 0.25, 0.25)[kind]:
-        points, triangles = arms[int(rng.integers(len(arms)))]
-        turn = _turn(rng.uniform(0, 2 * np.pi))
-        place = (*rng.normal(0.0, 0.25, 2), rng.uniform(0.02, 0.5))
-        scene.add((points @ turn.T + place, triangles))
+    if rng.random() < (0.25, 0.15, 0.1, 0.25, 0.25)[kind]:
+        scene.add(_machine(scene, arms))
     return scene
+
+
+def _machine(scene: SceneMeshes, arms: Sequence[Mesh]) -> Mesh:
+    """A robot arm, or links of any shape in a chain, which ends near the objects."""
+    rng = scene.rng
+    end = np.array([*rng.normal(0.0, 0.22, 2), rng.uniform(0.01, 0.45)])
+    if arms and rng.random() < 0.5:
+        points, triangles = arms[int(rng.integers(len(arms)))]
+        return points @ _turn(rng.uniform(0, 2 * np.pi)).T + end, triangles
+    links: list[Mesh] = []
+    away = np.array([*rng.normal(size=2), abs(rng.normal())])  # and up
+    way, wide = rng.normal(size=3), rng.uniform(0.015, 0.09)
+    way[2] = abs(way[2])
+    for _ in range(int(rng.integers(3, 9))):
+        way = way / np.linalg.norm(way)
+        points, triangles = scene.any_of_pool().mesh
+        low, high = points.min(axis=0), points.max(axis=0)
+        slim = ((points - (low + high) / 2) / (high - low))[:, np.argsort(high - low)]
+        size = np.array([*wide * rng.uniform(0.6, 1.5, 2), rng.uniform(0.05, 0.4)])
+        spin = Rotation.from_rotvec((0.0, 0.0, rng.uniform(0, 2 * np.pi)))
+        turn = Rotation.align_vectors(way[None], np.array([[0.0, 0.0, 1.0]]))[0] * spin
+        links.append((turn.apply(slim * size) + end + way * size[2] / 2, triangles))
+        end = end + 0.95 * size[2] * way
+        way = way + rng.normal(0.0, 0.6, 3) + 0.5 * away
+        wide *= rng.uniform(0.9, 1.35)
+    return merged(links)
 
 
 def _table(scene: SceneMeshes) -> None:
