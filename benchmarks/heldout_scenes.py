@@ -4,7 +4,8 @@
     edgegrasp benchmark-real --scenes SCENES --output RESULTS
 
 Tables, heaps, trays, bins and shelves in rooms, made of the test objects of `OBJECTS`, which are
-for evaluation only, and seen by depth cameras with their faults. Files are named by kind.
+for evaluation only, and seen by depth cameras with their faults; with `--robots`, robots too. Files
+are named by kind.
 """
 
 import argparse
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pybullet_data
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -31,6 +33,11 @@ WINDOW = 4  # pixels around one in which the surface is looked for that a readin
 LEAST = 0.001  # of an image's pixels, below which what is seen of an object is not labelled
 FLAT = 0.004  # metres from the plane within which what carries the objects is the support
 FAR = 12.0  # metres
+# PyBullet's models: arms, which stand beside the objects, and what hangs over them.
+ARMS = ("franka_panda/panda.urdf", "kuka_iiwa/model.urdf", "xarm/xarm6_with_gripper.urdf")
+HANGING = ("pr2_gripper.urdf", "laikago/laikago.urdf", "mini_cheetah/mini_cheetah.urdf")
+HANGING += ("quadruped/vision60.urdf", "aliengo/aliengo.urdf", "quadruped/spirit40.urdf")
+CLEAR = 0.015  # metres between a robot and the objects
 
 
 class Made(NamedTuple):
@@ -87,6 +94,25 @@ class Maker:
             if lift:
                 self.box((0.04, 0.03, lift), (x, y, lift / 2), turn)
                 self.box((0.26, 0.2, 0.012), (x, y, 0.006), turn)
+
+    def robot(self) -> None:
+        """A robot in a random pose that touches no object, after 40 tries none."""
+        rng, client = self.rng, self.world.client
+        for _ in range(40):
+            stands, angle = rng.random() < 0.4, rng.uniform(0, 2 * np.pi)
+            away = rng.uniform(0.45, 0.7) if stands else rng.uniform(0.12, 0.4)
+            place = [away * np.cos(angle), away * np.sin(angle), 0.0]
+            turn = Rotation.from_euler("z", angle + np.pi) if stands else Rotation.random(rng=rng)
+            place[2] = 0.0 if stands else rng.uniform(0.1, 0.4)
+            file = Path(pybullet_data.getDataPath()) / rng.choice(ARMS if stands else HANGING)
+            body = client.loadURDF(str(file), place, turn.as_quat().tolist(), useFixedBase=True)
+            for joint in range(client.getNumJoints(body)):
+                low, high = client.getJointInfo(body, joint)[8:10]
+                client.resetJointState(body, joint, rng.uniform(*sorted((low, high))))
+            others = [one.body.uid for one in self.objects]
+            if not any(client.getClosestPoints(body, other, CLEAR) for other in others):
+                return
+            client.removeBody(body)
 
     def drop(self, count: int, half: tuple[float, float], height: float, upright: float) -> None:
         """Let objects fall or stand them up, within half extents (2,) around the middle."""
@@ -229,14 +255,18 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--each", type=int, default=12, help="scenes of each kind")
+    parser.add_argument("--robots", action="store_true", help="one or two in each; no shelves")
     asked = parser.parse_args()
     asked.output.mkdir(parents=True, exist_ok=True)
-    for number, index in np.ndindex(len(KINDS), asked.each):
+    for number, index in np.ndindex(len(KINDS) - asked.robots, asked.each):
         rng = np.random.default_rng([asked.seed, number, index])
         labels = np.zeros((1, 1))
         while labels.max() < FIRST or (labels == 1).mean() < SUPPORT:
             maker = Maker(asked.objects, rng)
-            arrays = picture(maker, getattr(maker, KINDS[number])())
+            made = getattr(maker, KINDS[number])()
+            for _ in range(int(rng.integers(1, 3)) if asked.robots else 0):
+                maker.robot()
+            arrays = picture(maker, made)
             labels = arrays["labels"]
             maker.world.close()
         np.savez_compressed(asked.output / f"{KINDS[number]}_{index:02d}.npz", **arrays)
