@@ -85,10 +85,7 @@ MESSAGE = messages.ModelInferRequest(
 def test_mutated_inference_messages_are_answered_or_refused(content: bytes) -> None:
     with refused(), contextlib.suppress(DecodeError):
         request = messages.ModelInferRequest.FromString(content)
-        tensors = open_inference._grpc_inputs(request)
-        given = request.parameters.items()
-        parameters = {name: open_inference._value(each) for name, each in given}
-        MODELS.infer("grasps", tensors, parameters, 1.0, [])
+        open_inference._grpc_infer(MODELS, request, SimpleNamespace(time_remaining=lambda: 1.0))
 
 
 @pytest.fixture(scope="module")
