@@ -114,6 +114,9 @@ class _Work:
             result = self._detect(detector, cloud, options)
             self.facts.grasps = len(result.grasps)
         else:
+            if options.robot is not None:
+                fix = "Leave it out, or detect: reach is planned for detected grasps."
+                raise InvalidRequest("options.robot", "a robot beside given grasps", fix)
             with self._stage("score"):
                 most = self.settings.max_voxels
                 result = detector.score(cloud, options, **given, max_voxels=most)

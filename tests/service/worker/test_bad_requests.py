@@ -180,6 +180,11 @@ CASES = {
     "too many edges": Malformed(
         "edges", "16001", "16000", points=POINTS, edges=[[0, 1]] * 16001, scores=True
     ),
+    "robot while scoring": Malformed(
+        "options.robot", "beside given grasps", "detect",
+        {"robot": {"name": "fr3", "T_base_cloud": POSE, "joints": [0.0] * 7}},
+        points=POINTS, edges=[[0, 1]], scores=True,
+    ),
     "bad option while scoring": Malformed(
         "options.collision.margin", "-1.0", "greater", {"collision": {"margin": -1.0}},
         points=POINTS, edges=[[0, 1]], scores=True,
