@@ -26,7 +26,7 @@ class CloudInput:
     colors: object | None = None  # like points; checked, but not used by any network
     segment_ids: object | None = None  # (N,) or (H, W) integers
     view_ids: object | None = None  # (N,) or (H, W) integers: which of options.viewpoint saw it
-    viewpoint: Any = None  # of depth images: (x, y, z) of the camera, or one for each of several
+    viewpoint: Any = None  # as images and files have it: (x, y, z) of the camera, or of several
     warnings: tuple[str, ...] = ()  # warnings from reading it, for the answer
 
 

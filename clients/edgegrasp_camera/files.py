@@ -293,12 +293,13 @@ def _read_ply(data: bytes, max_points: int) -> CloudInput:
 
 # .pcd
 
+FARTHEST = 1e7  # metres of a VIEWPOINT from the origin
 PCD_TYPES = {"F4", "F8", "I1", "I2", "I4", "I8", "U1", "U2", "U4", "U8"}
 PCD_HEADER_END = re.compile(rb"^DATA[ \t]+(ascii|binary|binary_compressed)[ \t\r]*\n", re.MULTILINE)
 
 
 def _read_pcd(data: bytes, max_points: int) -> CloudInput:
-    """Read x, y, z of the points, and normal_x, normal_y, normal_z and rgb if present."""
+    """Read x, y, z of the points, and normals, rgb and the viewpoint if present."""
     lines, end = _read_header(data, PCD_HEADER_END)
     header = {words[0]: words[1:] for words in lines if words}
     if missing := {"FIELDS", "TYPE", "SIZE", "POINTS"} - header.keys():
@@ -314,6 +315,11 @@ def _read_pcd(data: bytes, max_points: int) -> CloudInput:
     ]
     record, count, body = _record(fields, "<"), int(header["POINTS"][0]), data[end.end() :]
     cloud = cloud_of_records(_read_records(body, record, count, max_points, end[1].decode()))
+    place = tuple(map(float, header.get("VIEWPOINT", [])[:3]))  # of the camera
+    if any(place):  # zeros: unknown
+        if len(place) < 3 or not max(map(abs, place)) <= FARTHEST:
+            raise ValueError(f"VIEWPOINT {' '.join(map(str, place))}")
+        cloud = replace(cloud, viewpoint=place)
     height, width = (int(header.get(name, ["1"])[0]) for name in ("HEIGHT", "WIDTH"))
     if height < 2 or height * width != count:
         return cloud

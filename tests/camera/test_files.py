@@ -252,6 +252,20 @@ def test_normals_and_colours_of_a_pcd_file(kind: str, height: int) -> None:
     np.testing.assert_array_equal(cloud.colors, COLORS)
 
 
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [("0 0 0 1 0 0 0", None), ("0.1 0 -2 1 0 0 0", (0.1, 0, -2)), ("nan 0 0 1 0 0 0", ValueError)],
+)
+def test_the_viewpoint_of_a_pcd_file(line: str, expected: object) -> None:
+    head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n"
+    text = f"{head}WIDTH 1\nHEIGHT 1\nVIEWPOINT {line}\nPOINTS 1\nDATA ascii\n0 0 1\n"
+    if expected is ValueError:
+        with refusal("cloud"):
+            read_file("pcd", text.encode(), MANY)
+    else:
+        assert read_file("pcd", text.encode(), MANY).viewpoint == expected
+
+
 @pytest.mark.parametrize("suffix", ["ply", "pcd", "xyz"])
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("text", [False, True])
