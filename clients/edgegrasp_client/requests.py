@@ -327,6 +327,9 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):
+        mask = value.get("mask")
+        if isinstance(mask, np.ndarray) and mask.dtype.kind in "iu":  # images of 0 and 255
+            value = {**value, "mask": mask != 0}
         return {name: _plain(part) for name, part in value.items() if part is not None}
     if isinstance(value, list | tuple | range):
         return [_plain(part) for part in value]

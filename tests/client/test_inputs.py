@@ -109,8 +109,9 @@ def test_scoring_over_any_cloud(client, cloud) -> None:
     assert client.score(depth_images=[depth_image()], edges=edges).evaluations
 
 
-def test_options_too_long_for_a_query_are_sent(client, cloud) -> None:
-    mask = np.ones((20, 25), bool)
+@pytest.mark.parametrize("kind", [bool, np.uint8, np.int64])
+def test_options_too_long_for_a_query_are_sent(client, cloud, kind) -> None:
+    mask = np.full((20, 25), 255).astype(kind)
     indices = np.arange(499)
     options: dict[str, Any] = {
         "approach_region": {"include": [{"kind": "mask", "mask": mask}]},
@@ -156,7 +157,7 @@ def image(**changes: Any) -> dict[str, Any]:
         ({"support": {"kind": "cylinder"}}, "support"),
         ({"approach_region": {"include": [{"kind": "cube"}]}}, "approach_region.include.0"),
         ({"approach_region": [{"kind": "mask", "mask": [True]}]}, "approach_region"),
-        (mask(np.ones((3, 4), np.uint8)), "contact_region.include.0.mask"),
+        (mask(np.ones((3, 4), np.float32)), "contact_region.include.0.mask"),
         (mask([[True], [False, True]]), "contact_region.include.0.mask"),
         (NEGATIVE, "contact_region.include.0.indices.1"),
         ({"gripper": [7]}, "gripper"),
