@@ -166,8 +166,8 @@ def benchmark_tracking(
     motion: Annotated[
         list[str] | None, Option(help=f"{', '.join(MOTIONS)}; may be repeated; else all.")
     ] = None,
-    rounds: Annotated[int, Option(help="Simulated scenes for each motion.")] = 20,
-    seconds: Annotated[float | None, Option(help="In place of each motion's own.")] = None,
+    rounds: Annotated[int, Option(min=1, help="Simulated scenes for each motion.")] = 20,
+    seconds: Annotated[float | None, Option(min=0.1, help="In place of each motion's own.")] = None,
     output: Annotated[Path, Option(help="Folder for results.json and jitter.svg.")] = Path(
         "results/tracking"
     ),
