@@ -121,6 +121,20 @@ def test_the_rest_of_a_table_that_was_cut_off_is_no_object(noise: float, height:
     assert found.grasps
 
 
+@pytest.mark.parametrize("given", [True, False])
+def test_a_table_that_lies_over_the_plane_is_not_cut_off(given: bool) -> None:
+    """What else is in view is no object: a plane that is given is never exact, nor a table flat."""
+    one, T_world_camera = box((0, 0, 0.03), (0.02, 0.03, 0.03)), camera(0.7, -1.5, 0.7)
+    points = seen_in_world([table(), one, *BACKGROUND["monitor"]], T_world_camera)
+    close = (np.abs(points[:, :2]) < 0.12).all(axis=1) & (points[:, 2] < 0.005)
+    points[close, 2] -= 0.0 if given else 0.0015
+    asked = {"support": {"normal": (0, 0, 1), "offset": -0.003}} if given else {}
+    found = detect(points, viewpoint=T_world_camera[:3, 3].tolist(), **asked)
+    assert len(found.objects) == 1
+    assert found.support is not None
+    assert found.support.share > 0.4
+
+
 def test_a_workspace_is_where_grasps_are_and_what_is_beyond_stays() -> None:
     boxes = [box((-0.05, 0, 0.05), (0.02, 0.03, 0.05)), box((0.12, 0, 0.05), (0.02, 0.03, 0.05))]
     T_world_camera = camera(0.8, -1.5, 0.7)

@@ -123,13 +123,14 @@ def choose_support(
         around = np.inf if options.follows_only else BELOW_WORKSPACE * np.abs(request.normal)
         over = np.flatnonzero(inside_workspace(seen.points, options.workspace, around))
         some = over[thinned(len(over))]
-        found = measured(Seen(seen.points[some], seen.viewpoint), request, GIVEN_MARGIN)
+        whole = shown is not None and bool((shown.support > 0.5).mean() > CUT_OFF)
+        found = measured(Seen(seen.points[some], seen.viewpoint), request, GIVEN_MARGIN, whole)
     else:
         rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
         if isinstance(request, RansacPlane):
             weight = by_surface(seen.points) * inside
             plane = fit_plane(seen, weight, rng, up, request.max_tilt)
-            found = None if plane is None else measured(seen, plane, request.distance)
+            found = None if plane is None else measured(seen, plane, request.distance, True)
             found = None if found is None or found.share < request.min_share else found
         else:
             assert shown is not None
@@ -169,7 +170,7 @@ def _fitted(
         plane = fit_plane(part, weight, rng, up)
     if plane is None:
         return None
-    found = measured(part, _close_to(plane, part.points[apart < CLOSE]), THICK)
+    found = measured(part, _close_to(plane, part.points[apart < CLOSE]), THICK, True)
     places = found.frame.points(part.points)
     if _area(places[np.abs(places[:, 2]) < MOST_MARGIN]) <= LEAST_AREA:
         return None
@@ -194,7 +195,7 @@ def _assumed(
     if up is None:
         return None
     offset = float(np.percentile(seen.points.astype(np.float64) @ up, LOWEST)) - UNDER
-    return measured(seen, SupportPlane(normal=tuple(up.tolist()), offset=offset), 0.0)
+    return measured(seen, SupportPlane(normal=tuple(up.tolist()), offset=offset), 0.0, False)
 
 
 def _up_of_cut(cloud: Float32, viewpoint: Float64) -> Float64 | None:
@@ -307,8 +308,11 @@ def _toward(seen: Seen, origin: Float64, up: Float64 | None) -> Float64:
     return np.broadcast_to(np.array([0.0, 0.0, 1.0]) if up is None else up, origin.shape)
 
 
-def measured(seen: Seen, plane: SupportPlane, least: float) -> Support:
-    """The support of a plane, at least `least` metres thick, as the points show it."""
+def measured(seen: Seen, plane: SupportPlane, least: float, whole: bool) -> Support:
+    """The support of a plane, at least `least` metres thick, as the points show it.
+
+    `whole`: the cloud was not cut off above the plane.
+    """
     sample = Seen(seen.points[thinned(len(seen.points))], seen.viewpoint)
     frame = CanonicalFrame.of_scene(sample.points, plane.normal, seen.viewpoint)
     frame.T_canonical_cloud[2, 3] = -plane.offset / np.linalg.norm(plane.normal)
@@ -316,7 +320,7 @@ def measured(seen: Seen, plane: SupportPlane, least: float) -> Support:
     thick, distance = sample.thickness(), sample.distance()
     near = np.abs(height) < thick
     # If the cloud was cut off above the plane, only objects on it are near.
-    if near.sum() < FEWEST or (height[near] < 1e-4).mean() < 0.2:
+    if near.sum() < FEWEST or (not whole and (height[near] < 1e-4).mean() < 0.2):
         return Support(plane, frame, least)
     terms, bow = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y]), np.zeros(6)
     for _ in range(REFINEMENTS):
