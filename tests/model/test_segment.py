@@ -211,6 +211,18 @@ def test_points_scattered_over_the_table_are_no_object() -> None:
     assert standing(detect(cloud), boxes, T_world_camera) == {0}
 
 
+def test_bumps_in_an_empty_table_are_no_objects() -> None:
+    """Errors of a depth camera are as wide as small objects, but smooth."""
+    T_world_camera = camera(0.7, -1.5, 0.7)
+    points = seen_in_world([table()], T_world_camera)
+    for place in ((0.05, 0.0), (-0.1, 0.08), (0.15, -0.12)):
+        away = np.linalg.norm(points[:, :2] - place, axis=1)
+        points[:, 2] += 0.01 * np.exp(-((away / 0.02) ** 2))
+    found = detect(points, viewpoint=T_world_camera[:3, 3].tolist())
+    assert found.support is not None
+    assert not found.objects
+
+
 def test_without_a_support_in_view_everything_is_an_object_and_the_answer_says_so() -> None:
     T_world_camera = camera(0.8, -1.5, 0.5)
     found = detect(render([box((0, 0, 0), (0.03, 0.04, 0.06), 0.4)], T_world_camera))

@@ -37,8 +37,10 @@ from edgegrasp_model.scene.regions import (
 )
 from edgegrasp_model.scene.segment import (
     FIXED,
+    LIKELY,
     UNKNOWN,
     Segmentation,
+    confidences,
     segment,
     with_clusters,
     with_risen,
@@ -55,10 +57,7 @@ REACH = 0.25  # metres around an object in which a hand at it may collide
 FOLLOWED_REACH = 0.16  # the same if only known grasps are checked
 PLAN_CELL = 0.05  # metres
 CLOSE = 0.06  # metres; no camera measures closer
-# Confidence of objects that the network did not see: where a cloud was cut off above its support,
-# hardly anything else is left; and elsewhere.
-CUT_OUT, UNRECOGNISED = 0.95, 0.7
-LIKELY = 0.5  # probability of object or support above which a risen point may be an object
+CUT_OUT = 0.95  # confidence of clusters where a cloud was cut off above its support
 
 
 @dataclass(frozen=True)
@@ -192,9 +191,14 @@ def _recognised(
         number = with_risen(number, plan, height[above], margin[above], likely)
         cut_off = math.isnan(support.growth)
         if cut_off or not (number >= 0).any():
-            number = with_clusters(number, plan, likely | cut_off)
-            further = range(len(confidence), number.max(initial=-1) + 1)
-            confidence |= dict.fromkeys(further, CUT_OUT if cut_off else UNRECOGNISED)
+            first = len(confidence)
+            number = with_clusters(number, plan, likely | cut_off, first)
+            new = np.flatnonzero(number >= first)
+            which = number[new] - first
+            mean = np.bincount(which, shown.object[above[new]]) / np.bincount(which)
+            certain = np.full(len(mean), CUT_OUT) if cut_off else confidences(mean)
+            confidence |= enumerate(certain.tolist(), first)
+            number[new[certain[which] <= LIKELY]] = FIXED
     return number, confidence
 
 

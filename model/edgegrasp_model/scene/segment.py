@@ -39,6 +39,7 @@ BESIDE = 0.012  # metres from an object within which missed points may belong to
 STANDS_OUT = 0.004  # least metres that such points rise above the support's margin
 FEWEST_CELLS, FEWEST_EACH = 5, 4  # cells of a cluster, each BESIDE wide; points per cell
 MOST_CELLS = 2000  # along a side of the ground plan
+LIKELY = 0.5  # confidence from which an instance is an object, not background
 REACH, REACH_GROWTH = 0.012, 0.012  # metres, and share of the depth, from a point to its pixel
 
 
@@ -76,6 +77,12 @@ def shipped() -> tuple[SceneNet, Float64]:
         return network, np.array(json.loads(file.metadata()["confidence"]))
 
 
+def confidences(probability: Float64) -> Float64:
+    """The confidence (O,) of instances by the mean probability (O,) of an object."""
+    constant, factor = shipped()[1]
+    return np.asarray(1.0 / (1.0 + np.exp(-(constant + factor * probability))))
+
+
 def segment(
     points: Float32,  # (N, 3) cloud frame, metres
     # of each camera: position (3,), rows (M,) of its points; None: all
@@ -109,20 +116,20 @@ def _segment_view(
 ) -> Segmentation:
     """The segmentation of M points seen by one camera."""
     image = range_image(points, viewpoint, up, down)
-    turn, (network, (constant, factor)) = image.T_cloud_camera[:3, :3], shipped()
+    turn, (network, _) = image.T_cloud_camera[:3, :3], shipped()
     up_in_view = None if up is None else up @ turn
     pixels, seen_up = look(network, image.points, up_in_view, image.footprint)
     of_pixel = group(pixels)
-    score = constant + factor * mean_probability(of_pixel, pixels.classes)
-    likely = score > 0.0  # that it is an object, rather than background
+    confidence = confidences(mean_probability(of_pixel, pixels.classes))
+    likely = confidence > LIKELY
     new = np.append(np.where(likely, np.cumsum(likely) - 1, FIXED), [UNKNOWN, FIXED])
-    of_pixel, score = new[of_pixel], score[likely]
+    of_pixel = new[of_pixel]
     number = np.full(len(points), UNKNOWN)
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
     T_camera_cloud = np.linalg.inv(image.T_cloud_camera)
     arrays = pixels.points, of_pixel, pixels.classes, number, objects, support
     _look_up(points, T_camera_cloud, image.corner, 2 * image.footprint, *arrays)
-    return Segmentation(number, objects, support, 1.0 / (1.0 + np.exp(-score)), turn @ seen_up)
+    return Segmentation(number, objects, support, confidence[likely], turn @ seen_up)
 
 
 def look(
@@ -279,8 +286,8 @@ def with_risen(
     return number
 
 
-def with_clusters(number: Int64, plan: Float64, among: Bools) -> Int64:
-    """The numbers (N,), with clusters of other points as further objects.
+def with_clusters(number: Int64, plan: Float64, among: Bools, first: int) -> Int64:
+    """The numbers (N,), with clusters of other points as further objects, from `first` on.
 
     For clouds whose support was cut off, in which the network sees objects without what they stand
     on, and for a small object alone on a table, which it overlooks. `plan` (N, 2) are metres along
@@ -298,7 +305,7 @@ def with_clusters(number: Int64, plan: Float64, among: Bools) -> Int64:
     large = ndimage.sum_labels(points > 0, cluster, which) >= FEWEST_CELLS
     large &= ndimage.mean(points, cluster, which) >= FEWEST_EACH
     new = np.full(count + 1, UNKNOWN)
-    new[1:][large] = int(number.max(initial=-1)) + 1 + np.arange(large.sum())
+    new[1:][large] = first + np.arange(large.sum())
     number = number.copy()
     number[rows] = new[cluster[tuple(cell.T)]]
     return number
