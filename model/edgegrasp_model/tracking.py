@@ -161,11 +161,9 @@ def merged(
     new = [replace(grasp, id=followed.next_id + row) for row, grasp in enumerate(found)]
     kept = [grasp for grasp in kept if grasp.score >= options.min_score]
     grasps = [*kept, *(grasp for grasp in new if grasp.score >= options.min_score)]
-    order = _order(grasps, options, up, len(kept))[: options.top_k]
-    tracking = Tracking(Following.STARTED, followed.next_id + len(new))
-    if not previous.grasps:
-        return [grasps[row] for row in order], tracking
-    first, became = previous.grasps[0].id, Following.LOST
+    order = _order(grasps, options, up, len(kept))
+    first = previous.grasps[0].id if previous.grasps else None
+    became = untracked(previous).first
     held = next((row for row in order if grasps[row].id == first), None)
     if held is not None and _worth(grasps[held]) >= ALIVE:
         # Without a search the others are the earlier answer's own, whose scores vary with noise.
@@ -173,7 +171,8 @@ def merged(
         better = previous.search and best > _worth(grasps[held]) + MARGIN
         became = Following.REPLACED if better else Following.KEPT
         order = order if better else [held, *(row for row in order if row != held)]
-    return [grasps[row] for row in order], replace(tracking, first=became)
+    tracking = Tracking(became, followed.next_id + len(new))
+    return [grasps[row] for row in order[: options.top_k]], tracking
 
 
 def untracked(previous: Previous) -> Tracking:

@@ -55,9 +55,10 @@ def answer(found: list[Grasp], now: Grasp | None, **options: Any) -> tuple[list[
     return merged(found, Followed(moved, {}, {}, 8), asked, UP, lambda *_: [Evaluation(now, None)])
 
 
-def test_a_grasp_stays_first_unless_another_is_better_by_a_margin() -> None:
-    grasps, tracking = answer([grasp(0.88, 0.2)], grasp(0.8, 0.0))
-    assert ([one.id for one in grasps], tracking.first) == ([7, 8], "kept")
+@pytest.mark.parametrize("top_k", [1, 2])
+def test_a_grasp_stays_first_unless_another_is_better_by_a_margin(top_k: int) -> None:
+    grasps, tracking = answer([grasp(0.88, 0.2)], grasp(0.8, 0.0), top_k=top_k)
+    assert ([one.id for one in grasps], tracking.first) == ([7, 8][:top_k], "kept")
     assert tracking.next_id == 9
     grasps, tracking = answer([grasp(0.95, 0.2)], grasp(0.8, 0.0))
     assert ([one.id for one in grasps], tracking.first) == ([8, 7], "replaced")
