@@ -243,8 +243,8 @@ class GraspDetector:
         if scene is not None:
             if prepared.followed is not None:
                 score_poses = partial(self._score_poses, prepared, scene)
-                up = prepared.selected.up
-                grasps, tracking = merged(grasps, prepared.followed, options, up, score_poses)
+                context = options, scene, gripper, score_poses
+                grasps, tracking = merged(grasps, prepared.followed, *context)
             with prepared.timed("ranking"):
                 objects = detected_objects(scene, grasps, sample, score, gripper)
             if prepared.followed is not None:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import mean_of_alike, non_max_suppression
 from edgegrasp_model.options import (
     MAX_SURFACE,
@@ -23,7 +24,7 @@ from edgegrasp_model.options import (
     Suppression,
     Workspace,
 )
-from edgegrasp_model.ranking import COLLIDING, objects_first, ranked
+from edgegrasp_model.ranking import COLLIDING, drawbacks, objects_first, ranked
 from edgegrasp_model.results import OBSTACLE, Following
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.segment import FIXED, UNKNOWN
@@ -141,7 +142,8 @@ def merged(
     found: list[Grasp],  # of this cloud alone, best first
     followed: Followed,
     options: DetectOptions,
-    up: Float64,  # (3,) unit, cloud frame
+    scene: Scene,
+    gripper: Gripper,
     score: Callable[[Float32, Collision], list[Evaluation]],  # of poses (M, 4, 4) T_cloud_hand
 ) -> tuple[list[Grasp], Tracking]:
     """The earlier answer's grasps at their new poses, then others; the kept grasp comes first."""
@@ -161,7 +163,7 @@ def merged(
     new = [replace(grasp, id=followed.next_id + row) for row, grasp in enumerate(found)]
     kept = [grasp for grasp in kept if grasp.score >= options.min_score]
     grasps = [*kept, *(grasp for grasp in new if grasp.score >= options.min_score)]
-    order = _order(grasps, options, up, len(kept))
+    order = _order(grasps, options, scene, gripper, len(kept))
     first = previous.grasps[0].id if previous.grasps else None
     became = untracked(previous).first
     held = next((row for row in order if grasps[row].id == first), None)
@@ -181,7 +183,9 @@ def untracked(previous: Previous) -> Tracking:
     return Tracking(became, previous.next_id)
 
 
-def _order(grasps: list[Grasp], options: DetectOptions, up: Float64, kept: int) -> list[int]:
+def _order(
+    grasps: list[Grasp], options: DetectOptions, scene: Scene, gripper: Gripper, kept: int
+) -> list[int]:
     """Rows of grasps, best first, without duplicates of the first `kept` or of a better one."""
     if not grasps:
         return []
@@ -195,14 +199,19 @@ def _order(grasps: list[Grasp], options: DetectOptions, up: Float64, kept: int) 
         rows = rows[(rows < kept) | ~like_kept]
     else:
         rows, _ = non_max_suppression(T_cloud_tcp, rows, *near, len(rows))
-    score = np.array([grasps[row].score for row in rows])
-    free = np.array([grasps[row].collision_free for row in rows])
-    clearance = np.array([grasps[row].clearance for row in rows])
-    order = ranked(score, free, options.order, T_cloud_tcp[rows, :3, 3] @ up, clearance)
+    some = [grasps[row] for row in rows]
+    score = np.array([one.score for one in some])
+    free = np.array([one.collision_free for one in some])
+    clearance = np.array([one.clearance for one in some])
+    hands = scene.frame.poses([one.T_cloud_hand for one in some])
+    height, preferred = (hands @ gripper.T_hand_tcp)[:, 2, 3], score
     if options.order == "score":
-        number = np.array(
-            [-1 if grasps[row].object is None else grasps[row].object for row in rows]
-        )
+        places = np.stack([one.contact_point for one in some])
+        contact = np.asarray(cKDTree(scene.points_in_cloud).query(places)[1])
+        preferred = score - drawbacks(scene, contact, hands, gripper)
+    order = ranked(preferred, free, options.order, height, clearance)
+    if options.order == "score":
+        number = np.array([-1 if one.object is None else one.object for one in some])
         order = objects_first(order, score, number)
     return [int(row) for row in rows[order]]
 

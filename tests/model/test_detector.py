@@ -48,6 +48,11 @@ def test_seed_decides_and_zero_is_a_seed() -> None:
     assert not same(first, detect(seed=1, sampling="uniform"))
 
 
+@pytest.mark.parametrize("mode", ["avoid", "penalise"])
+def test_an_empty_previous_leaves_the_grasps_in_their_order(mode: str) -> None:
+    assert same(detect(collision=mode), detect(collision=mode, previous={}))
+
+
 def test_several_depth_images_show_each_object_once() -> None:
     boxes = [table(), *boxes_on_table(1)]
     poses = [camera(0.7, turn, 0.9) for turn in (0.0, 2.1, 4.2)]

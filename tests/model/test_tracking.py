@@ -12,7 +12,7 @@ from edgegrasp_model.options import parse_options
 from edgegrasp_model.tracking import Followed, Surface, merged, narrowed, registered, sampled
 from edgegrasp_results import Evaluation, Grasp
 
-UP = np.array([0.0, 0.0, 1.0])
+from .scenes import PANDA, scene_of
 
 
 def box_corner(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -52,7 +52,9 @@ def answer(found: list[Grasp], now: Grasp | None, **options: Any) -> tuple[list[
     previous = {"gripper": "panda", "grasps": [{"id": 7, "T_cloud_hand": pose, "object": 0}]}
     asked = parse_options({"previous": previous, **options})
     moved = {} if now is None else {0: np.eye(4)}
-    return merged(found, Followed(moved, {}, {}, 8), asked, UP, lambda *_: [Evaluation(now, None)])
+    scene = scene_of(np.zeros((9, 3), np.float32))
+    followed = Followed(moved, {}, {}, 8)
+    return merged(found, followed, asked, scene, PANDA, lambda *_: [Evaluation(now, None)])
 
 
 @pytest.mark.parametrize("top_k", [1, 2])
