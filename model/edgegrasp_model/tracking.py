@@ -167,10 +167,9 @@ def merged(
     first = previous.grasps[0].id if previous.grasps else None
     became = untracked(previous).first
     held = next((row for row in order if grasps[row].id == first), None)
-    if held is not None and _worth(grasps[held]) >= ALIVE:
+    if held is not None and (worth := _worth(grasps[held], options)) >= ALIVE:
         # Without a search the others are the earlier answer's own, whose scores vary with noise.
-        best = _worth(grasps[order[0]])
-        better = previous.search and best > _worth(grasps[held]) + MARGIN
+        better = previous.search and _worth(grasps[order[0]], options) > worth + MARGIN
         became = Following.REPLACED if better else Following.KEPT
         order = order if better else [held, *(row for row in order if row != held)]
     tracking = Tracking(became, followed.next_id + len(new))
@@ -201,7 +200,7 @@ def _order(
         rows, _ = non_max_suppression(T_cloud_tcp, rows, *near, len(rows))
     some = [grasps[row] for row in rows]
     score = np.array([one.score for one in some])
-    free = np.array([one.collision_free for one in some])
+    free = np.array([_free(one, options) for one in some])
     clearance = np.array([one.clearance for one in some])
     hands = scene.frame.poses([one.T_cloud_hand for one in some])
     height, preferred = (hands @ gripper.T_hand_tcp)[:, 2, 3], score
@@ -216,8 +215,12 @@ def _order(
     return [int(row) for row in rows[order]]
 
 
-def _worth(grasp: Grasp) -> float:
-    return grasp.score if grasp.collision_free else COLLIDING * grasp.score
+def _free(grasp: Grasp, options: DetectOptions) -> bool:
+    return grasp.collision_free or options.collision.mode == "ignore"
+
+
+def _worth(grasp: Grasp, options: DetectOptions) -> float:
+    return grasp.score if _free(grasp, options) else COLLIDING * grasp.score
 
 
 class Surface(NamedTuple):

@@ -48,7 +48,7 @@ def test_seed_decides_and_zero_is_a_seed() -> None:
     assert not same(first, detect(seed=1, sampling="uniform"))
 
 
-@pytest.mark.parametrize("mode", ["avoid", "penalise"])
+@pytest.mark.parametrize("mode", ["avoid", "penalise", "ignore"])
 def test_an_empty_previous_leaves_the_grasps_in_their_order(mode: str) -> None:
     assert same(detect(collision=mode), detect(collision=mode, previous={}))
 

@@ -64,6 +64,8 @@ def test_a_grasp_stays_first_unless_another_is_better_by_a_margin(top_k: int) ->
     assert tracking.next_id == 9
     grasps, tracking = answer([grasp(0.95, 0.2)], grasp(0.8, 0.0))
     assert ([one.id for one in grasps], tracking.first) == ([8, 7], "replaced")
+    grasps, tracking = answer([grasp(0.6, 0.2)], grasp(0.9, 0.0, free=False), collision="ignore")
+    assert ([one.id for one in grasps], tracking.first) == ([7, 8], "kept")
 
 
 def test_what_is_found_at_the_place_of_a_followed_grasp_is_that_grasp() -> None:
