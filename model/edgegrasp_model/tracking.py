@@ -81,8 +81,9 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
         return options
     low, high = np.min(places, axis=0) - AROUND, np.max(places, axis=0) + AROUND
     if options.workspace is not None:
-        inside = np.maximum(low, options.workspace.min), np.minimum(high, options.workspace.max)
-        low, high = inside if (inside[0] < inside[1]).all() else (low, high)
+        whole = np.array([options.workspace.min, options.workspace.max])
+        low, high = np.maximum(low, whole[0]), np.minimum(high, whole[1])
+        low, high = (low, high) if (low < high).all() else whole
     box = Workspace(min=tuple(low.tolist()), max=tuple(high.tolist()))
     unused = dict.fromkeys(("at", "near", "approach_region", "contact_region"))
     return options.model_copy(update={**unused, "workspace": box, "objects": "off"})

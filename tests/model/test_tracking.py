@@ -98,3 +98,13 @@ def test_previous_of_another_hand_or_frame_is_refused(gripper: str, x: float, er
     previous = {"gripper": gripper, "grasps": [{"id": 7, "T_cloud_hand": pose}]}
     with pytest.raises(InvalidRequest, match=error):
         narrowed(parse_options({"previous": previous}), "panda", np.zeros((9, 3), np.float32))
+
+
+@pytest.mark.parametrize(("begin", "low"), [(-0.1, -0.03), (0.0, 0.0), (0.2, 0.2)])
+def test_objects_are_followed_in_the_workspace_only(begin: float, low: float) -> None:
+    workspace = {"min": (begin, -1, -1), "max": (1, 1, 1)}
+    previous = {"objects": [{"number": 0, "surface": [0, 0, 0]}], "search": False}
+    asked = parse_options({"previous": previous, "workspace": workspace})
+    box = narrowed(asked, "panda", np.zeros((9, 3), np.float32)).workspace
+    assert box is not None
+    assert box.min[0] == low
