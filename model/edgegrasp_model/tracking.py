@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
+from edgegrasp_model.candidates.sample import allowed_directions
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import mean_of_alike, non_max_suppression
@@ -159,11 +160,13 @@ def merged(
         # A small overlap is allowed, since the hand was fully checked when it was found.
         there = zip(old, score((move @ before).astype(np.float32), rule), strict=True)
         kept = [replace(e.grasp, id=one.id, object=one.object) for one, e in there if e.grasp]
-    if options.collision.mode == "avoid":
-        kept = [grasp for grasp in kept if grasp.collision_free]
-    new = [replace(grasp, id=followed.next_id + row) for row, grasp in enumerate(found)]
-    kept = [grasp for grasp in kept if grasp.score >= options.min_score]
-    grasps = [*kept, *(grasp for grasp in new if grasp.score >= options.min_score)]
+    if kept:
+        ways = scene.frame.directions([one.approach_direction for one in kept])
+        fit = allowed_directions(ways, options.approach_direction, scene.frame.directions)
+        fit &= np.array([one.score >= options.min_score for one in kept])
+        fit &= np.array([one.collision_free or options.collision.mode != "avoid" for one in kept])
+        kept = [kept[row] for row in np.flatnonzero(fit)]
+    grasps = kept + [replace(one, id=followed.next_id + row) for row, one in enumerate(found)]
     order = _order(grasps, options, scene, gripper, len(kept))
     first = previous.grasps[0].id if previous.grasps else None
     became = untracked(previous).first
@@ -173,7 +176,7 @@ def merged(
         better = previous.search and _worth(grasps[order[0]], options) > worth + MARGIN
         became = Following.REPLACED if better else Following.KEPT
         order = order if better else [held, *(row for row in order if row != held)]
-    tracking = Tracking(became, followed.next_id + len(new))
+    tracking = Tracking(became, followed.next_id + len(found))
     return [grasps[row] for row in order[: options.top_k]], tracking
 
 

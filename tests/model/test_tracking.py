@@ -40,8 +40,8 @@ def test_an_object_is_found_where_it_was_moved_to(millimetres: Any, degrees: flo
     assert apart.max() < 0.003
 
 
-def grasp(score: float, x: float, free: bool = True) -> Grasp:
-    pose = np.eye(4, dtype=np.float32)
+def grasp(score: float, x: float, free: bool = True, z: float = -1.0) -> Grasp:
+    pose = np.diag(np.float32([1, z, z, 1]))
     pose[0, 3] = x
     return Grasp(score, pose, pose, 0.08, pose[:3, 3], pose[:3, 3], pose[:3, 2], free, 0.01, 0)
 
@@ -80,8 +80,10 @@ def test_new_grasps_near_each_other_stay_without_suppression(suppression: Any, i
     assert [one.id for one in grasps] == ids
 
 
-@pytest.mark.parametrize("now", [None, grasp(0.1, 0.0), grasp(0.9, 0.0, free=False)])
-def test_a_grasp_that_is_gone_fails_or_collides_is_lost(now: Grasp | None) -> None:
+@pytest.mark.parametrize(
+    "now", [None, grasp(0.1, 0.0), grasp(0.9, 0.0, free=False), grasp(0.9, 0.0, z=1.0)]
+)
+def test_a_grasp_that_is_gone_fails_collides_or_comes_from_below_is_lost(now: Grasp | None) -> None:
     grasps, tracking = answer([grasp(0.6, 0.2)], now)
     assert (grasps[0].id, tracking.first) == (8, "lost")
 
