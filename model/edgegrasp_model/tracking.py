@@ -51,8 +51,9 @@ ON_OBJECT = 0.012  # metres from an object's points within which points belong t
 class Followed:
     """The objects of `previous` that were found again, by their numbers."""
 
-    moved: dict[int, Float64]  # (4, 4) T_now_before of each, cloud frame
-    surface: dict[int, Float32]  # (K, 3) its points now; taken anew if few fit
+    # (4, 4) T_now_before of each, cloud frame, and its number now: the same, or its segment.
+    moved: dict[int | None, tuple[Float64, int | None]]  # None: what is on no object stays
+    surface: dict[int, Float32]  # (K, 3) points, by numbers in the answer; taken anew if few fit
     named: dict[int, int]  # numbers in the scene: numbers in the answer
     next_id: int
 
@@ -103,29 +104,37 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
         scene.frame.directions_in_cloud(scene.cloud.normals[seen]),
         cKDTree(points[seen]),
     )
-    moved: dict[int, Float64] = {}
+    moved: dict[int | None, tuple[Float64, int | None]] = {None: (np.eye(4), None)}
     surface: dict[int, Float32] = {}
     found = np.unique(number[number >= 0])
     named = {int(one): int(one) for one in found} if given else {}
     renamed = number.copy() if given or previous.search else np.full_like(number, UNKNOWN)
-    for one in previous.objects:
-        before = np.reshape(one.surface, (-1, 3)).astype(np.float64)
-        T, share = registered(before, cloud)
+    taken = np.zeros(len(number), dtype=bool)
+    places = [np.reshape(one.surface, (-1, 3)).astype(np.float64) for one in previous.objects]
+    matches = [(*registered(before, cloud), row) for row, before in enumerate(places)]
+    # Of two objects that match the same points, the better match is there.
+    for T, share, row in sorted(matches, key=lambda match: -match[1]):
         if share < FOUND:
             continue
-        now = before @ T[:3, :3].T + T[:3, 3]
+        now = places[row] @ T[:3, :3].T + T[:3, 3]
         near = seen[cloud.near(now)]
         if np.median(number[near]) < 0:
             continue
         near = near[number[near] >= 0]
-        moved[one.number], surface[one.number] = T, now.astype(np.float32)
-        if not given:
-            which = int(np.bincount(number[near]).argmax())
-            renamed[number == which if previous.search else near] = one.number
-            named[which] = one.number
-        if share < GOOD:
-            surface[one.number] = sampled(points[renamed == one.number])
-    next_id = max([previous.next_id, *(1 + one for one in [*moved, *named.values()])])
+        there, count = np.unique(number[near], return_counts=True)
+        which, name = int(there[count.argmax()]), previous.objects[row].number
+        mine = number == which if previous.search else near
+        if given:
+            name = which
+        elif taken[mine].mean() > 0.5:
+            continue
+        else:
+            renamed[mine], taken[mine], named[which] = name, True, name
+        moved[previous.objects[row].number] = T, name
+        fits = share >= GOOD
+        here = now.astype(np.float32) if fits else sampled(points[renamed == name])
+        surface.setdefault(name, here)
+    next_id = max([previous.next_id, *(1 + one for one in named.values())])
     for which in found if previous.search else ():
         if which not in named:
             named[int(which)], next_id = next_id, next_id + 1
@@ -151,15 +160,15 @@ def merged(
     """The earlier answer's grasps at their new poses, then others; the kept grasp comes first."""
     previous = options.previous
     assert previous is not None
-    old = [one for one in previous.grasps if one.object is None or one.object in followed.moved]
+    old = [one for one in previous.grasps if one.object in followed.moved]
     kept: list[Grasp] = []
     if old:
         before = np.reshape([one.T_cloud_hand for one in old], (-1, 4, 4))
-        move = [np.eye(4) if one.object is None else followed.moved[one.object] for one in old]
+        move, number = zip(*(followed.moved[one.object] for one in old), strict=True)
         rule = options.collision.model_copy(update={"margin": options.collision.margin - SLACK})
         # A small overlap is allowed, since the hand was fully checked when it was found.
-        there = zip(old, score((move @ before).astype(np.float32), rule), strict=True)
-        kept = [replace(e.grasp, id=one.id, object=one.object) for one, e in there if e.grasp]
+        there = zip(old, number, score((move @ before).astype(np.float32), rule), strict=True)
+        kept = [replace(e.grasp, id=one.id, object=now) for one, now, e in there if e.grasp]
     if kept:
         ways = scene.frame.directions([one.approach_direction for one in kept])
         fit = allowed_directions(ways, options.approach_direction, scene.frame.directions)

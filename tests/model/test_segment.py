@@ -1,6 +1,7 @@
 """What is found in a view without further options: the support, and the objects on it."""
 
 import tracemalloc
+from typing import Any
 
 import numpy as np
 import pytest
@@ -168,17 +169,55 @@ def test_segments_are_the_objects_where_they_are_sent() -> None:
     assert found.debug.labels.max() == number
 
 
+def continued(before: Detection) -> dict[str, Any]:
+    """What the next request sends of an answer."""
+    grasps = [
+        {"id": one.id, "T_cloud_hand": np.ravel(one.T_cloud_hand).tolist(), "object": one.object}
+        for one in before.grasps[:20]
+    ]
+    objects = [
+        {"number": one.number, "surface": np.ravel(one.surface).tolist()} for one in before.objects
+    ]
+    return {"gripper": before.gripper.name, "grasps": grasps, "objects": objects}
+
+
 def test_a_chosen_object_is_not_taken_for_one_beside_it_that_was_left_out() -> None:
     boxes = [box((0.045 * row, 0.0, 0.03), (0.015, 0.015, 0.03)) for row in range(3)]
     cloud = render([table(), *boxes], camera(0.8, -1.5, 0.7))
     before = detect(cloud, previous={})
-    objects = [
-        {"number": one.number, "surface": np.ravel(one.surface).tolist()} for one in before.objects
-    ]
-    assert len(objects) == 3
+    assert len(before.objects) == 3
     for one in before.objects:
-        now = detect(cloud, near=one.center.tolist(), previous={"objects": objects})
+        now = detect(cloud, near=one.center.tolist(), previous=continued(before))
         assert [each.number for each in now.objects] == [one.number]
+
+
+@pytest.mark.parametrize("search", [True, False])
+def test_followed_objects_have_the_numbers_of_the_segments_they_are_in(search: bool) -> None:
+    boxes, T_world_camera = boxes_on_table(5), camera(0.8, -1.5, 0.7)
+    cloud = render([table(), *boxes], T_world_camera)
+    near = np.nan_to_num(to_world(T_world_camera, cloud.reshape(-1, 3)), nan=9.0)
+    on = np.array([one.distance(near) < 0.004 for one in boxes])
+    segment = np.argmax([~on.any(axis=0), *on], axis=0)
+    previous = continued(detect(CloudInput(cloud, segment_ids=segment), previous={}))
+    renumbered = np.array([0, 4, 3, 2, 1])[segment]
+    now = detect(CloudInput(cloud, segment_ids=renumbered), previous=previous | {"search": search})
+    assert now.tracking is not None
+    assert now.tracking.first == "kept"
+    for number, there in [
+        *((one.number, one.surface) for one in now.objects),
+        *((one.object, one.contact_point[None]) for one in now.grasps),
+    ]:
+        assert number is not None
+        assert boxes[4 - number].distance(to_world(T_world_camera, there)).max() < 0.01
+
+
+@pytest.mark.parametrize("search", [True, False])
+def test_of_two_earlier_objects_in_one_place_only_one_is_there(search: bool) -> None:
+    cloud = render([table(), *boxes_on_table(5)], camera(0.8, -1.5, 0.7))
+    previous = continued(detect(cloud, previous={})) | {"search": search}
+    previous["objects"] += [previous["objects"][0] | {"number": 9}]
+    now = detect(cloud, previous=previous)
+    assert {grasp.object for grasp in now.grasps} <= {each.number for each in now.objects}
 
 
 def test_a_segment_for_every_pixel_takes_no_more_approach_points() -> None:

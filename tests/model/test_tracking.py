@@ -51,7 +51,7 @@ def answer(found: list[Grasp], now: Grasp | None, **options: Any) -> tuple[list[
     pose = np.eye(4).ravel().tolist()
     previous = {"gripper": "panda", "grasps": [{"id": 7, "T_cloud_hand": pose, "object": 0}]}
     asked = parse_options({"previous": previous, **options})
-    moved = {} if now is None else {0: np.eye(4)}
+    moved = {} if now is None else {0: (np.eye(4), 0)}
     scene = scene_of(np.zeros((9, 3), np.float32))
     followed = Followed(moved, {}, {}, 8)
     return merged(found, followed, asked, scene, PANDA, lambda *_: [Evaluation(now, None)])
