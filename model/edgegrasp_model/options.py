@@ -570,6 +570,12 @@ class Previous(Strict):
         "again, which takes a fraction of the time; send the `support` of that answer",
     )
 
+    @property
+    def free_id(self) -> int:
+        """Above all ids of grasps and numbers of objects in it."""
+        used = [grasp.id for grasp in self.grasps] + [one.number for one in self.objects]
+        return max([self.next_id, *(1 + one for one in used)])
+
     @model_validator(mode="after")
     def _distinct(self) -> Self:
         for name, numbers in (

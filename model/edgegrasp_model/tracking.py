@@ -134,7 +134,7 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
         fits = share >= GOOD
         here = now.astype(np.float32) if fits else sampled(points[renamed == name])
         surface.setdefault(name, here)
-    next_id = max([previous.next_id, *(1 + one for one in named.values())])
+    next_id = max([previous.free_id, *(1 + one for one in named.values())])
     for which in found if previous.search else ():
         if which not in named:
             named[int(which)], next_id = next_id, next_id + 1
@@ -192,7 +192,7 @@ def merged(
 def untracked(previous: Previous) -> Tracking:
     """The tracking state if nothing is seen."""
     became = Following.LOST if previous.grasps else Following.STARTED
-    return Tracking(became, previous.next_id)
+    return Tracking(became, previous.free_id)
 
 
 def _order(

@@ -9,7 +9,15 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import parse_options
-from edgegrasp_model.tracking import Followed, Surface, merged, narrowed, registered, sampled
+from edgegrasp_model.tracking import (
+    Followed,
+    Surface,
+    merged,
+    narrowed,
+    registered,
+    sampled,
+    untracked,
+)
 from edgegrasp_results import Evaluation, Grasp
 
 from .scenes import PANDA, scene_of
@@ -86,6 +94,16 @@ def test_new_grasps_near_each_other_stay_without_suppression(suppression: Any, i
 def test_a_grasp_that_is_gone_fails_collides_or_comes_from_below_is_lost(now: Grasp | None) -> None:
     grasps, tracking = answer([grasp(0.6, 0.2)], now)
     assert (grasps[0].id, tracking.first) == (8, "lost")
+
+
+@pytest.mark.parametrize("sent", [{}, {"next_id": 3}, {"next_id": 8}])
+def test_new_ids_are_above_all_that_are_sent(sent: Any) -> None:
+    pose, surface = np.eye(4).ravel().tolist(), [0.0, 0.0, 0.0]
+    sent |= {"grasps": [{"id": 7, "T_cloud_hand": pose}]}
+    sent |= {"objects": [{"number": 4, "surface": surface}]}
+    previous = parse_options({"previous": sent}).previous
+    assert previous is not None
+    assert untracked(previous).next_id == 8
 
 
 @pytest.mark.parametrize(
