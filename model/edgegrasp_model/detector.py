@@ -158,7 +158,7 @@ class GraspDetector:
                 f"uncalibrated for {gripper.name!r}; use them for ranking only."
             )
         options = _with_viewpoint(sent, options, warnings)
-        previous, followed = options.previous, None
+        previous, followed, choice = options.previous, None, options.objects
         if previous is not None:
             options = narrowed(options, gripper.name, sent.points)
         selected = select_points(sent, options, counts, warnings)
@@ -169,8 +169,8 @@ class GraspDetector:
                 f"{counts['kept']} points remain: too few for a surface; see counts."
             )
         elif previous is not None:
-            chosen = not isinstance(options.objects, str) or bool(options.at or options.near)
-            scene, followed = follow(scene, previous, sent.segment_ids is not None, chosen)
+            chosen, given = bool(options.at or options.near), sent.segment_ids is not None
+            scene, followed = follow(scene, previous, given, chosen, choice, warnings)
             if options.debug:
                 labels = relabelled(selected.labels, followed.named)
                 selected = replace(selected, labels=labels)

@@ -21,12 +21,14 @@ from edgegrasp_model.options import (
     MAX_SURFACE,
     Collision,
     DetectOptions,
+    ObjectChoice,
     Previous,
     Suppression,
     Workspace,
 )
 from edgegrasp_model.ranking import COLLIDING, drawbacks, objects_first, ranked
 from edgegrasp_model.results import OBSTACLE, Following
+from edgegrasp_model.scene.regions import numbers_chosen
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.segment import FIXED, UNKNOWN
 from edgegrasp_results import Evaluation, Grasp, Tracking
@@ -61,10 +63,13 @@ class Followed:
 def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOptions:
     """The options for building the scene: without a search, only around followed objects.
 
+    Objects are chosen by their numbers in the answer, which `follow` finds.
     InvalidRequest: `previous` is for another gripper, or in another frame than the points (N, 3).
     """
     previous = options.previous
     assert previous is not None
+    if not isinstance(options.objects, str):
+        options = options.model_copy(update={"objects": "auto"})
     if previous.gripper not in ("", gripper) or (previous.grasps and not previous.gripper):
         fix = f"Send what was found for {gripper!r}, or leave previous out."
         raise InvalidRequest("options.previous.gripper", repr(previous.gripper), fix)
@@ -91,12 +96,15 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
     return options.model_copy(update={**unused, "workspace": box, "objects": "off"})
 
 
-def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple[Scene, Followed]:
-    """Find the objects of an earlier answer again.
-
-    `given`: the caller gave their numbers; `chosen`: the request leaves some of them out, and what
-    is left must not be taken for those.
-    """
+def follow(
+    scene: Scene,
+    previous: Previous,
+    given: bool,  # the caller gave the objects' numbers
+    chosen: bool,  # some objects were left out; what is left must not be taken for those
+    choice: ObjectChoice | str,  # by numbers in the answer, if all are looked for
+    warnings: list[str],
+) -> tuple[Scene, Followed]:
+    """Find the objects of an earlier answer again."""
     points, number = scene.points_in_cloud, scene.object_of_point
     seen = np.flatnonzero((number >= 0) | (chosen & (number == FIXED)))
     cloud = Surface(
@@ -145,7 +153,17 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
     if not previous.search:
         known = [(one.number, one.confidence) for one in previous.objects]
         confidence = {which: value for which, value in known if value is not None}
-    scene = replace(scene, object_of_point=renamed, confidence=confidence)
+    all_numbers = np.unique(renamed[renamed >= 0])
+    wanted = numbers_chosen(all_numbers, choice if previous.search else "auto", warnings)
+    left = (renamed >= 0) & ~np.isin(renamed, wanted)
+    scene = replace(
+        scene,
+        object_of_point=np.where(left, FIXED, renamed),
+        approach_allowed=scene.approach_allowed & ~left,
+        contact_allowed=scene.contact_allowed & ~left,
+        confidence=confidence,
+    )
+    moved = {was: now for was, now in moved.items() if now[1] is None or now[1] in wanted}
     return scene, Followed(moved, surface, named, next_id)
 
 

@@ -211,6 +211,16 @@ def test_followed_objects_have_the_numbers_of_the_segments_they_are_in(search: b
         assert boxes[4 - number].distance(to_world(T_world_camera, there)).max() < 0.01
 
 
+def test_objects_are_chosen_by_the_numbers_that_following_gives_them() -> None:
+    cloud = render([table(), *boxes_on_table(5)], camera(0.8, -1.5, 0.7))
+    previous = continued(detect(cloud, previous={"next_id": 20}))
+    for chosen, numbers in (("include", {22}), ("exclude", {20, 21, 23})):
+        now = detect(cloud, previous=previous, objects={chosen: [22]})
+        assert {grasp.object for grasp in now.grasps} == numbers
+        assert {each.number for each in now.objects} == numbers
+        assert not now.warnings
+
+
 @pytest.mark.parametrize("search", [True, False])
 def test_of_two_earlier_objects_in_one_place_only_one_is_there(search: bool) -> None:
     cloud = render([table(), *boxes_on_table(5)], camera(0.8, -1.5, 0.7))

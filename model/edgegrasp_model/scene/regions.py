@@ -76,13 +76,7 @@ def chosen_objects(
     held = number[number >= 0]
     # Counting is many times faster, but takes as much memory as the caller's numbers are high.
     found = np.flatnonzero(np.bincount(held)) if cloud.segment_ids is None else np.unique(held)
-    wanted, choice = found, options.objects
-    if isinstance(choice, ObjectChoice):
-        if unknown := sorted({*choice.include, *choice.exclude} - {*found.tolist()}):
-            here = ", ".join(map(str, found[:10])) or "none"
-            warnings.append(f"objects: no object is numbered {unknown[0]}; there are: {here}.")
-        wanted = found[np.isin(found, choice.include)] if choice.include else found
-        wanted = wanted[~np.isin(wanted, choice.exclude)]
+    wanted = numbers_chosen(found, options.objects, warnings)
     for name, target in (("at", options.at), ("near", options.near)):
         if target is None:
             continue
@@ -101,6 +95,17 @@ def chosen_objects(
             shown = ", ".join(f"{value:g}" for value in target)
             warnings.append(f"{name}: no object that grasps may be for is at {shown}.")
     return np.where((number >= 0) & ~np.isin(number, wanted), FIXED, number)
+
+
+def numbers_chosen(found: Int64, choice: ObjectChoice | str, warnings: list[str]) -> Int64:
+    """Those of the objects numbered `found` that a choice names; all if it is in a word."""
+    if isinstance(choice, str):
+        return found
+    if unknown := sorted({*choice.include, *choice.exclude} - {*found.tolist()}):
+        here = ", ".join(map(str, found[:10])) or "none"
+        warnings.append(f"objects: no object is numbered {unknown[0]}; there are: {here}.")
+    wanted = found[np.isin(found, choice.include)] if choice.include else found
+    return wanted[~np.isin(wanted, choice.exclude)]
 
 
 def has_rows(region: Region | None) -> bool:
