@@ -276,7 +276,7 @@ def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
     T = np.eye(4)
     if len(before) < FEWEST or len(cloud.points) < FEWEST:
         return T, 0.0
-    spread = float(np.square(before - before.mean(axis=0)).sum(axis=1).mean())
+    spread = max(float(np.square(before - before.mean(axis=0)).sum(axis=1).mean()), 1e-9)
     stiff, total = np.diag(np.multiply(STIFF, [spread] * 3 + [1.0] * 3)), np.zeros(6)
     for reach in STEPS:
         now = before @ T[:3, :3].T + T[:3, 3]

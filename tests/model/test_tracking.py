@@ -48,6 +48,13 @@ def test_an_object_is_found_where_it_was_moved_to(millimetres: Any, degrees: flo
     assert apart.max() < 0.003
 
 
+def test_a_surface_of_one_place_is_found_there() -> None:
+    points, normals = box_corner(1)
+    surface = Surface(points.astype(np.float32), normals.astype(np.float32), cKDTree(points))
+    _, share = registered(np.repeat(points[:1], 9, axis=0), surface)
+    assert share == 1.0
+
+
 def grasp(score: float, x: float, free: bool = True, z: float = -1.0) -> Grasp:
     pose = np.diag(np.float32([1, z, z, 1]))
     pose[0, 3] = x
