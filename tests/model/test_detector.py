@@ -53,6 +53,13 @@ def test_an_empty_previous_leaves_the_grasps_in_their_order(mode: str) -> None:
     assert same(detect(collision=mode), detect(collision=mode, previous={}))
 
 
+def test_an_obstacle_may_be_as_thin_as_a_number_is() -> None:
+    plate = {"kind": "box", "min": (0.1, -0.1, 0.0), "max": (0.2, 0.1, 1e-300)}
+    found = detect(collision={"mode": "ignore", "obstacles": [plate]})
+    assert found.grasps
+    assert all(np.isfinite(grasp.clearance) for grasp in found.grasps)
+
+
 def test_several_depth_images_show_each_object_once() -> None:
     boxes = [table(), *boxes_on_table(1)]
     poses = [camera(0.7, turn, 0.9) for turn in (0.0, 2.1, 4.2)]

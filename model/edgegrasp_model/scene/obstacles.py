@@ -13,6 +13,7 @@ from edgegrasp_model.options import Box, OrientedBox
 from edgegrasp_model.scene.cloud import CanonicalFrame
 
 CHUNK = 20_000  # pairs of boxes at a time
+THINNEST = 1e-6  # metres, half a box of a request at least, so that its axes have a direction
 _SIGNS = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(8, 3)
 _DIFFER = (_SIGNS[:, None] != _SIGNS).sum(axis=2)  # (8, 8) coordinates
 _EDGES = np.argwhere(np.triu(_DIFFER == 1))  # (12, 2) corners
@@ -34,6 +35,7 @@ class SolidBoxes:
         centers, halves = np.empty((len(shapes), 3)), np.empty((len(shapes), 3, 3))
         for row, shape in enumerate(shapes):
             T_cloud_box, half = box_pose(shape)
+            half = np.maximum(half, THINNEST)
             centers[row], halves[row] = T_cloud_box[:3, 3], np.diag(half) @ T_cloud_box[:3, :3].T
         return cls(frame.points(centers), frame.directions(halves))
 
