@@ -51,10 +51,10 @@ def check_edges(edges: object, rows: int) -> Int64:
 
 def check_hand_poses(poses: object) -> Float32:
     """Check (M, 4, 4) poses T_cloud_hand; raises InvalidRequest unless they are rigid."""
-    fix = "Send floats of shape (M, 4, 4): T_cloud_hand."
+    fix = "Send numbers of shape (M, 4, 4): T_cloud_hand."
     if not isinstance(poses, np.ndarray):
         raise InvalidRequest("hand_poses", f"a {type(poses).__name__}", fix)
-    if poses.dtype.kind != "f" or poses.shape[1:] != (4, 4):
+    if poses.dtype.kind not in "fiu" or poses.shape[1:] != (4, 4):
         raise InvalidRequest("hand_poses", f"dtype {poses.dtype}, shape {poses.shape}", fix)
     _check_number("hand_poses", len(poses))
     rigid = are_rigid(poses)

@@ -136,6 +136,8 @@ def test_poses_in_the_air_hold_nothing_and_colliding_ones_are_marked() -> None:
     poses[1, 2, 3] = 0.1  # the tips below the table, the palm in the box
     air, box = detector().score(box_on_table(500), ask(), hand_poses=poses).evaluations
     assert air.reason == NoGrasp.NOTHING_BETWEEN
+    whole = detector().score(box_on_table(500), ask(), hand_poses=np.eye(4, dtype=int)[None])
+    assert len(whole.evaluations) == 1
     assert box.grasp is not None
     assert not box.grasp.collision_free
     assert box.grasp.clearance < 0

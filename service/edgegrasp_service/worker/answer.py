@@ -219,6 +219,4 @@ def _given(fields: Mapping[str, Any], max_points: int) -> dict[str, Array]:
     name, given = names[0], fields[names[0]]
     if not isinstance(given, np.ndarray):
         given = decode_array(name, given, max_points)
-    if name == "hand_poses" and given.dtype.kind in "iu":
-        given = given.astype(np.float64)
     return {name: given}
