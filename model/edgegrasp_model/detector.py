@@ -46,7 +46,15 @@ from edgegrasp_model.scene.scene import (
     object_probability,
     select_points,
 )
-from edgegrasp_model.tracking import Followed, follow, merged, narrowed, relabelled, untracked
+from edgegrasp_model.tracking import (
+    Followed,
+    follow,
+    merged,
+    narrowed,
+    only_chosen,
+    relabelled,
+    untracked,
+)
 from edgegrasp_results import Detection, Evaluation, GripperOutline, Scoring
 
 NO_APPROACH_POINT = (
@@ -170,7 +178,9 @@ class GraspDetector:
             )
         elif previous is not None:
             chosen, given = bool(options.at or options.near), sent.segment_ids is not None
-            scene, followed = follow(scene, previous, given, chosen, choice, warnings)
+            scene, followed = follow(scene, previous, given, chosen)
+            if previous.search:
+                scene, followed = only_chosen(scene, followed, choice, warnings)
             if options.debug:
                 labels = relabelled(selected.labels, followed.named)
                 selected = replace(selected, labels=labels)

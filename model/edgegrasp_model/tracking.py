@@ -28,6 +28,7 @@ from edgegrasp_model.options import (
 )
 from edgegrasp_model.ranking import COLLIDING, drawbacks, objects_first, ranked
 from edgegrasp_model.results import OBSTACLE, Following
+from edgegrasp_model.scene.cloud import thinned
 from edgegrasp_model.scene.regions import numbers_chosen
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.segment import FIXED, UNKNOWN
@@ -77,10 +78,8 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
     places += [place for one in previous.objects for place in np.reshape(one.surface, (-1, 3))]
     if not places:
         return options
-    some = points[:: max(len(points) // 2000, 1)]
-    apart, _ = cKDTree(some).query(np.array(places))
-    away = float(np.min(apart))
-    if away > FOREIGN:
+    apart, _ = cKDTree(points[thinned(len(points), 2000)]).query(np.array(places))
+    if (away := float(np.min(apart))) > FOREIGN:
         value = f"grasps {away:.2g} m from the nearest point of the cloud"
         fix = "Send previous in the frame of this cloud, or leave it out."
         raise InvalidRequest("options.previous", value, fix)
@@ -96,22 +95,16 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
     return options.model_copy(update={**unused, "workspace": box, "objects": "off"})
 
 
-def follow(
-    scene: Scene,
-    previous: Previous,
-    given: bool,  # the caller gave the objects' numbers
-    chosen: bool,  # some objects were left out; what is left must not be taken for those
-    choice: ObjectChoice | str,  # by numbers in the answer, if all are looked for
-    warnings: list[str],
-) -> tuple[Scene, Followed]:
-    """Find the objects of an earlier answer again."""
+def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple[Scene, Followed]:
+    """Find the objects of an earlier answer again.
+
+    `given`: the caller gave their numbers; `chosen`: the request leaves some of them out, and what
+    is left must not be taken for those.
+    """
     points, number = scene.points_in_cloud, scene.object_of_point
     seen = np.flatnonzero((number >= 0) | (chosen & (number == FIXED)))
-    cloud = Surface(
-        points[seen],
-        scene.frame.directions_in_cloud(scene.cloud.normals[seen]),
-        cKDTree(points[seen]),
-    )
+    normals = scene.frame.directions_in_cloud(scene.cloud.normals[seen])
+    cloud = Surface(points[seen], normals, cKDTree(points[seen]))
     moved: dict[int | None, tuple[Float64, int | None]] = {None: (np.eye(4), None)}
     surface: dict[int, Float32] = {}
     found = np.unique(number[number >= 0])
@@ -122,11 +115,8 @@ def follow(
     matches = [(*registered(before, cloud), row) for row, before in enumerate(places)]
     # Of two objects that match the same points, the better match is there.
     for T, share, row in sorted(matches, key=lambda match: -match[1]):
-        if share < FOUND:
-            continue
         now = places[row] @ T[:3, :3].T + T[:3, 3]
-        near = seen[cloud.near(now)]
-        if np.median(number[near]) < 0:
+        if share < FOUND or np.median(number[near := seen[cloud.near(now)]]) < 0:
             continue
         near = near[number[near] >= 0]
         there, count = np.unique(number[near], return_counts=True)
@@ -153,18 +143,25 @@ def follow(
     if not previous.search:
         known = [(one.number, one.confidence) for one in previous.objects]
         confidence = {which: value for which, value in known if value is not None}
-    all_numbers = np.unique(renamed[renamed >= 0])
-    wanted = numbers_chosen(all_numbers, choice if previous.search else "auto", warnings)
-    left = (renamed >= 0) & ~np.isin(renamed, wanted)
+    scene = replace(scene, object_of_point=renamed, confidence=confidence)
+    return scene, Followed(moved, surface, named, next_id)
+
+
+def only_chosen(
+    scene: Scene, followed: Followed, choice: ObjectChoice | str, warnings: list[str]
+) -> tuple[Scene, Followed]:
+    """Without the objects that a choice by numbers in the answer leaves out."""
+    number = scene.object_of_point
+    wanted = numbers_chosen(np.unique(number[number >= 0]), choice, warnings)
+    held = np.isin(number, wanted)
+    moved = {was: now for was, now in followed.moved.items() if now[1] is None or now[1] in wanted}
     scene = replace(
         scene,
-        object_of_point=np.where(left, FIXED, renamed),
-        approach_allowed=scene.approach_allowed & ~left,
-        contact_allowed=scene.contact_allowed & ~left,
-        confidence=confidence,
+        object_of_point=np.where((number >= 0) & ~held, FIXED, number),
+        approach_allowed=scene.approach_allowed & held,
+        contact_allowed=scene.contact_allowed & held,
     )
-    moved = {was: now for was, now in moved.items() if now[1] is None or now[1] in wanted}
-    return scene, Followed(moved, surface, named, next_id)
+    return scene, replace(followed, moved=moved)
 
 
 def merged(
@@ -176,10 +173,9 @@ def merged(
     score: Callable[[Float32, Collision], list[Evaluation]],  # of poses (M, 4, 4) T_cloud_hand
 ) -> tuple[list[Grasp], Tracking]:
     """The earlier answer's grasps at their new poses, then others; the kept grasp comes first."""
-    previous = options.previous
+    previous, kept = options.previous, list[Grasp]()
     assert previous is not None
     old = [one for one in previous.grasps if one.object in followed.moved]
-    kept: list[Grasp] = []
     if old:
         before = np.reshape([one.T_cloud_hand for one in old], (-1, 4, 4))
         move, number = zip(*(followed.moved[one.object] for one in old), strict=True)
@@ -195,9 +191,8 @@ def merged(
         kept = [kept[row] for row in np.flatnonzero(fit)]
     grasps = kept + [replace(one, id=followed.next_id + row) for row, one in enumerate(found)]
     order = _order(grasps, options, scene, gripper, len(kept))
-    first = previous.grasps[0].id if previous.grasps else None
-    became = untracked(previous).first
-    held = next((row for row in order if grasps[row].id == first), None)
+    became, first = untracked(previous).first, [one.id for one in previous.grasps[:1]]
+    held = next((row for row in order if grasps[row].id in first), None)
     if held is not None and (worth := _worth(grasps[held], options)) >= ALIVE:
         # Without a search the others are the earlier answer's own, whose scores vary with noise.
         better = previous.search and _worth(grasps[order[0]], options) > worth + MARGIN
@@ -231,7 +226,7 @@ def _order(
         rows, _ = non_max_suppression(T_cloud_tcp, rows, *near, len(rows))
     some = [grasps[row] for row in rows]
     score = np.array([one.score for one in some])
-    free = np.array([_free(one, options) for one in some])
+    free = np.array([one.collision_free or options.collision.mode == "ignore" for one in some])
     clearance = np.array([one.clearance for one in some])
     hands = scene.frame.poses([one.T_cloud_hand for one in some])
     height, preferred = (hands @ gripper.T_hand_tcp)[:, 2, 3], score
@@ -246,12 +241,9 @@ def _order(
     return [int(row) for row in rows[order]]
 
 
-def _free(grasp: Grasp, options: DetectOptions) -> bool:
-    return grasp.collision_free or options.collision.mode == "ignore"
-
-
 def _worth(grasp: Grasp, options: DetectOptions) -> float:
-    return grasp.score if _free(grasp, options) else COLLIDING * grasp.score
+    free = grasp.collision_free or options.collision.mode == "ignore"
+    return grasp.score if free else COLLIDING * grasp.score
 
 
 class Surface(NamedTuple):
