@@ -211,6 +211,7 @@ def detected_objects(
         which = int(number[row])
         T_cloud_box, half = _upright_box(scene, scene.object_of_point == which)
         turn = Rotation.from_matrix(T_cloud_box[:3, :3])
+        good = best.get(which, 0.0) >= GOOD_SCORE
         objects.append(
             DetectedObject(
                 number=which,
@@ -220,13 +221,13 @@ def detected_objects(
                 quaternion=turn.as_quat().astype(np.float32),
                 best_score=best.get(which),
                 confidence=scene.confidence.get(which),
-                reason=_why_ungraspable(scene, which, 2 * half, sample, score, gripper),
+                reason=None if good else _why(scene, which, 2 * half, sample, score, gripper),
             )
         )
     return objects
 
 
-def _why_ungraspable(
+def _why(
     scene: Scene,
     number: int,
     size: Float32,

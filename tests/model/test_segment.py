@@ -225,6 +225,8 @@ def test_objects_are_chosen_by_the_numbers_that_following_gives_them() -> None:
 def test_of_two_earlier_objects_in_one_place_only_one_is_there(search: bool) -> None:
     cloud = render([table(), *boxes_on_table(5)], camera(0.8, -1.5, 0.7))
     previous = continued(detect(cloud, previous={})) | {"search": search}
+    few = detect(cloud, previous=previous, num_candidates=1)
+    assert not any(one.reason for one in few.objects if (one.best_score or 0.0) >= 0.5)
     previous["objects"] += [previous["objects"][0] | {"number": 9}]
     now = detect(cloud, previous=previous)
     assert {grasp.object for grasp in now.grasps} <= {each.number for each in now.objects}
