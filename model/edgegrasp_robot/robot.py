@@ -201,7 +201,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     gripper = gripper_from_fields(hand)
     beyond = _cut_beyond(root, file.flange_frame)
     _fix_other_joints(root, joints)
-    _check_meshes(path, root, packages)
+    _check_meshes(urdf, root, packages)
     arm = as_text(root)
     _add_hand(root, file, gripper)
     shaped = [link for link in root.findall("link") if link.find("collision") is not None]
@@ -277,7 +277,7 @@ def _located(path: Path, field: str, name: str, packages: Sequence[str]) -> Path
         places = [path.parent / name.removeprefix("file://")]
     for place in places:
         if place.is_file():
-            return place
+            return place.absolute()
     fix = "Name a file beside this one, or add the folder of its package to `packages`"
     raise InvalidRobot(f"{path.name}: {field}: there is no {brief(name)}. {fix}.")
 
@@ -367,11 +367,11 @@ def _numbers(values: ArrayLike) -> str:
     return " ".join(f"{value:.12g}" for value in np.asarray(values))
 
 
-def _check_meshes(path: Path, root: Element, packages: Sequence[str]) -> None:
+def _check_meshes(urdf: Path, root: Element, packages: Sequence[str]) -> None:
     for link in root.findall("link"):
         for mesh in link.findall("collision/geometry/mesh"):
-            field = f"urdf: the mesh of {link.get('name')}"
-            mesh.set("filename", str(_located(path, field, str(mesh.get("filename")), packages)))
+            field, name = f"the mesh of {link.get('name')}", str(mesh.get("filename"))
+            mesh.set("filename", str(_located(urdf, field, name, packages)))
         for visual in link.findall("visual"):  # planning does not look at it
             link.remove(visual)
 
