@@ -283,8 +283,10 @@ def _located(path: Path, field: str, name: str, packages: Sequence[str]) -> Path
 
 
 def _link(joint: Element, which: str) -> str:
-    """The `parent` or `child` of a joint."""
-    return str(joint.find(which).get("link"))  # type: ignore[union-attr]
+    """The `parent` or `child` of a joint; raises ValueError if it has none."""
+    if (found := joint.find(which)) is None:
+        raise ValueError(f"joint {joint.get('name')} has no {which}")
+    return str(found.get("link"))
 
 
 def _above(root: Element, link: str) -> list[Element]:
