@@ -222,11 +222,15 @@ def _load(path: Path, file: RobotFile) -> Robot:
     if ((home < lower) | (home > upper)).any():
         fix = f"Give joints between {lower.tolist()} and {upper.tolist()}."
         raise InvalidRobot(f"{path.name}: home: got {home.tolist()}. {fix}")
+    fastest, accelerations = scenes[0].getVelocityLimitVectors(GROUP)[1], file.max_acceleration
+    for field, most in (("max_velocity", fastest), ("max_acceleration", accelerations)):
+        if min(most) <= 0.0:  # some exporters of URDFs write 0
+            fix = "Give what each joint can do, above 0."
+            raise InvalidRobot(f"{path.name}: {field}: got {np.asarray(most).tolist()}. {fix}")
     robot = Robot(
         path.stem, gripper, hand, file.base_frame, file.flange_frame,
         scenes[0].forwardKinematics(home, HAND, file.flange_frame), joint_names, home, lower, upper,
-        scenes[0].getVelocityLimitVectors(GROUP)[1],
-        scenes[0].getAccelerationLimitVectors(GROUP)[1],
+        fastest, np.array(accelerations),
         _kinematics(joints, scenes[0], file.base_frame), model, *scenes, SimpleIk(bare, IK),
     )  # fmt: skip
     if scenes[0].hasCollisions(home):

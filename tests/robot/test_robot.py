@@ -47,6 +47,8 @@ BAD = {
     "short home": ({"home": "[0.0]"}, "home: got 1 numbers"),
     "home beyond limits": ({"home": "[9.0, 0.0, 0.0, -2.0, 0.0, 2.0, 0.0]"}, "home"),
     "home in itself": ({"home": "[0.0, -1.7, 0.0, -3.0, 0.0, 0.6, 0.0]"}, "touch"),
+    "no speed": ({"max_velocity": "[0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]"}, "max_velocity: got [0.0"),
+    "backward": ({"max_acceleration": "[-1, 1, 1, 1, 1, 1, 1]"}, "max_acceleration: got"),
     "unknown field": ({"speed": "1.0"}, "speed"),
     "no toml": ({"home": "["}, "mine.toml"),
 }
@@ -64,17 +66,37 @@ def test_a_file_that_is_wrong_says_how(tmp_path, lines, word):
     assert word in str(error.value)
 
 
-def test_a_missing_mesh_is_named(tmp_path):
-    urdf = """<robot name="r"><link name="base"/><link name="tip"><collision><geometry>
-        <mesh filename="package://lost/tip.stl"/></geometry></collision></link>
-        <joint name="turn" type="revolute"><parent link="base"/><child link="tip"/>
-        <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
-        <link name="flange"/><joint name="end" type="fixed"><parent link="tip"/>
-        <child link="flange"/></joint></robot>"""
-    (tmp_path / "r.urdf").write_text(urdf)
-    lines = {
-        "urdf": '"r.urdf"', "srdf": '""', "base_frame": '"base"', "flange_frame": '"flange"',
-        "home": "[0.0]", "max_velocity": "[1.0]", "max_acceleration": "[1.0]",
-    }  # fmt: skip
-    with pytest.raises(InvalidRobot, match=r"mesh of tip: there is no 'package://lost/tip\.stl'"):
-        load_robot(changed(tmp_path, **lines))
+URDF = """<robot name="r"><link name="base"/><link name="tip"><collision><geometry>
+    <mesh filename="tip.obj"/></geometry></collision></link>
+    <joint name="turn" type="revolute"><parent link="base"/><child link="tip"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+    <link name="flange"/><joint name="end" type="fixed"><parent link="tip"/>
+    <child link="flange"/></joint></robot>"""
+ARM = {
+    "urdf": '"arm/r.urdf"', "srdf": '""', "base_frame": '"base"', "flange_frame": '"flange"',
+    "home": "[0.0]", "max_velocity": "", "max_acceleration": "[1.0]",
+}  # fmt: skip
+
+
+def test_meshes_lie_beside_their_urdf(tmp_path, monkeypatch):
+    (tmp_path / "arm").mkdir()
+    (tmp_path / "arm" / "r.urdf").write_text(URDF)
+    (tmp_path / "arm" / "tip.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n")
+    monkeypatch.chdir(changed(tmp_path, **ARM).parent)
+    assert load_robot("mine.toml").joint_names == ["turn"]
+
+
+@pytest.mark.parametrize(
+    ("known", "now", "said"),
+    [
+        ("tip.obj", "package://lost/a.stl", r"mesh of tip: there is no 'package://lost/a\.stl'"),
+        ('<parent link="tip"/>', "", "joint end has no parent"),
+        ('velocity="1"', 'velocity="0"', r"max_velocity: got \[0\.0\]"),
+    ],
+)
+def test_a_urdf_that_is_wrong_says_how(tmp_path, known, now, said):
+    (tmp_path / "arm").mkdir()
+    urdf = URDF.replace(known, now).replace('<mesh filename="tip.obj"/>', '<sphere radius="0.1"/>')
+    (tmp_path / "arm" / "r.urdf").write_text(urdf)
+    with pytest.raises(InvalidRobot, match=said):
+        load_robot(changed(tmp_path, **ARM))
