@@ -144,9 +144,10 @@ class Trainer:
     def finish(self, provenance: dict[str, Any], command: str) -> Evaluation:
         """Calibrate the best network on all validation views; write it and its card."""
         path = self.folder / f"{self.metadata.name}.safetensors"
-        best, _ = load_checkpoint(path, self.device)
+        best, saved = load_checkpoint(path, self.device)
         self.average.load_state_dict(rescaled(best, LENGTH_UNIT).state_dict())
-        if self.start is not None:  # mixed with where it started (Wortsman et al., CVPR 2022)
+        # Mixed once with where it started (Wortsman et al., CVPR 2022).
+        if self.start is not None and not saved.training:
             first = deepcopy(self.average)
             start_from(first, load_checkpoint(self.start, self.device)[0])
             with torch.no_grad():

@@ -94,6 +94,9 @@ def test_a_run_may_start_where_another_ended(make_trainer, tmp_path, network) ->
     _, metadata = load_checkpoint(tmp_path / "on" / "tiny.safetensors")
     assert metadata.training["started_from"] == "tiny"
     assert metadata.training["started_from_digest"] == load_checkpoint(start)[1].digest
+    half = make_trainer(tmp_path / "half", network, start=start, steps=4, keep=0.5)
+    half.run(ignore)
+    np.testing.assert_array_equal(*(half.finish({}, "").logit for _ in range(2)))
     kept = make_trainer(tmp_path / "kept", network, start=start, steps=4, keep=1.0)
     kept.run(ignore)
     logit = kept.finish({}, "edgegrasp train data").logit  # all of the old weights is kept
