@@ -95,8 +95,13 @@ class Trainer:
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).is_file():
             state = torch.load(folder / STATE_FILE, weights_only=True, map_location=device)
-            for name in STATEFUL:
-                getattr(self, name).load_state_dict(state[name])
+            try:
+                for name in STATEFUL:
+                    getattr(self, name).load_state_dict(state[name])
+            except RuntimeError:
+                raise ValueError(
+                    f"run: {folder} holds another model. Name another folder"
+                ) from None
             for name in COUNTERS:
                 setattr(self, name, state[name])
         else:

@@ -107,6 +107,8 @@ def test_weights_of_another_network_are_no_start(make_trainer, tmp_path) -> None
     make_trainer(tmp_path / "balls", "balls", steps=1).run(ignore)
     with pytest.raises(ValueError, match="same model"):
         make_trainer(tmp_path / "on", "hands", start=tmp_path / "balls" / "tiny.safetensors")
+    with pytest.raises(ValueError, match="holds another model"):
+        make_trainer(tmp_path / "balls", "hands")
 
 
 @pytest.fixture(scope="module")
