@@ -88,6 +88,7 @@ def train(
     The run folder gets log.csv, the weights with the least validation loss, and when training is
     done a model card. Running the same command again continues from the last state.
     """
+    from edgegrasp_model.detector import choose_device
     from edgegrasp_training.evaluation import recalibrate
     from edgegrasp_training.examples import Teacher
     from edgegrasp_training.recipes import recipe
@@ -105,8 +106,9 @@ def train(
     metadata, teacher = recipe(asked.model), None
     if asked.teacher is not None:
         teacher = Teacher(asked.teacher, metadata.network.crop_radius)
+    device = choose_device(asked.device)
     trainer = Trainer(
-        metadata, views, validation, asked.run, asked, asked.device, teacher, asked.start_from
+        metadata, views, validation, asked.run, asked, device, teacher, asked.start_from
     )
     print(f"{len(views)} training and {len(validation)} validation views")
     with Progress() as progress:
