@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,16 +113,19 @@ def _hand(fields: str) -> Gripper:
 
 
 def load_view(path: Path) -> LabelledView:
-    """Read a view."""
-    with np.load(path, allow_pickle=False) as arrays:
-        return LabelledView(
-            **{name: np.asarray(arrays[name], TYPES.get(name)) for name in REQUIRED},
-            **{name: arrays.get(name) for name in OPTIONAL},
-            engine=str(arrays.get("engine", LabelledView.engine)),
-            gripper=str(arrays.get("gripper", "")),
-            objects=tuple(map(str, arrays.get("objects", ()))),
-            object_digests=tuple(map(str, arrays.get("object_digests", ()))),
-        )
+    """Read a view; raises ValueError for another file."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return LabelledView(
+                **{name: np.asarray(arrays[name], TYPES.get(name)) for name in REQUIRED},
+                **{name: arrays.get(name) for name in OPTIONAL},
+                engine=str(arrays.get("engine", LabelledView.engine)),
+                gripper=str(arrays.get("gripper", "")),
+                objects=tuple(map(str, arrays.get("objects", ()))),
+                object_digests=tuple(map(str, arrays.get("object_digests", ()))),
+            )
+    except (KeyError, EOFError, BadZipFile) as error:
+        raise ValueError(f"data: {path} is no view of generate-data ({error}). Remove it") from None
 
 
 def different(paths: Iterable[Path], name: Literal["engine", "gripper"]) -> set[str]:
@@ -150,11 +154,17 @@ def scene_of(path: Path) -> str:
 def split_by_scene(
     paths: list[Path], validation_share: float, seed: int
 ) -> tuple[list[Path], list[Path]]:
-    """Training and validation views; a scene keeps its side when scenes are added."""
+    """Training and validation views; a scene keeps its side when scenes are added.
+
+    Raises:
+        ValueError: None is left to train on.
+    """
     place = {
         scene: zlib.crc32(f"{seed} {scene}".encode()) / 2**32 for scene in map(scene_of, paths)
     }
     limit = max(validation_share, min(place.values()) + 2**-32)
+    if max(place.values()) < limit:
+        raise ValueError(f"data: got {len(place)} scenes, all kept for validation. Make more")
     return (
         [path for path in paths if place[scene_of(path)] >= limit],
         [path for path in paths if place[scene_of(path)] < limit],

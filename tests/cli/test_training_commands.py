@@ -45,6 +45,8 @@ def test_training_pauses_goes_on_and_is_recalibrated(data, run, tmp_path) -> Non
     [
         (("train", "FOLDER"), "no .npz views"),
         (("train", "DATA", "--model", "huge"), "edgegrasp-plus"),
+        (("train", "DATA", "--device", "gpu"), "Use auto, cpu, cuda"),
+        (("train", "DATA", "--validation-share", "1"), "Make more"),
         (("import-checkpoint", "FOLDER"), "local_emd_model"),
         (("benchmark", "--scene", "attic"), "attic"),
         (("benchmark", "--objects", "FOLDER"), "urdf"),

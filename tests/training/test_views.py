@@ -46,6 +46,14 @@ def test_a_view_comes_back_with_the_hand_that_tried_its_grasps(tmp_path) -> None
     assert load_view(file).hand == load_gripper("robotiq-2f-140")
 
 
+def test_other_files_are_no_views(tmp_path) -> None:
+    np.savez(tmp_path / "scenes.npz", depth=np.zeros(3))
+    (tmp_path / "half.npz").write_bytes((tmp_path / "scenes.npz").read_bytes()[:99])
+    for file in tmp_path.iterdir():
+        with pytest.raises(ValueError, match="is no view"):
+            load_view(file)
+
+
 def test_scenes_never_fall_on_both_sides_and_keep_theirs_as_data_grows() -> None:
     paths = [Path(f"pile_{scene}_{view}.npz") for scene in range(200) for view in range(2)]
     train, validation = split_by_scene(paths, 0.2, seed=0)
