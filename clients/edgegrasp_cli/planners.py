@@ -45,9 +45,8 @@ def open_planner(
         GraspClientError: the server does not answer.
     """
     if choice.planner not in SHIPPED:
-        make = partial(named_planner, choice.planner)
-        make()  # fails here on a wrong name, not in every worker
-        yield ChosenPlanner(make, {"name": choice.planner})
+        _loaded(choice.planner)  # fails here on a wrong name, not in every worker
+        yield ChosenPlanner(partial(named_planner, choice.planner), {"name": choice.planner})
         return
     weights, model = [path.resolve() for path in choice.weights], choice.model
     if choice.server and (weights or choice.planner == "in-process"):
@@ -88,6 +87,11 @@ def named_planner(name: str) -> Planner:
     Raises:
         ValueError: there is no such planner.
     """
+    found = _loaded(name)
+    return cast("Planner", found() if isinstance(found, type) else found)
+
+
+def _loaded(name: str) -> Any:
     installed = entry_points(group=GROUP)
     try:
         if name in installed.names:
@@ -99,10 +103,9 @@ def named_planner(name: str) -> Planner:
             raise ValueError(f"planner is {name!r}; choose one of {known}, or module:callable")
     except (ImportError, AttributeError) as error:
         raise ValueError(f"planner {name!r} cannot be loaded: {error}") from error
-    planner: Any = found() if isinstance(found, type) else found
-    if not callable(planner):
+    if not callable(found):
         raise ValueError(f"planner {name!r} is not callable; name a function or a class")
-    return cast("Planner", planner)
+    return found
 
 
 class _OneThread(OwnDetector):

@@ -1,5 +1,6 @@
 """Tasks that do not depend on each other: in this process, in several, or on a Ray cluster."""
 
+import atexit
 import ctypes
 import importlib
 import multiprocessing
@@ -95,8 +96,10 @@ def _run(made: bytes, task: Any) -> Any:
 
 @lru_cache(maxsize=1)
 def _runner(made: bytes) -> Callable[[Any], Any]:
-    runner: Callable[[Any], Any] = pickle.loads(made)()
-    return runner
+    runner: Any = pickle.loads(made)()
+    if close := getattr(runner, "close", None):
+        atexit.register(close)
+    return runner  # type: ignore[no-any-return]
 
 
 def _on_ray(

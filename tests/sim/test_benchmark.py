@@ -36,11 +36,15 @@ from examples import your_planner
 
 MARK = Path(__file__).with_suffix(".died")
 
-def plan(observation, seed):
-    if not MARK.exists():
-        MARK.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return your_planner.plan(observation, seed)
+class Planner:
+    def __call__(self, observation, seed):
+        if not MARK.exists():
+            MARK.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return your_planner.plan(observation, seed)
+
+    def close(self):
+        MARK.with_suffix(".closed").touch()
 """
 
 
@@ -58,9 +62,10 @@ def test_rounds_of_a_crashed_worker_are_run_again_and_workers_change_nothing(
     config, digest = alone
     (tmp_path / "dies_once.py").write_text(DIES_ONCE)
     monkeypatch.syspath_prepend(tmp_path)  # workers get it, too
-    planner = importlib.import_module("dies_once").plan
-    rounds = run_benchmark(config, partial(partial, planner), workers=2)
+    planner = importlib.import_module("dies_once").Planner
+    rounds = run_benchmark(config, planner, workers=2)
     assert (tmp_path / "dies_once.died").exists()
+    assert (tmp_path / "dies_once.closed").exists()
     assert attempts_digest(rounds) == digest
 
 
