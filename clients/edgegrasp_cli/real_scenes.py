@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Int64
 from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
 from edgegrasp_camera.picture import View
+from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
 
 BEST = 10  # grasps of each scene that are judged
@@ -34,7 +35,7 @@ class RealScene:
     name: str
     request: Mapping[str, Any]  # the detector's input, as arguments of `GraspClient.detect`
     points: Float32  # (R, 3) NaN where there is no reading
-    labels: NDArray[np.uint8]  # (R,) 0 anything else, 1 the support plane, 2 and up objects
+    labels: Int64  # (R,) 0 anything else, 1 the support plane, 2 and up objects
     normal: Float64 | None  # (3,) of the support plane, toward the camera; None: it is hidden
     offset: float  # normal . x of its points
     camera: View
@@ -48,7 +49,7 @@ class RealScene:
     @property
     def object_of_point(self) -> Int64:
         """(R,) number of the object that each point is on, from 1; 0 for the background."""
-        return np.maximum(self.labels.astype(np.int64) - FIRST_OBJECT + 1, 0)
+        return np.maximum(self.labels - FIRST_OBJECT + 1, 0)
 
     @property
     def feet(self) -> Float64:
@@ -182,14 +183,17 @@ def load_scenes(folders: Sequence[Path]) -> list[RealScene]:
 def load_scene(file: Path) -> RealScene:
     """Read one scene; raises ValueError, with file, field and fix, for what is none."""
     try:
-        with np.load(file) as archive:
+        with file.open("rb") as opened, np.load(opened) as archive:
             arrays = dict(archive)
-    except (OSError, ValueError) as error:
+    except Exception as error:  # of another file numpy raises whatever it stumbles over
         fix = "Give what numpy.savez(file, ...) writes."
         raise ValueError(f"{file.name}: {error}. {fix}") from None
     checked = _Arrays(file.name, arrays)
     normal, offset = _plane(checked)
-    request, points = _cloud(checked)
+    try:
+        request, points = _cloud(checked)
+    except InvalidRequest as error:
+        raise ValueError(f"{file.name}: {error}") from None
     labels = checked.get("labels", "u", "an integer from 0 for each row", points.shape[:-1])
     labels = np.where(np.isfinite(points).all(axis=-1), labels, 0)
     if not (labels >= FIRST_OBJECT).any():
@@ -197,8 +201,9 @@ def load_scene(file: Path) -> RealScene:
     rgb = arrays.get("rgb")
     if rgb is not None:
         checked.get("rgb", "u", "a colour of three bytes for each pixel", points.shape)
-    camera, intrinsics = None, arrays.get("intrinsics")
-    if points.ndim == 3 and intrinsics is not None:
+    camera = None
+    if points.ndim == 3 and "intrinsics" in arrays:
+        intrinsics = checked.get("intrinsics", "fiu", "fx, fy, cx, cy", (4,))
         camera = View((points.shape[0], points.shape[1]), *intrinsics.tolist())
     elif points.ndim == 3:
         camera = View.of_image(points)
@@ -209,7 +214,7 @@ def load_scene(file: Path) -> RealScene:
         file.stem,
         request,
         points.reshape(-1, 3),
-        labels.ravel().astype(np.uint8),
+        labels.ravel().astype(np.int64),
         normal,
         offset,
         camera,
@@ -270,7 +275,7 @@ def _objects_held(scene: RealScene, grasps: Sequence[Any]) -> Int64:
     ends = [(grasp.approach_point, grasp.contact_point) for grasp in grasps]
     # Points of a grasp are means of small voxels, so they lie near a measured point, not on it.
     _, row = cKDTree(scene.points[seen]).query(np.asarray(ends).reshape(-1, 2, 3))
-    label = scene.labels[seen][row].astype(np.int64)  # (E, 2)
+    label = scene.labels[seen][row]  # (E, 2)
     same = (label[:, 0] == label[:, 1]) & (label[:, 0] >= FIRST_OBJECT)
     return np.where(same, label[:, 0], 0)
 
@@ -309,7 +314,7 @@ def _plane(arrays: _Arrays) -> tuple[Float64 | None, float]:
     if not {"support_normal", "support_offset"} & arrays.arrays.keys():
         return None, 0.0
     normal = arrays.get("support_normal", "f", "three numbers, of length 1", (3,))
-    if abs(np.linalg.norm(normal) - 1.0) > 1e-3:
+    if not abs(np.linalg.norm(normal) - 1.0) <= 1e-3:  # nor NaN
         arrays.refuse("support_normal", f"length {np.linalg.norm(normal):g}", "a unit normal")
     offset = float(arrays.get("support_offset", "f", "one number, metres", ()))
     return normal.astype(np.float64), offset

@@ -162,6 +162,8 @@ def test_a_scene_that_is_refused_counts_as_one_without_grasps(scene, run, tmp_pa
         ("labels", np.ones(SHAPE, np.uint8), "box.npz: labels: got no label above 1. Save"),
         ("labels", np.ones(7, np.uint8), "box.npz: labels: got shape (7,), dtype uint8. Save"),
         ("intrinsics", None, "box.npz: intrinsics: got nothing. Save"),
+        ("intrinsics", np.zeros(4), "box.npz: depth_images.0.intrinsics.fx: got 0"),
+        ("support_normal", np.full(3, np.nan), "box.npz: support_normal: got length nan"),
         ("support_normal", np.ones(3), "box.npz: support_normal: got length 1.73"),
         ("rgb", np.zeros((2, 2, 3), np.uint8), "box.npz: rgb: got shape (2, 2, 3)"),
     ],
@@ -172,13 +174,20 @@ def test_a_bad_file_is_named_with_field_and_fix(field, value, sentence, scene, r
     assert sentence in refused("benchmark-real", "--scenes", scene.parent)
 
 
+def test_labels_may_be_any_numbers(scene) -> None:
+    labels = seen_scene()["labels"].astype(np.uint16)
+    np.savez(scene, **seen_scene() | {"labels": np.where(labels > 1, labels + 254, labels)})
+    assert min(load_scene(scene).objects) == 256
+
+
 def test_what_is_no_scene_is_refused(refused, scene: Path, tmp_path: Path) -> None:
     twice = ("--scenes", scene.parent, "--scenes", scene.parent)
     assert "two of the name box" in refused("benchmark-real", *twice)
     scene.unlink()
     assert "Give a folder of scenes" in refused("benchmark-real", "--scenes", tmp_path)
-    (tmp_path / "foreign.npz").write_bytes(b"foreign")
-    assert "foreign.npz: " in refused("benchmark-real", "--scenes", tmp_path)
+    for content in (b"foreign", b"", b"PK\3\4", b"\x93NUMPY\1\0\2\0{}"):
+        (tmp_path / "foreign.npz").write_bytes(content)
+        assert "foreign.npz: " in refused("benchmark-real", "--scenes", tmp_path)
 
 
 LABELS = np.repeat([0, 1, 2, 3], [40, 20, 20, 20])
