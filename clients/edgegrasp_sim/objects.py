@@ -73,8 +73,11 @@ class ObjectModel:
 
     @property
     def files(self) -> list[Path]:
-        """Its URDF file and the meshes that it names, sorted by name."""
-        meshes = ElementTree.parse(self.urdf).iter("mesh")
+        """Its URDF file and the meshes that it names, sorted by name; ValueError: no XML."""
+        try:
+            meshes = ElementTree.parse(self.urdf).iter("mesh")
+        except ElementTree.ParseError as error:
+            raise ValueError(f"{self.urdf} cannot be read: {error}") from error
         named = {self.urdf.parent / mesh.get("filename", "") for mesh in meshes}
         return sorted({self.urdf} | {path for path in named if path.is_file()})
 

@@ -53,6 +53,8 @@ def test_folders_are_read_in_order_of_names(tmp_path: Path) -> None:
     objects = ObjectSet.from_folder(tmp_path, SceneKind.PACKED, "train")
     assert [model.name for model in objects.models] == ["a", "b", "c"]
     assert objects.name == "packed/train"
+    with pytest.raises(ValueError, match=r"a\.urdf cannot be read"):
+        assert objects.digest
 
 
 @pytest.fixture(scope="module")
