@@ -6,10 +6,10 @@ A protocol is a named and versioned file in `protocols/`; its constants go into 
 import tomllib
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, NonNegativeFloat, PositiveInt, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from edgegrasp_sim.camera import TableView, ViewRange
@@ -18,7 +18,7 @@ from edgegrasp_sim.sensor import SENSORS, DepthNoise, DepthSensor, random_sensor
 from edgegrasp_sim.surroundings import OPEN_THICKNESS
 
 FOLDER = Path(__file__).parent / "protocols"
-STRICT = ConfigDict(extra="forbid")
+STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 Range = tuple[float, float]
 
 
@@ -26,7 +26,9 @@ Range = tuple[float, float]
 class SceneRules:
     """The objects on the table."""
 
-    num_objects: tuple[int, ...]  # how many objects to try to place, in turn from round to round
+    num_objects: Annotated[
+        tuple[PositiveInt, ...], Field(min_length=1)
+    ]  # how many objects to try to place, in turn from round to round
     packed_scale: Range  # range of the factor on the objects' size in packed scenes and on tables
     pile_scale: Range  # range of that factor in piles and bins
     table_thickness: float = OPEN_THICKNESS  # of packed and pile scenes, metres
@@ -41,22 +43,22 @@ class RoundRules:
     """What counts as held, and conditions that end a round."""
 
     min_opening: float  # metres between the fingers; a hand that is open by less holds nothing
-    max_consecutive_failures: int  # failed grasps in a row that end a round
-    max_no_grasp: int  # views without any grasp that end a round
+    max_consecutive_failures: PositiveInt  # failed grasps in a row that end a round
+    max_no_grasp: PositiveInt  # views without any grasp that end a round
 
 
 @dataclass(frozen=True, config=STRICT)
 class CameraRules(ViewRange):
     """Where the camera stands; ranges are drawn from uniformly before every grasp."""
 
-    views: int  # images before every grasp, spread evenly over a full turn from the first
+    views: PositiveInt  # images before every grasp, spread evenly over a full turn from the first
 
 
 @dataclass(frozen=True, config=STRICT)
 class NoiseRules(DepthNoise):
     """Noise of the depth image, see `DepthNoise`, and of the points made from it."""
 
-    point_std: float = 0.0  # standard deviation of each coordinate of each point, metres
+    point_std: NonNegativeFloat = 0.0  # standard deviation of each coordinate of each point, metres
     # Kind of camera whose faults the images have besides; `random`: another before every grasp.
     sensor: Literal["", "random", "structured-light", "stereo", "time-of-flight"] = ""
 
@@ -139,7 +141,8 @@ def _constants(path: Path) -> dict[str, Any]:
         raise ValueError(f"base is {base!r}; name one of {', '.join(protocol_names())}")
     inherited = _constants(FOLDER / f"{base}.toml")
     for name, value in table.items():
-        inherited[name] = inherited.get(name, {}) | value if isinstance(value, dict) else value
+        both = isinstance(value, dict) and isinstance(inherited.get(name), dict)
+        inherited[name] = inherited[name] | value if both else value
     return inherited
 
 

@@ -163,6 +163,10 @@ def test_a_file_gives_what_differs_from_its_base(tmp_path: Path) -> None:
     [
         ("views = 1", "", "camera.views: Field required"),
         ("views = 1", "views = 1\nzoom = 2", "camera.zoom: Unexpected"),
+        ("views = 1", "views = 0", "camera.views: .* greater than 0"),
+        ("num_objects = [5]", "num_objects = []", "scene.num_objects: .* at least 1 item"),
+        ("packed_scale = [0.7", "packed_scale = [nan", "scene.packed_scale"),
+        ("version = 3", 'version = 3\nbase = "vgn"\n[rounds]', "rounds: Input"),
         ('table = "known"', 'table = "guess"', "planning.table: .* 'known', 'seen', 'around'"),
         ("version = 3", "version = ", "protocol .*toml"),
         ("version = 3", 'version = 3\nbase = "nobody"', "base is 'nobody'; name one of bin"),
