@@ -36,7 +36,7 @@ class Connection(BaseModel):
     tls_certificate: Path | None = Field(default=None, description="Client certificate, PEM")
     tls_key: Path | None = Field(default=None, description="Key of the client certificate, PEM")
 
-    def connect(self, address: str, timeout: float | None = None) -> "GraspClient":
+    def connect(self, address: str) -> "GraspClient":
         """A client of a server; raises GraspClientError."""
         from edgegrasp_client import GraspClient, Tls
 
@@ -49,7 +49,7 @@ class Connection(BaseModel):
             raise ValueError(f"token file {self.token_file}: {error}") from error
         return GraspClient(
             address,
-            timeout=timeout or self.timeout,
+            timeout=self.timeout,
             token=token,
             tls=Tls(*files) if self.tls or any(files) else None,
         )
@@ -58,6 +58,7 @@ class Connection(BaseModel):
 class PlannerFlags(Connection):
     """The flags that choose a planner of the benchmark."""
 
+    timeout: float = Field(default=300.0, description="Seconds to wait for a server")
     planner: str = Field(
         default="server", description="server, in-process, an installed one, or module:callable"
     )

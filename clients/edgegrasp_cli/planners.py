@@ -1,7 +1,7 @@
 """Planners for clutter removal: a detector, on a server or in this process, or any by name."""
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -20,7 +20,6 @@ from edgegrasp_sim.trial import PlannedGrasp, Planner, StartCollides
 
 GROUP = "edgegrasp.planners"  # entry points under which packages may name their planners
 SHIPPED = ("server", "in-process")
-CONNECT_SECONDS, REQUEST_SECONDS = 30.0, 300.0
 SUFFIX = ".safetensors"
 
 
@@ -59,16 +58,16 @@ def open_planner(
         weights, model = [*weights, file], file.stem
     asked = {"model": model, **options}
     with ExitStack() as stack:
-        open_client: Callable[[float], Any]
+        open_client: Callable[[], Any]
         if choice.planner == "in-process":
-            open_client = partial(_OneThread, weights, choice.robot)
+            open_client = partial(_OneThread, weights, robot=choice.robot)
         else:
             flags = [text for path in weights for text in ("--weights", str(path))]
             if choice.robot is not None:
                 flags += ["--robots", choice.robot]
             address = choice.server or stack.enter_context(local_server(*flags)).grpc_address
             open_client = partial(choice.connect, address)
-        with closing(open_client(CONNECT_SECONDS)) as client:
+        with closing(open_client()) as client:
             used = model_used(client, model)
         facts: dict[str, Any] = {"name": choice.planner, "options": dict(options)}
         facts |= {"model": used.name, "digest": used.digest, "voxel_size": used.voxel_size}
@@ -76,7 +75,8 @@ def open_planner(
             from edgegrasp_model.scene.segment import WEIGHTS
 
             facts["scene_digest"] = hashlib.sha256(WEIGHTS.read_bytes()).hexdigest()
-        yield ChosenPlanner(partial(ClientPlanner, open_client, rules, asked), facts)
+        make = partial(ClientPlanner, open_client, rules, asked, choice.timeout)
+        yield ChosenPlanner(make, facts)
 
 
 def named_planner(name: str) -> Planner:
@@ -111,9 +111,6 @@ def _loaded(name: str) -> Any:
 class _OneThread(OwnDetector):
     """A detector on one thread, whose sums do not depend on the number of threads."""
 
-    def __init__(self, weights: Sequence[Path], robot: str | None, timeout: float) -> None:
-        super().__init__(weights, robot=robot)
-
     def detect(self, cloud: Any = None, **options: Any) -> Any:
         import torch
 
@@ -129,20 +126,21 @@ class _OneThread(OwnDetector):
 class ClientPlanner:
     """Requests the best grasp of each observation; waits while a server restarts."""
 
-    open_client: Callable[[float], Any]  # of a timeout in seconds; a GraspClient or the like
+    open_client: Callable[[], Any]  # a GraspClient or the like
     rules: PlanningRules  # of the protocol
     options: Mapping[str, Any]  # of each request, besides the protocol's
+    timeout: float  # seconds
     _client: Any = field(default=None, init=False)
 
     def __call__(self, observation: Observation, seed: int) -> PlannedGrasp | None:
         """The best grasp; None if there is none.
 
         Raises:
-            GraspClientError: the server refuses the request, or is away for REQUEST_SECONDS.
+            GraspClientError: the server refuses the request, or is away for `timeout`.
             EdgeGraspError: the detector in this process refuses it.
         """
         if self._client is None:
-            self._client = self.open_client(REQUEST_SECONDS)
+            self._client = self.open_client()
         options = request_options(observation, seed, self.rules, self.options)
         views = observation.view_ids if len(observation.camera_positions) > 1 else None
         ask = partial(self._client.detect, observation.image, view_ids=views, **options)
@@ -150,7 +148,7 @@ class ClientPlanner:
             try:
                 grasps = ask().grasps
             except ServerUnavailableError:
-                self._client.wait_until_ready(REQUEST_SECONDS)
+                self._client.wait_until_ready(self.timeout)
                 grasps = ask().grasps
         except (StartCollision, StartCollisionError) as error:
             raise StartCollides(str(error)) from None

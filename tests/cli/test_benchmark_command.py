@@ -193,6 +193,12 @@ def test_a_model_may_be_a_file_of_weights(tmp_path: Path) -> None:
             pass
 
 
+def test_a_planner_waits_for_a_server_as_long_as_the_flag_says() -> None:
+    choice = PlannerFlags(planner="in-process", timeout=7.0)
+    with open_planner(choice, PAPER, {}) as made:
+        assert made.make().timeout == 7.0
+
+
 def test_a_view_in_which_the_arm_touches_the_table_is_told_from_other_errors() -> None:
     pytest.importorskip("roboplan", reason="the extra robot is not installed")
     *_, fields = benchmark_arm("fr3", load_protocol("edgegrasp").camera)
