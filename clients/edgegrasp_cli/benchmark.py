@@ -130,7 +130,7 @@ def _plan(
         rules,
         asked.objects.resolve() if asked.objects is not None else None,
         asked.split,
-        "mujoco" if asked.robot else asked.engine or "",
+        asked.engine or ("mujoco" if asked.robot else ""),
         hand,
         arm,
     )
@@ -230,7 +230,7 @@ def run_rounds(
     """Run the remaining rounds, with a progress bar; returns all, and `run` of the manifest."""
     from edgegrasp_cli.planners import open_planner
     from edgegrasp_sim.benchmark import manifest, run_benchmark
-    from edgegrasp_sim.results import count
+    from edgegrasp_sim.results import below_gate, count, summary_of
 
     # Fails on a wrong folder before a server is started, and prepares meshes once for all workers.
     with Console(stderr=True).status("reading objects"):
@@ -239,6 +239,8 @@ def run_rounds(
     came: list[Round] = []
     with open_planner(asked, config.protocol.planning, options) as planner:
         facts = manifest(config, planner.facts)
+        if asked.gate is not None:  # another file fails here, not after hours
+            below_gate(summary_of(facts["run"], []), asked.gate)
         if folder is not None:
             folder.open(facts)
         finished = sum(folder.has(*task) for task in tasks) if folder is not None else 0

@@ -45,6 +45,7 @@ def test_a_picture_of_a_robot(run, tmp_path: Path) -> None:
     ("words", "said"),
     [
         (("robot", "check", "r2d2"), "Use one of ['fr3', 'ur5']"),
+        (("benchmark", "--robot", "fr3", "--engine", "drake"), "engine is 'drake'"),
         (
             ("robot", "add", UR5, "--base", "b", "--flange", "tool0", "--output", "x.toml"),
             "base_link",
