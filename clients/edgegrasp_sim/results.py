@@ -43,12 +43,16 @@ class ResultFolder:
         known = self.path / "manifest.json"
         manifest = json.loads(json.dumps(manifest))  # tuples become lists, as in the file
         if known.is_file():
-            before, now = self.manifest()["run"], manifest["run"]
+            held = self.manifest()
+            before, now = held["run"], manifest["run"]
             changed = [key for key in before | now if before.get(key) != now.get(key)]
+            changed += ["seeds"] if {*held["seeds"]} - {*manifest["seeds"]} else []
+            changed += ["rounds"] if held["rounds"] > manifest["rounds"] else []
             if changed:
                 raise ValueError(
                     f"{self.path} holds another benchmark (different {', '.join(changed)}); "
-                    "choose another folder, or repeat the command that began it"
+                    "choose another folder, or repeat the command that began it, with more rounds "
+                    "or seeds if you like"
                 )
         (self.path / "rounds").mkdir(parents=True, exist_ok=True)
         _write(known, json.dumps(manifest, indent=1) + "\n")

@@ -91,14 +91,18 @@ def test_results_of_two_engines_are_kept_apart(tmp_path: Path) -> None:
     run = {"scene": "pile", "protocol": {"name": "edgegrasp", "version": 2}, "planner": {}}
     run |= {"objects": {}, "constants": {}}
     folders = ResultFolder(tmp_path / "before"), ResultFolder(tmp_path / "after")
-    folders[0].open({"run": run | {"engine": "pybullet"}})
-    folders[1].open({"run": run | {"engine": "mujoco"}})
+    amount = {"seeds": [0, 1], "rounds": 2}
+    folders[0].open({"run": run | {"engine": "pybullet"}, **amount})
+    folders[1].open({"run": run | {"engine": "mujoco"}, **amount})
     for folder in folders:
         folder.add(ROUNDS[0])
     with pytest.raises(ValueError, match=r"different engine"):
-        folders[0].open({"run": run | {"engine": "mujoco"}})
+        folders[0].open({"run": run | {"engine": "mujoco"}, **amount})
     with pytest.raises(ValueError, match=r"different engine"):
-        folders[0].open({"run": run})
+        folders[0].open({"run": run, **amount})
+    for less in ({"seeds": [2]}, {"rounds": 1}):
+        with pytest.raises(ValueError, match=f"different {next(iter(less))}"):
+            folders[0].open({"run": run | {"engine": "pybullet"}, **amount | less})
     with pytest.raises(ValueError, match=r"differ in engine"):
         compare(*folders)
     gate = gate_file(tmp_path, 90, 100)
