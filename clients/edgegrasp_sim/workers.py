@@ -72,6 +72,10 @@ def _in_processes(
                 crashes = 0
                 missing.remove(task)
                 yield task, result
+        except (KeyboardInterrupt, GeneratorExit):  # their results would be lost anyway
+            for process in list(pool._processes.values()):
+                process.terminate()
+            raise
         except BrokenProcessPool:
             crashes += 1
             if crashes >= MAX_CRASHES:

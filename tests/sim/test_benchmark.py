@@ -20,6 +20,7 @@ from edgegrasp_sim.protocol import FOLDER, load_protocol, protocol_from, protoco
 from edgegrasp_sim.results import ResultFolder, attempts_digest, summarise
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trial import PlannedGrasp, Planner, Round, RoundDriver, RoundEnd, StartCollides
+from edgegrasp_sim.workers import run_tasks
 
 from .conftest import paper_with
 
@@ -67,6 +68,12 @@ def test_rounds_of_a_crashed_worker_are_run_again_and_workers_change_nothing(
     assert (tmp_path / "dies_once.died").exists()
     assert (tmp_path / "dies_once.closed").exists()
     assert attempts_digest(rounds) == digest
+
+
+def test_a_run_that_is_given_up_does_not_wait_for_its_workers() -> None:
+    made = run_tasks(partial(partial, time.sleep), (0, 600), workers=2)
+    assert next(made) == (0, None)
+    made.close()
 
 
 def test_the_manifest_holds_what_decides_the_figures(engine: str) -> None:
