@@ -82,10 +82,7 @@ def open_planner(
 def named_planner(name: str) -> Planner:
     """The planner of a name: `module:attribute`, or an entry point of `edgegrasp.planners`.
 
-    A function is the planner itself; a class is called without arguments to make one.
-
-    Raises:
-        ValueError: there is no such planner.
+    A class is called without arguments to make one. ValueError: there is no such planner.
     """
     found = _loaded(name)
     return cast("Planner", found() if isinstance(found, type) else found)

@@ -156,8 +156,7 @@ def split_by_scene(
 ) -> tuple[list[Path], list[Path]]:
     """Training and validation views; a scene keeps its side when scenes are added.
 
-    Raises:
-        ValueError: None is left to train on.
+    ValueError: none is left to train on.
     """
     place = {
         scene: zlib.crc32(f"{seed} {scene}".encode()) / 2**32 for scene in map(scene_of, paths)
