@@ -23,6 +23,7 @@ from edgegrasp_camera.picture import draw_detection
 from edgegrasp_cli.flags import Connection, option_flags, parse_option_flags, takes_flags
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.request_cloud import File, decode_cloud, value_of_text
+from edgegrasp_results import plain
 
 if TYPE_CHECKING:
     from edgegrasp_client import DepthImage, Model
@@ -129,9 +130,8 @@ def detect(
     if asked.trajectory is not None:
         _write_trajectory(asked.trajectory, detection)
     if as_document:
-        from edgegrasp_service.worker.http_bodies import write
-
-        print(write(detection).decode())
+        text = json.dumps(detection, default=plain)
+        print(json.dumps(json.loads(text, parse_constant=lambda _: None)))  # NaN is null
     else:
         _print_detection(detection)
 

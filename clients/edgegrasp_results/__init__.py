@@ -4,7 +4,7 @@ The shape in an array's annotation is the client's.
 """
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -178,3 +178,12 @@ class Scoring:
     seconds: dict[str, float]
     model: str
     warnings: list[str] = field(default_factory=list)
+
+
+def plain(value: Any) -> Any:
+    """The JSON form of a part of an answer that JSON does not know; its floats are float32."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    fields = vars(value)
+    floats = {name: one for name, one in fields.items() if isinstance(one, float)}
+    return fields | {name: float(np.float32(one)) for name, one in floats.items()}

@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,16 @@ def test_flags_win_over_the_options_file(file, dummy_server, run, refused, tmp_p
         assert sentence in refused(*asked)
 
 
+def test_json_of_a_server_needs_no_package_of_the_server(
+    camera_files, dummy_server, run, monkeypatch
+) -> None:
+    """`pip install 'edgegrasp[cli,view]'` is enough."""
+    monkeypatch.setitem(sys.modules, "orjson", None)
+    monkeypatch.delitem(sys.modules, "edgegrasp_service.worker.http_bodies", raising=False)
+    asked = ("--server", dummy_server.grpc_address, "--json")
+    assert len(json.loads(run("detect", *camera_files, *asked))["grasps"]) == 10
+
+
 def test_a_table_shows_counts_and_warnings(file: str, dummy_server, run) -> None:
     output = run("detect", file, "--server", dummy_server.http_url, "--top-k", "3")
     assert len(re.findall(r"^\d +0\.\d{3}.* (?:yes|no) *$", output, re.MULTILINE)) == 3
@@ -54,7 +65,7 @@ def camera_files(tmp_path: Path) -> list[str]:
 
 def test_a_depth_image_is_grasped_where_its_mask_is(camera_files, dummy_server, run) -> None:
     flags = (*camera_files, "--json", "--num-approach-points", "4", "--debug", "--support", "none")
-    document = json.loads(run("detect", *flags))
+    document = json.loads(run("detect", *flags), parse_constant=pytest.fail)  # NaN is null
     assert document["counts"]["points"] == 24 * 32
     assert document["counts"]["in_approach_region"] < document["counts"]["kept"]
     debug = document["debug"]

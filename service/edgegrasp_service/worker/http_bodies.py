@@ -11,7 +11,6 @@ from pathlib import PurePath
 from typing import Any
 from urllib.parse import parse_qsl
 
-import numpy as np
 import orjson
 from werkzeug.exceptions import HTTPException
 from werkzeug.formparser import MultiPartParser
@@ -28,7 +27,7 @@ from edgegrasp_model.request_cloud import (
     unique_keys,
     value_of_text,
 )
-from edgegrasp_results import Detection, Scoring
+from edgegrasp_results import Detection, Scoring, plain
 from edgegrasp_service.errors import UnsupportedMediaType
 from edgegrasp_service.worker.process import Job
 
@@ -85,16 +84,7 @@ def read_request(job: Job) -> dict[str, Any]:
 
 def write(result: Detection | Scoring) -> bytes:
     """A result as DetectionBody or ScoringBody; its floats are exact float32 values."""
-    return orjson.dumps(result, default=_plain, option=orjson.OPT_PASSTHROUGH_DATACLASS)
-
-
-def _plain(value: Any) -> Any:
-    """The JSON form of a value that orjson does not know; orjson writes NaN as null."""
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    fields = vars(value)
-    floats = {name: one for name, one in fields.items() if isinstance(one, float)}
-    return fields | {name: float(np.float32(one)) for name, one in floats.items()}
+    return orjson.dumps(result, default=plain, option=orjson.OPT_PASSTHROUGH_DATACLASS)
 
 
 def _refuse_unknown(fields: Iterable[str], known: tuple[str, ...], kind: str) -> None:
