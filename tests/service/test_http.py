@@ -109,7 +109,7 @@ async def test_headers_that_do_not_come_are_not_waited_for(serve) -> None:
         ("127.0.0.1", {}, 200),
         ("[::1]:8000", {}, 200),
         ("edgegrasp", {}, 200),  # a name within one's own network
-        ("robot.example", {"allowed_hosts": ["robot.example"]}, 200),
+        ("robot.example", {"allowed_hosts": ["Robot.example"]}, 200),
         ("evil.example", {"allowed_hosts": ["robot.example"]}, 400),
         ("evil.example", {"allowed_hosts": ["*"]}, 200),
     ],

@@ -167,8 +167,9 @@ class HttpMiddleware:
     def _serves(self, host: str) -> bool:
         """Whether a Host header names this server, not a name that a web page pointed at it."""
         name = re.sub(r":\d*$", "", host).strip("[]").lower()
-        allowed = self._service.settings.allowed_hosts
-        if name in allowed or "*" in allowed or name == self._service.settings.host:
+        settings = self._service.settings
+        allowed = [one.lower() for one in settings.allowed_hosts]
+        if name in allowed or "*" in allowed or name == settings.host.lower():
             return True
         if allowed:
             return False
