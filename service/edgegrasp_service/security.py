@@ -70,15 +70,13 @@ def _read_tokens(setting: str, path: Path | None) -> list[Token]:
     if path is None:
         return []
     try:
-        lines = [line.strip() for line in path.read_text().splitlines()]
+        lines = [line.partition("#")[0].strip() for line in path.read_text().splitlines()]
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidSettings(
             f"{setting}: got {str(path)!r}. It cannot be read: {error}."
         ) from None
     tokens: list[Token] = []
-    for line in lines:
-        if not line or line.startswith("#"):
-            continue
+    for line in filter(None, lines):
         number = len(tokens) + 1
         name, text = _NAMED.fullmatch(line).groups()  # type: ignore[union-attr]  # anything matches
         if not _TOKEN.fullmatch(text):

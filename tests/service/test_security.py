@@ -209,3 +209,9 @@ def test_bad_files_are_named(tmp_path: Path, text: str | bytes | None, sentence:
         Tokens(Settings(token_file=path))
     assert sentence in str(caught.value)
     assert "short" not in str(caught.value)
+
+
+def test_a_comment_may_follow_a_token(tmp_path: Path) -> None:
+    path = tmp_path / "tokens"
+    path.write_text(f"# all robots\n\nleft:{USER}  # of cell 1\n")
+    assert Tokens(Settings(token_file=path)).check(f"Bearer {USER}").name == "left"
