@@ -45,7 +45,7 @@ class Server:
     """Both transports of one service. Must be created in the running event loop.
 
     Raises:
-        InvalidSettings: A certificate or a token cannot be used.
+        InvalidSettings: A certificate, a token or another file of the settings cannot be used.
     """
 
     def __init__(

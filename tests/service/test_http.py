@@ -8,6 +8,8 @@ from typing import Any
 import httpx
 import pytest
 
+from edgegrasp_service.errors import InvalidSettings
+
 
 def test_pages_work_without_internet(dummy_server) -> None:
     with httpx.Client(base_url=dummy_server.http_url, follow_redirects=True) as http:
@@ -27,6 +29,11 @@ async def test_the_front_page_is_the_playground_or_that_of_the_api(serve) -> Non
         assert front.url.path == path
         assert "default-src 'none'" in front.headers["content-security-policy"] or not playground
         assert (await http.get("/playground/")).status_code == status
+
+
+async def test_a_folder_of_samples_that_is_missing_is_named(serve, tmp_path) -> None:
+    with pytest.raises(InvalidSettings, match=r"samples: got '.*none', which is no folder"):
+        await serve(samples=tmp_path / "none")
 
 
 def test_head_is_get_without_the_body(dummy_server) -> None:

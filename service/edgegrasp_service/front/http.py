@@ -30,6 +30,7 @@ from edgegrasp_model.gripper import gripper_names, load_gripper
 from edgegrasp_service.errors import (
     Cancelled,
     HeadersTooLarge,
+    InvalidSettings,
     Problem,
     UnsupportedMediaType,
     problem_document,
@@ -229,6 +230,10 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
         grippers = JSONResponse(jsonable_encoder(found))
         routes.append(Route(f"{PLAYGROUND}grippers.json", grippers, methods=["GET"]))
         if settings.samples is not None:
+            if not settings.samples.is_dir():
+                raise InvalidSettings(
+                    f"samples: got {str(settings.samples)!r}, which is no folder."
+                )
             routes.append(Mount(f"{PLAYGROUND}samples", StaticFiles(directory=settings.samples)))
         routes.append(_file(PLAYGROUND, PLAYGROUND_FILES / "index.html"))
         routes += _files(PLAYGROUND, PLAYGROUND_FILES)
