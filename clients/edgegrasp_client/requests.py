@@ -324,14 +324,14 @@ def _depth_fields(depth: object, path: str) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray) and value.dtype == bool:
         return value.ravel()
-    if isinstance(value, np.ndarray | np.generic):
+    if hasattr(value, "tolist"):  # also array.array, as rclpy has parameters
         return value.tolist()
     if isinstance(value, Mapping):
         mask = value.get("mask")
         if isinstance(mask, np.ndarray) and mask.dtype.kind in "iu":  # images of 0 and 255
             value = {**value, "mask": mask != 0}
         return {name: _plain(part) for name, part in value.items() if part is not None}
-    if isinstance(value, list | tuple | range):
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
         return [_plain(part) for part in value]
     return value
 

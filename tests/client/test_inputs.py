@@ -1,5 +1,7 @@
 """What may be sent besides an array of points, and scoring: the same over both transports."""
 
+from array import array
+from collections import deque
 from types import SimpleNamespace
 from typing import Any
 
@@ -118,6 +120,12 @@ def test_options_too_long_for_a_query_are_sent(client, cloud, kind) -> None:
         "contact_region": {"include": [{"kind": "indices", "indices": indices}] * 10},
     }
     assert contacts(client.detect(cloud, **options)) == contacts(client.detect(cloud))
+
+
+def test_options_may_be_sequences_of_any_kind(client, cloud) -> None:
+    given: Any = {"up": array("d", [0.0, 0.0, 1.0]), "objects": {"exclude": deque([9])}}
+    plain: Any = {"up": [0.0, 0.0, 1.0], "objects": {"exclude": [9]}}
+    assert contacts(client.detect(cloud, **given)) == contacts(client.detect(cloud, **plain))
 
 
 def test_a_file_and_its_own_normals_are_not_sent_twice(client, cloud, tmp_path) -> None:
