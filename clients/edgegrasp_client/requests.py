@@ -7,6 +7,7 @@ scene's.
 import io
 import json
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeGuard, cast
@@ -278,10 +279,10 @@ def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
         found = ", ".join(map(str, image)) if isinstance(image, Mapping) else type(image).__name__
         fix = "Give a mapping with depth and intrinsics, T_cloud_camera and depth_scale or not."
         raise invalid(path, found[:80], fix)
-    pose = np.asarray(image.get("T_cloud_camera", np.eye(4)))
-    if pose.shape != (4, 4) or pose.dtype.kind not in "iuf":
-        value = f"shape {pose.shape}, dtype {pose.dtype}"
-        raise invalid(f"{path}.T_cloud_camera", value, "Give a 4 x 4 matrix.")
+    given = image.get("T_cloud_camera", np.eye(4))
+    pose = np.asarray(given, dtype=object)  # also rows of different lengths
+    if pose.shape != (4, 4) or not all(isinstance(each, Real) for each in pose.flat):
+        raise invalid(f"{path}.T_cloud_camera", repr(given)[:80], "Give a 4 x 4 matrix.")
     depth = _depth_fields(image["depth"], f"{path}.depth")
     try:
         camera = intrinsics_of(image["intrinsics"])._asdict()
