@@ -289,8 +289,11 @@ def draw_detection(
         near = seen[np.linalg.norm(seen - middle, axis=1) < AROUND]
         up = np.asarray(detection.up, dtype=np.float64)
         aside = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
-        given = None if from_above else options.get("viewpoint")
-        eye = middle + 0.6 * up - 0.5 * aside if given is None else np.ravel(given)[:3]
+        eye = middle + 0.6 * up - 0.5 * aside
+        if not from_above:  # a cloud whose z points down is in its camera's frame
+            other = np.zeros(3) if up[2] < 0 else eye + aside
+            eyes = options.get("viewpoint"), sent.viewpoint, other
+            eye = np.ravel(next(each for each in eyes if each is not None))[:3]
         view = View.of(near if len(near) else seen, eye, up)
     title = f"the {len(shown)} best of {len(detection.grasps)} grasps, {detection.model}"
     picture = Picture(view, flat, shades, image, title)

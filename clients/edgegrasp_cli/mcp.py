@@ -174,20 +174,19 @@ class _Tools:
         )
         if (point_cloud_file is None) == (depth_file is None) or (depth_file is None and of_image):
             raise ValueError("Give point_cloud_file alone, or depth_file and intrinsics.")
-        file, images, eye = None, None, [0.0, 0.0, 0.0]
+        file, images = None, None
         if point_cloud_file is not None:
             file = self._path(point_cloud_file)
         else:
             images = [self._image(str(depth_file), intrinsics or [], depth_scale, T_base_camera)]
             asked = self._in_image(asked, mask_file, T_base_camera)
-            eye = eye if T_base_camera is None else [row[3] for row in T_base_camera[:3]]
         found = self._client.detect(file, depth_images=images, **asked)
         best = found.grasps[0].score if found.grasps else 0.0
         text = f"{len(found.grasps)} grasps, the best {best:.2f}. {' '.join(found.warnings)}"
         sent, pictures = sent_cloud(file, images), []
         for from_above in (False, True):
             drawn = io.BytesIO()
-            draw_detection(drawn, found, sent, {"viewpoint": eye, **asked}, from_above=from_above)
+            draw_detection(drawn, found, sent, asked, from_above=from_above)
             pictures.append(Image(data=drawn.getvalue(), format="png"))
         return [text.strip(), *pictures]
 
@@ -225,7 +224,7 @@ class _Tools:
 
         if pose is not None:
             asked = {"up": [0.0, 0.0, 1.0], **asked}
-        elif asked.get("robot", {}).get("T_base_cloud") is IN_BASE:
+        elif (asked.get("robot") or {}).get("T_base_cloud") is IN_BASE:
             raise ValueError("robot: give T_base_camera, in the arm's base frame.")
         return asked if mask is None else dict(on_mask(pixels(self._path(mask)), asked))
 

@@ -1,11 +1,13 @@
 import io
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from edgegrasp_camera.picture import Picture, View, draw_grasps
+from edgegrasp_camera.clouds import CloudInput
+from edgegrasp_camera.picture import Picture, View, draw_detection, draw_grasps
 
 
 @dataclass
@@ -54,3 +56,16 @@ def test_regions_are_drawn_where_they_are() -> None:
     (x, y), _ = view.project((0.1, 0.0, 0.0))
     scale = drawn.shape[1] / view.shape[1]
     assert np.hypot(column.mean() / scale - x, row.mean() / scale - y) < 10
+
+
+@pytest.mark.parametrize("up", [1.0, -1.0])
+def test_a_cloud_is_seen_from_its_camera_or_from_above_its_support(up: float, monkeypatch) -> None:
+    """Never from under the table, where the origin of an arm's base is."""
+    points, eyes = np.random.default_rng(0).uniform((-0.2, -0.2, 0.5), (0.2, 0.2, 0.6), (90, 3)), []
+    monkeypatch.setattr(View, "of", lambda _, eye, up: eyes.append(eye) or View((4, 4), 1, 1, 2, 2))
+    gripper = SimpleNamespace(palm_z=0.05, tip_z=0.1)
+    found = SimpleNamespace(up=(0.0, 0.0, up), grasps=[], gripper=gripper, model="")
+    for sent in (CloudInput(points), CloudInput(points, viewpoint=(0.0, 0.0, 0.2))):
+        draw_detection(io.BytesIO(), found, sent, {})
+    assert eyes[0][2] > 0.6 if up > 0 else not eyes[0].any()
+    assert eyes[1].tolist() == [0.0, 0.0, 0.2]

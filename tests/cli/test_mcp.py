@@ -154,6 +154,8 @@ MASKED_CLOUD = {"point_cloud_file": "cloud.npy", "mask_file": "mask.png"}
         (CLOUD, {"options": {"tok_k": 1}}, "options.tok_k"),
         (DEPTH, {"depth_file": "depth.png", "intrinsics": [1]}, "fx, fy"),
         (DEPTH, IMAGE | {"robot": {"name": "fr3"}}, "give T_base_camera"),
+        ("visualize_grasps", IMAGE | {"T_base_camera": [[1.0], [0.0, 1.0]]}, "T_cloud_camera"),
+        (DEPTH, IMAGE | {"options": {"robot": None, "tok_k": 1}}, "options.tok_k"),
         ("visualize_grasps", {}, "Give point_cloud_file alone, or depth_file"),
         ("visualize_grasps", MASKED_CLOUD, "Give point_cloud_file alone, or depth_file"),
     ],
