@@ -78,7 +78,8 @@ def open_inference(
     """
     with asked.connect(asked.server) as client:
         models = Models(client, name, asked.timeout)
-        with grpc_server(models, f"{host}:{grpc_port}"):
+        place = f"[{host}]" if ":" in host else host  # IPv6 is in brackets
+        with grpc_server(models, f"{place}:{grpc_port}"):
             uvicorn.run(http_app(models), host=host, port=http_port, log_level="warning")
 
 

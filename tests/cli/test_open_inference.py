@@ -140,15 +140,18 @@ def test_two_gateways_do_not_share_a_port(gateway) -> None:
         pass
 
 
-def test_the_command_serves_both_transports(dummy_server) -> None:
-    ports = [str(port) for port in free_ports(2)]
-    flags = ["--server", dummy_server.grpc_address]
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_the_command_serves_both_transports(dummy_server, host: str) -> None:
+    if ":" in host and not socket.has_dualstack_ipv6():
+        pytest.skip("this machine has no IPv6")
+    ports, url = [str(port) for port in free_ports(2)], f"[{host}]" if ":" in host else host
+    flags = ["--server", dummy_server.grpc_address, "--host", host]
     flags += ["--http-port", ports[0], "--grpc-port", ports[1]]
     with started(*EDGEGRASP, "open-inference", *flags):
         with httpx.Client(transport=httpx.HTTPTransport(retries=10)) as http:
-            ready = http.get(f"http://127.0.0.1:{ports[0]}/v2/health/ready", timeout=60)
+            ready = http.get(f"http://{url}:{ports[0]}/v2/health/ready", timeout=60)
         assert ready.json() == {"ready": True}
-        socket.create_connection(("127.0.0.1", int(ports[1]))).close()
+        socket.create_connection((host, int(ports[1]))).close()
 
 
 def test_a_server_that_is_away() -> None:
