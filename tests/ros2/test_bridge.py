@@ -361,6 +361,13 @@ def test_the_best_pick_is_a_trajectory_of_the_arm(planning, sent, make_cloud, cl
         first = last
 
 
+def test_an_arm_is_where_it_is_before_the_first_scene(planning, make_cloud, cloud) -> None:
+    """The cloud of an action's object may be the only one."""
+    scene, options = Scene(joints={"a": 0.1, "b": 0.2}), {"robot": "arm"}
+    bridge.detect(planning, scene, Settings(), options, lookup, make_cloud(cloud))
+    assert planning.given["robot"]["joints"] == [0.1, 0.2]
+
+
 @pytest.mark.parametrize(
     ("name", "joints", "message"),
     [("other", {}, "robots are arm"), ("arm", {"a": 0.1}, "joint_states: none has come of 'b'")],

@@ -196,7 +196,7 @@ def detect(
         InvalidRequest: A cloud or an image does not match its fields.
     """
     if scene.header is None and object_cloud is not None:
-        scene, object_cloud = Scene(cloud=object_cloud), None
+        scene, object_cloud = scene._replace(cloud=object_cloud), None
     if scene.header is None:
         raise ValueError("No cloud and no depth image has come yet.")
     frame_id, stamp = scene.header.frame_id, scene.header.stamp
