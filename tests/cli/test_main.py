@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_cli import main
+from edgegrasp_service.errors import InvalidRequest, report
 from edgegrasp_service.worker.process import Answer, Facts, Job
 
 from .conftest import invoke
@@ -130,11 +131,15 @@ def test_a_recorded_request_is_answered_again(transport, run, refused, tmp_path,
 
     def replay(path: Path, settings: object) -> tuple[Job, Answer, Answer]:
         job, facts = Job("DetectGrasps", transport, b"", 60.0), Facts(grasps=7)
+        if path.stem == "errors":
+            first, second = (report(InvalidRequest("cloud", value, "")) for value in "ab")
+            return job, Answer(b"", facts, first), Answer(b"", facts, second)
         return job, Answer(body("plus", 1.0), facts), Answer(body(path.stem, 2.0), facts)
 
     monkeypatch.setattr("edgegrasp_cli.replay.answer_again", replay)
     assert "7 grasps\nthe answer is the same" in run("replay", "request", "plus.job")
-    assert "differs" in refused("replay", "request", "small.job")
+    for differing in ("small.job", "errors.job"):
+        assert "differs" in refused("replay", "request", differing)
 
 
 def test_a_scene_is_viewed_until_ctrl_c(tmp_path: Path) -> None:

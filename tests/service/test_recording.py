@@ -20,7 +20,7 @@ from edgegrasp_service.front.service import Admission
 from edgegrasp_service.recording import Recorder, append_line, check_outcomes
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import answer
-from edgegrasp_service.worker.process import Answer, Facts, Job
+from edgegrasp_service.worker.process import Answer, Facts, Job, pack
 from edgegrasp_training.evaluation import read_outcomes
 
 
@@ -42,7 +42,9 @@ async def test_recorded_requests_are_replayed(serve, transport, cloud, tmp_path,
         cut = recorded.body.index(b'"seconds"')
         assert again.body[:cut] == recorded.body[:cut]
     assert answer_again(bad, settings)[-1].error.kind == "invalid-request"
-    for other in (b"", b"\xff" * 64, fine.read_bytes()[:-9000], bad.read_bytes()[12:]):
+    tried = Job("RecordOutcome", "http", b""), Answer(b"{}", Facts())  # it would be kept twice
+    outcome = b"".join(part for message in tried for part in pack(message))
+    for other in (b"", b"\xff" * 64, fine.read_bytes()[:-9000], bad.read_bytes()[12:], outcome):
         fine.write_bytes(other)
         with pytest.raises(ValueError, match="is not a recorded request"):
             answer_again(fine, settings)
