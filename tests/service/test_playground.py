@@ -256,6 +256,8 @@ def test_files_of_every_kind_are_shown_and_sent(dummy_server, open_page, tmp_pat
         assert len(shown(page)) == 10
     page.set_input_files("#files", [tmp_path / "color.png"])
     page.get_by_text("add the depth image").wait_for()
+    assert page.inner_text("#summary") == "No grasps yet"
+    page.locator("#stage canvas").click()  # the hands that are still drawn mean nothing
 
 
 @pytest.mark.parametrize("name", ["mustard_bottle", "milk_clorox"])  # an image; a cloud

@@ -62,8 +62,10 @@ async function openSample() {
 
 /** Read files and show them; whether that went well. */
 async function open(files) {
+  state.busy?.abort(); // its answer would be of another scene
   state.files = files;
   [state.answer, state.scene, state.fresh, state.target] = [null, null, true, {}];
+  showAnswer();
   $("base").value = "";
   const image = files.some(({ name }) => /\.png$/i.test(name));
   $("camera").hidden = !image;
@@ -84,7 +86,6 @@ async function open(files) {
   $("camera").hidden = !state.scene.image;
   $("viewpoint_row").hidden = Boolean(state.scene.image);
   for (const name of Object.keys(state.shapes)) setShape(name, null);
-  showAnswer();
   say(`${(state.scene.points.length / 3).toLocaleString("en")} points of ${state.scene.name}.`);
   return true;
 }
@@ -278,7 +279,7 @@ function filter() {
 
 function choose(row) {
   state.chosen = row;
-  const grasp = row === null ? null : state.answer.grasps[row];
+  const grasp = state.answer?.grasps[row] ?? null;
   if (state.answer) view.choose(grasp);
   if (robot()) view.bendArm(grasp?.arm?.grasp_joints ?? joints());
   [...$("grasps").children].forEach((item, each) => item.firstChild.setAttribute("aria-pressed", each === row));
