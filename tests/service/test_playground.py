@@ -251,6 +251,10 @@ def test_files_of_every_kind_are_shown_and_sent(dummy_server, open_page, tmp_pat
             page.get_by_text("give the camera's fx, fy, cx, cy").wait_for()
             page.locator("#intrinsics").fill("30,30,15,10")
             page.get_by_text("Find grasps").click()
+        if files[0].name == "camera.npz":
+            page.locator("#depth_scale").fill("0.0005")
+            page.get_by_text("Find grasps").click()
+            page.locator("#curl").get_by_text("depth_scale=0.0005").wait_for()
         counted = page.locator("#counts td").get_by_text(str(points), exact=True).first
         counted.wait_for(state="attached")  # the table is folded
         assert len(shown(page)) == 10

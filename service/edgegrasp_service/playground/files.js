@@ -23,7 +23,7 @@ export async function readScene(files, camera) {
   }
   const scene = { name: file.name, colors: null, camera: null, cloud: file, image: null, note: "" };
   const bytes = await file.arrayBuffer();
-  if (format === "npz") return { ...scene, ...(await readArchive(file, bytes)) };
+  if (format === "npz") return { ...scene, ...(await readArchive(file, bytes, camera)) };
   if (format === "npy") {
     const array = readArray(bytes);
     if (array.shape.length !== 2 || array.shape[1] === 3) return { ...scene, points: points(array) };
@@ -165,7 +165,7 @@ function readArray(buffer) {
 }
 
 /** An .npz file: a cloud, or a depth image with `intrinsics`; `rgb` or `colors` beside either. */
-async function readArchive(file, buffer) {
+async function readArchive(file, buffer, { depth_scale }) {
   const members = await unzip(buffer);
   const arrays = Object.fromEntries(
     Object.entries(members).map(([name, bytes]) => [name, readArray(bytes)]),
@@ -177,7 +177,7 @@ async function readArchive(file, buffer) {
   const note = (name) => `${name}.npy is the array ${name} of ${file.name}`;
   if (arrays.depth && arrays.intrinsics) {
     const intrinsics = Array.from(arrays.intrinsics.values, (value) => +value.toPrecision(9)).join();
-    const camera = { intrinsics, depth_scale: "" };
+    const camera = { intrinsics, depth_scale };
     return { ...fromDepth(arrays.depth, alone("depth"), colors, camera), note: note("depth") };
   }
   const names = Object.keys(arrays);
