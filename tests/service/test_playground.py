@@ -258,6 +258,12 @@ def test_files_of_every_kind_are_shown_and_sent(dummy_server, open_page, tmp_pat
         counted = page.locator("#counts td").get_by_text(str(points), exact=True).first
         counted.wait_for(state="attached")  # the table is folded
         assert len(shown(page)) == 10
+    page.set_input_files("#files", [tmp_path / "cloud.npy"])
+    for typed, told in (("0,1", "3 numbers are needed"), ("[0, 0, 1]", "detecting, by")):
+        page.locator("#viewpoint").fill(typed)
+        page.get_by_text("Find grasps").click()
+        page.get_by_text(told).wait_for()
+    assert '"viewpoint":[0,0,1]' in page.locator("#curl").text_content()
     page.set_input_files("#files", [tmp_path / "color.png"])
     page.get_by_text("add the depth image").wait_for()
     assert page.inner_text("#summary") == "No grasps yet"

@@ -95,8 +95,8 @@ async function open(files) {
 /** The options that differ from the API's defaults. */
 function options() {
   const found = {};
-  const viewpoint = numbers($("viewpoint").value, 3);
-  if (viewpoint && !state.scene?.image) found.viewpoint = viewpoint;
+  const viewpoint = state.scene?.image ? null : typed("viewpoint", 3);
+  if (viewpoint) found.viewpoint = viewpoint;
   for (const name of ["model", "gripper"]) if ($(name).value) found[name] = $(name).value;
   const { cone, region, workspace } = state.shapes;
   if (cone) found.approach_direction = { cones: [rounded(cone)] };
@@ -110,8 +110,8 @@ function options() {
     found.workspace = rounded({ min: corner(-1), max: corner(1) });
   }
   Object.assign(found, state.target);
-  const base = numbers($("base").value, 16);
-  if (robot() && base) found.robot = { name: robot().name, T_base_cloud: base, joints: joints() };
+  const base = robot() && typed("base", 16);
+  if (base) found.robot = { name: robot().name, T_base_cloud: base, joints: typed("joints", robot().home.length) ?? robot().home };
   if ($("debug").checked) found.debug = true;
   if ($("follow").checked) found.previous = state.followed ?? {};
   const more = $("more").value.trim();
@@ -155,8 +155,8 @@ async function ask() {
   let asked;
   try {
     asked = options();
-  } catch {
-    return say("More options: no valid JSON.", true);
+  } catch (error) {
+    return say(error instanceof SyntaxError ? "More options: no valid JSON." : error.message, true);
   }
   state.busy?.abort();
   const stop = (state.busy = new AbortController());
@@ -549,8 +549,15 @@ function copyText(text) {
   return copied.then(() => say("Copied."), () => say("The browser does not allow copying.", true));
 }
 
+/** The numbers of a field; null where it is empty. */
+function typed(id, count) {
+  const found = numbers($(id).value, count);
+  if (found || !$(id).value.trim()) return found;
+  throw new Error(`${$(id).labels[0].textContent.trim()}: ${count} numbers are needed, with commas between them.`);
+}
+
 function numbers(text, count) {
-  const values = text.split(",").map(Number);
+  const values = text.replace(/[[\]]/g, "").split(",").map(Number);
   return text.trim() && values.length === count && values.every(Number.isFinite) ? values : null;
 }
 
