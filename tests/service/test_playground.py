@@ -150,6 +150,13 @@ def test_objects_and_points_are_asked_for_and_answers_saved(real_server, open_pa
     assert answered.value.ok
     assert '"at":[' in page.locator("#curl").text_content()
 
+    page.locator("#more").fill('{"order": "clearance"}')
+    with page.expect_response(f"{real_server.http_url}/v1/grasps") as answered:
+        page.locator("#all").click()
+    page.get_by_text("detecting, by").wait_for()
+    scores = [f"{grasp['score']:.3f}" for grasp in answered.value.json()["grasps"][:12]]
+    assert [line.inner_text().split()[1] for line in shown(page)] == scores
+    page.locator("#more").fill("")
     with page.expect_response(f"{real_server.http_url}/v1/grasps"):
         page.locator("#all").click()
     page.get_by_text("detecting, by").wait_for()

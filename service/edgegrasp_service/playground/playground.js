@@ -167,7 +167,7 @@ async function ask() {
     const body = new FormData();
     for (const [name, value] of parts(asked)) body.append(name, value);
     const answer = await call("/v1/grasps", { method: "POST", signal: stop.signal, body });
-    if (!asked.robot && !asked.previous) answer.grasps.sort((one, other) => other.score - one.score);
+    if (!asked.robot && !asked.previous && !asked.order) answer.grasps.sort((one, other) => other.score - one.score);
     [state.answer, state.gripper] = [answer, gripperOf(asked, answer.model)];
     view.showAnswer(answer, state.gripper, state.fresh);
     state.fresh = false;
