@@ -308,10 +308,12 @@ def test_the_chosen_grasp_is_followed_in_the_next_image(real_server, open_page, 
     page.get_by_text("detecting, by").wait_for()
     page.locator("#grasps button").nth(2).click()
     before = json.loads(page.locator("#chosen_json").text_content())
+    page.locator("#base").evaluate("base => base.value = 'its own'")  # hidden without an arm
     page.set_input_files("#files", tmp_path / "1.npy")
     page.get_by_text("detecting, by").wait_for()
     after = json.loads(page.locator("#chosen_json").text_content())
     assert after["id"] == before["id"]
+    assert page.locator("#base").input_value() == "its own"
     y = [grasp["T_cloud_hand"][1][3] for grasp in (before, after)]
     assert y[1] - y[0] == pytest.approx(STEP, abs=0.002)
 

@@ -66,7 +66,7 @@ async function open(files) {
   state.files = files;
   [state.answer, state.scene, state.fresh, state.target] = [null, null, true, {}];
   showAnswer();
-  $("base").value = "";
+  if (!$("follow").checked) $("base").value = ""; // what is followed stays in its frame
   const image = files.some(({ name }) => /\.png$/i.test(name));
   $("camera").hidden = !image;
   try {
