@@ -113,7 +113,9 @@ def read_json(field: str, text: bytes) -> Any:
     try:
         return json.loads(text, object_pairs_hook=partial(unique_keys, field))
     except (ValueError, RecursionError) as error:
-        raise InvalidRequest(field, f"no valid JSON ({error})", "Send a JSON object.") from None
+        is_array = field in ("depth", *PER_POINT)  # perhaps an image of another format
+        fix = "Send an .npy or .png file, or JSON." if is_array else "Send a JSON object."
+        raise InvalidRequest(field, f"no valid JSON ({error})", fix) from None
 
 
 # Forms

@@ -289,6 +289,7 @@ CLOUD = part("cloud", npy(POINTS), '; filename="a.npy"')
         (form(CLOUD, part("options", b"[]")), "options"),
         (form(CLOUD, part("options", b'{"seed": -1}')), "options.seed"),
         (form(part("point_cloud2", npy(POINTS), '; filename="a.npy"')), "point_cloud2"),
+        (form(part("depth", bytes(4000), '; filename="depth.tiff"')), "depth"),
         (form(CLOUD, end=b""), "body"),
         (form(("Content-Type: text/plain", b"{}")), "body"),
         (b"--b\r\nno header at all\r\n--b--\r\n", "body"),
@@ -303,6 +304,7 @@ CLOUD = part("cloud", npy(POINTS), '; filename="a.npy"')
 def test_bad_forms(body: bytes, field: str) -> None:
     error = problem("http", body, "multipart/form-data; boundary=b")
     assert (error.status // 100, error.field) == (4, field)
+    assert field != "depth" or ".png" in error.fix
     assert problem("http", body, "multipart/form-data").field == "body"
 
 
