@@ -74,6 +74,9 @@ def view(
 
     from edgegrasp_client.connection import local_server
 
+    if file is not None and depth is not None:
+        raise ValueError("give a cloud file, or --depth and --intrinsics")
+
     # SIGTERM from a supervisor ends it like Ctrl-C, together with its server.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)

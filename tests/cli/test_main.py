@@ -164,3 +164,4 @@ def test_a_scene_is_viewed_until_ctrl_c(tmp_path: Path) -> None:
 
 def test_a_file_to_view_that_is_not_there_is_named(refused) -> None:
     assert "No such file" in refused("view", "absent.ply", "--no-browser")
+    assert "or --depth" in refused("view", "absent.ply", "--depth", "depth.png", "--no-browser")
