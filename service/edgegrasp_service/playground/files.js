@@ -14,8 +14,8 @@ const FORMATS = ["npy", "npz", "ply", "pcd", "xyz"];
  */
 /** The Scene of one cloud, or of a depth image with or without its colours, whose camera is given as text. */
 export async function readScene(files, camera) {
-  const images = files.filter((file) => /\.png$/i.test(file.name));
-  if (images.length) return readImages(images, files, camera);
+  const images = files.filter((file) => ["png", "npy"].includes(ending(file)));
+  if (images.length > 1 || images.some((file) => ending(file) === "png")) return readImages(images, camera);
   const file = files[0];
   const format = ending(file);
   if (!FORMATS.includes(format)) {
@@ -58,14 +58,14 @@ function fromLinear(values) {
 
 // Depth images
 
-async function readImages(images, files, camera) {
+async function readImages(images, camera) {
   let [depth, color] = [null, null];
   for (const file of images) {
-    const head = new Uint8Array(await file.slice(0, 26).arrayBuffer());
-    if (head[24] === 16 && head[25] === 0) depth = file;
+    const bytes = await file.arrayBuffer();
+    const head = new Uint8Array(bytes);
+    if (ending(file) === "png" ? head[24] === 16 && head[25] === 0 : readArray(bytes).shape[2] !== 3) depth = file;
     else color = file;
   }
-  depth ??= files.find((file) => ending(file) === "npy");
   if (!depth) throw new Error(`${color.name}: add the depth image, a .png of 16 bits or an .npy.`);
   const read = ending(depth) === "png" ? readDepthPng : async (bytes) => readArray(bytes);
   const array = await read(await depth.arrayBuffer());
@@ -101,6 +101,10 @@ function fromDepth(array, file, colors, { intrinsics, depth_scale }) {
 export class NeedsCamera extends Error {}
 
 async function readColors(file) {
+  if (ending(file) === "npy") {
+    const { shape: [height, width], values, whole } = readArray(await file.arrayBuffer());
+    return { width, height, colors: Float32Array.from(values, (value) => value / (whole ? 255 : 1)) };
+  }
   const image = await createImageBitmap(file);
   const { width, height } = image;
   const canvas = new OffscreenCanvas(width, height).getContext("2d");
