@@ -133,7 +133,8 @@ class _Work:
         if not kind.lower().startswith(http_bodies.JSON):  # foreign web pages cannot send it
             fix = f"Send {http_bodies.JSON}."
             raise UnsupportedMediaType("Content-Type", repr(kind[:40]), fix)
-        assert path is not None
+        if path is None:  # Ray has this path without the setting too
+            raise InvalidRequest("path", "/v1/outcomes", "Set the setting `outcomes_file`.")
         fields = http_bodies.read_json("body", self.job.body)
         tried = parse(recording.TriedGrasp, fields, "body")
         self.catalogue.get(tried.model)  # raises UnknownModel
