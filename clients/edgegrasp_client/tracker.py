@@ -90,7 +90,7 @@ class GraspTracker:
             ]
             previous["objects"] = [
                 {"number": one.number, "surface": one.surface, "confidence": one.confidence}
-                for one in self._objects.values()
+                for one in sorted(self._objects.values(), key=lambda one: one.number != object_)
                 if self._searching or one.number == object_
             ][:MOST]
             if not self._searching:

@@ -58,6 +58,14 @@ def test_it_searches_first_then_follows_and_searches_again_after_some_images() -
     assert tracker.options()["at"] is None
 
 
+def test_the_followed_object_is_sent_of_more_than_a_request_may_name() -> None:
+    tracker, found = GraspTracker(search_every=1), answer()
+    many = [replace(found.objects[0], number=number) for number in range(70)]
+    grasps = [replace(one, object=69) for one in found.grasps]
+    tracker.take(replace(found, objects=many, grasps=grasps))
+    assert [one["number"] for one in previous(tracker)["objects"]] == [69, *range(63)]
+
+
 @pytest.mark.parametrize("asked", ["auto", {"kind": "ransac"}, None, {"normal": UP, "offset": 0}])
 def test_a_support_that_is_looked_for_is_the_last_answers_while_it_follows(asked: Any) -> None:
     tracker = GraspTracker(support=asked)
