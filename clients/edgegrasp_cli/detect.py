@@ -173,30 +173,20 @@ class OwnDetector:
     device: str = "cpu"
     robot: str | None = None  # a name or file, in place of the name in a request
 
-    def detect(
-        self,
-        cloud: Any = None,
-        *,
-        depth_images: Any = None,
-        colors: Any = None,
-        view_ids: Any = None,
-        **options: Any,
-    ) -> Any:
-        """Find grasps in a cloud: an array, a file, or depth images; raises as the detector."""
-        from edgegrasp_client.requests import depth_image_fields, npy_bytes
+    def detect(self, cloud: Any = None, **asked: Any) -> Any:
+        """Find grasps in a cloud, as `GraspClient.detect`; raises also as the detector."""
+        from edgegrasp_client.requests import Request, cloud_file, depth_image_fields, npy_bytes
 
-        beside = {"colors": colors, "view_ids": view_ids}
+        request = Request(cloud, asked)
         fields: dict[str, Any] = {
-            name: File("npy", npy_bytes(of)) for name, of in beside.items() if of is not None
+            name: File("npy", npy_bytes(array)) for name, array in request.arrays.items()
         }
-        if depth_images is not None:
-            images = enumerate(depth_images)
-            fields["depth_images"] = [depth_image_fields(image, row) for row, image in images]
-        elif isinstance(cloud, Path):
-            fields["cloud"] = File(cloud.suffix[1:].lower(), cloud.read_bytes())
+        if request.depth_images is None:
+            fields["cloud"] = File(*cloud_file(cloud))
         else:
-            fields["cloud"] = File("npy", npy_bytes(cloud))
-        sent, parsed = decode_cloud(fields, parse_options(options), sys.maxsize)
+            images = enumerate(request.depth_images)
+            fields["depth_images"] = [depth_image_fields(image, row) for row, image in images]
+        sent, parsed = decode_cloud(fields, parse_options(request.options), sys.maxsize)
         detector = self._catalogue.get(parsed.model)
         if parsed.robot is None:
             return detector.detect(sent, parsed)

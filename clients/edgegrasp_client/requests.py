@@ -228,7 +228,8 @@ def cloud_file(cloud: Cloud) -> tuple[str, bytes]:
     path = Path(cloud)
     file_format = path.suffix[1:].lower()
     if file_format not in FILE_FORMATS:
-        fix = f"Give one of: {', '.join(FILE_FORMATS)}; a depth image as one of depth_images."
+        depth = "a depth image as `depth` with `intrinsics` in depth_images"
+        fix = f"Give one of: {', '.join(FILE_FORMATS)}; {depth}."
         raise invalid("cloud", repr(path.name), fix)
     try:
         return file_format, path.read_bytes()

@@ -26,6 +26,8 @@ def test_every_option_is_a_flag() -> None:
 
 def test_flags_win_over_the_options_file(file, dummy_server, run, refused, tmp_path) -> None:
     options = tmp_path / "options.json"
+    options.write_text('{"top_k": null}')  # a field left out, with a server or without
+    assert "returned" in run("detect", file, "--options", options)
     options.write_text(json.dumps({"top_k": 4, "seed": 3, "collision": {"mode": "penalise"}}))
     asked = ("detect", file, "--server", dummy_server.grpc_address, "--json", "--options", options)
     assert len(json.loads(run(*asked))["grasps"]) == 4
@@ -168,7 +170,7 @@ def test_a_bad_option_is_named(options, sentence, file, dummy_server, refused) -
     ("name", "content", "flags", "sentence"),
     [
         ("absent.npy", None, (), "No such file"),
-        ("cloud.las", b"0 0 0", (), "Send one of: npy, npz, ply, pcd, xyz; a depth image as"),
+        ("cloud.las", b"0 0 0", (), "Give one of: npy, npz, ply, pcd, xyz; a depth image as"),
         ("cloud.npy", b"foreign", (), "cloud: got 7 bytes that are no whole .npy file"),
         ("cloud.npy", b"foreign", ("--top-k", "0"), "options.top_k: got 0."),
     ],
