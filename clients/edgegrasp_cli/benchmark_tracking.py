@@ -211,13 +211,12 @@ def benchmark_tracking(
 def follow(client: Any, scene: Scene, seconds: float, clock: Callable[[], float]) -> Followed:
     """Follow the first grasp of a scene, which starts to move once that grasp is found."""
     from edgegrasp_client import GraspTracker
-    from edgegrasp_client.requests import plain_options
 
     tracker, done, now, shown = GraspTracker(top_k=10), Followed(), 0.0, None
     while now < seconds:
         taken = np.floor(now * RATE + 1e-6) / RATE  # the latest image
         image, start = scene.look(taken), clock()
-        found = client.detect(**image, **plain_options(tracker.options()))
+        found = client.detect(**image, **tracker.options())
         spent = clock() - start
         tracker.take(found)
         best = found.grasps[0] if found.grasps else None
