@@ -65,7 +65,6 @@ async function open(files) {
   state.busy?.abort(); // its answer would be of another scene
   state.files = files;
   [state.answer, state.scene, state.fresh, state.target] = [null, null, true, {}];
-  showAnswer();
   if (!$("follow").checked) $("base").value = ""; // what is followed stays in its frame
   const image = files.some(({ name }) => /\.png$/i.test(name));
   $("camera").hidden = !image;
@@ -82,6 +81,7 @@ async function open(files) {
     return false;
   } finally {
     busy(null);
+    showAnswer();
   }
   $("camera").hidden = !state.scene.image;
   $("viewpoint_row").hidden = Boolean(state.scene.image);
