@@ -2,7 +2,6 @@
 
 import base64
 import json
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,46 +18,26 @@ POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (60, 3)).astype(np.float32)
 NAN = float("nan")
 
 
-@dataclass
 class Malformed:
-    """A request, and what is said of it."""
+    """A request, as JSON has it, and what is said of it."""
 
-    field: str
-    value: str
-    fix: str
-    options: dict[str, Any] = field(default_factory=dict)
-    kind: str = "invalid-request"
-    points: Any = None
-    images: list[dict[str, Any]] | None = None
-    ros: dict[str, Any] | None = None
-    edges: list[list[int]] | None = None
-    poses: Any = None
-    scores: bool = False
+    def __init__(
+        self, field: str, value: str, fix: str, options: dict[str, Any] | None = None,
+        kind: str = "invalid-request", scores: bool = False, **sent: Any,
+    ) -> None:  # fmt: skip
+        self.field, self.value, self.fix, self.kind, self.scores = field, value, fix, kind, scores
+        self._sent = {"options": options or {}} | sent
 
     def as_json(self) -> bytes:
-        body: dict[str, Any] = {"options": self.options}
-        if self.points is not None:
-            body["points"] = np.asarray(self.points).tolist()
-        named = {"depth_images": self.images, "point_cloud2": self.ros, "edges": self.edges}
-        body |= {name: value for name, value in named.items() if value is not None}
-        if self.poses is not None:
-            body["hand_poses"] = np.asarray(self.poses).tolist()
-        return json.dumps(body, default=lambda data: base64.b64encode(data).decode()).encode()
+        def plain(part: Any) -> Any:
+            return base64.b64encode(part).decode() if isinstance(part, bytes) else part.tolist()
+
+        return json.dumps(self._sent, default=plain).encode()
 
     def as_message(self) -> bytes:
         message = grasp_pb2.ScoreGraspsRequest() if self.scores else grasp_pb2.DetectGraspsRequest()
-        fill(message.options, self.options, "options")
-        if self.points is not None:
-            message.points = np.asarray(self.points, np.float32).tobytes()
-        for image in self.images or ():
-            flat = np.ravel(image["T_cloud_camera"]).tolist()
-            fill(message.depth_images.add(), image | {"T_cloud_camera": flat}, "depth_images")
-        if self.ros is not None:
-            fill(message.point_cloud2, self.ros, "point_cloud2")
-        for edge in self.edges or ():
-            message.edges.add(approach_index=edge[0], contact_index=edge[1])
-        for pose in [] if self.poses is None else self.poses:
-            message.hand_poses.add(T_cloud_hand=np.ravel(pose).tolist())
+        points = {"points": self._sent["points"].tobytes()} if "points" in self._sent else {}
+        fill(message, self._sent | points, "request")
         return message.SerializeToString()
 
 
@@ -101,30 +80,30 @@ CASES = {
     # PointCloud2.
     "PointCloud2 of integers": Malformed(
         "point_cloud2.fields", "z of type 5", "float32",
-        ros=ros(fields=[*ros()["fields"][:2], {**ros()["fields"][2], "datatype": 5}]),
+        point_cloud2=ros(fields=[*ros()["fields"][:2], {**ros()["fields"][2], "datatype": 5}]),
     ),
     "PointCloud2 of too many points": Malformed(
         "point_cloud2", "2000001 points", "2000000", kind="payload-too-large",
-        ros=ros(width=2_000_001),
+        point_cloud2=ros(width=2_000_001),
     ),
     # Depth images.
     "depth image cut short": Malformed(
-        "depth_images.0.depth.data", "4 bytes", "whole image", images=[image(data=bytes(4))]
+        "depth_images.0.depth.data", "4 bytes", "whole image", depth_images=[image(data=bytes(4))]
     ),
     "depth image of negative depth": Malformed(
         "depth_images.0.depth", "-0.5 m", "0 or NaN",
-        images=[image(data=np.full(80, -0.5, "<f4").tobytes())],
+        depth_images=[image(data=np.full(80, -0.5, "<f4").tobytes())],
     ),
     "no focal length": Malformed(
-        "depth_images.0.intrinsics.fx", "0.0", "greater than 0", images=[image(fx=0.0)]
+        "depth_images.0.intrinsics.fx", "0.0", "greater than 0", depth_images=[image(fx=0.0)]
     ),
     "camera pose that is no rotation": Malformed(
         "depth_images.0.T_cloud_camera", "2.0", "rotation",
-        images=[image(T_cloud_camera=np.diag([2.0, 1, 1, 1]).tolist())],
+        depth_images=[image(T_cloud_camera=np.diag([2.0, 1, 1, 1]).tolist())],
     ),
     "depth images beside a viewpoint": Malformed(
         "options.viewpoint", "0.0, 0.0, 1.0", "Leave it out",
-        {"viewpoint": [0.0, 0.0, 1.0]}, images=[image()],
+        {"viewpoint": [0.0, 0.0, 1.0]}, depth_images=[image()],
     ),
     # Options.
     "unknown model": Malformed(
@@ -166,12 +145,12 @@ CASES = {
     ),
     "camera beyond measure": Malformed(
         "depth_images.0.T_cloud_camera.0.3", "1e+200", "10000000",
-        images=[image(T_cloud_camera=[[1, 0, 0, 1e200], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])],
+        depth_images=[image(T_cloud_camera=[[1, 0, 0, 1e200], *np.eye(4)[1:].tolist()])],
     ),
     "65 viewpoints": option("viewpoint", [[0.0, 0.0, 1.0]] * 65, "", "", "at most 64"),
     # Edges and hand poses.
     "edges and hand poses": Malformed(
-        "hand_poses", "beside edges", "one", points=POINTS, edges=[[0, 1]], poses=[np.eye(4)],
+        "hand_poses", "beside edges", "one", points=POINTS, edges=[[0, 1]], hand_poses=[np.eye(4)],
         scores=True,
     ),
     "edge to no point": Malformed(
