@@ -315,6 +315,12 @@ def serve(begin: Serve) -> Serve:
     return start
 
 
+@pytest.fixture
+async def running(serve: Serve) -> Running:
+    """A server with the default settings, which is ready."""
+    return await serve()
+
+
 def is_error(answer: Reply, kind: str) -> bool:
     """Whether an answer is the error of a kind, on whichever transport."""
     code, status = next(STATUS[error] for error in STATUS if kind_of(error) == kind)

@@ -184,8 +184,7 @@ async def test_nobody_is_read_before_there_is_a_place(serve, cloud) -> None:
     assert (await accepted).fine
 
 
-async def test_turns_come_in_order(serve, cloud) -> None:
-    running = await serve()
+async def test_turns_come_in_order(running, cloud) -> None:
     client, answered, asked = running.connect("grpc"), [], []
     stages = running.stages
     stages.shut("prepare")

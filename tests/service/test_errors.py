@@ -36,8 +36,7 @@ async def ask(running, cloud) -> tuple[httpx.Response, aio.AioRpcError]:
     return response, caught.value
 
 
-async def test_every_error_of_the_table(serve, cloud) -> None:
-    running = await serve()
+async def test_every_error_of_the_table(running, cloud) -> None:
     for number, (kind, (code, http_status)) in enumerate(STATUS.items(), 1):
         running.stages.fail("prepare", kind_of(kind))
         response, status = await ask(running, cloud)
@@ -88,8 +87,7 @@ def check_google_details(data: bytes, ours: grasp_pb2.ErrorDetail) -> None:
         ("MemoryError", (503, grpc.StatusCode.UNAVAILABLE)),
     ],
 )
-async def test_unforeseen_errors_tell_nothing(serve, cloud, fault: str, expected, caplog) -> None:
-    running = await serve()
+async def test_unforeseen_errors_tell_nothing(running, cloud, fault: str, expected, caplog) -> None:
     running.stages.fail("prepare", fault)
     response, status = await ask(running, cloud)
     assert (response.status_code, status.code()) == expected

@@ -329,8 +329,7 @@ async def test_answers_of_pages_are_given_up_too(serve) -> None:
         await running.until(lambda: running.server.service.in_flight == 0)
 
 
-async def test_pages_that_nobody_reads_keep_no_place_from_another_client(serve) -> None:
-    running = await serve()
+async def test_pages_that_nobody_reads_keep_no_place_from_another_client(running) -> None:
     held = [connect(running.server.http_url) for _ in range(2 * PAGES)]
     for connection in held:
         connection.sendall(PAGE)
@@ -341,10 +340,9 @@ async def test_pages_that_nobody_reads_keep_no_place_from_another_client(serve) 
         connection.close()
 
 
-async def test_silent_health_checks_and_watchers_hold_up_nobody(serve, monkeypatch) -> None:
+async def test_silent_health_checks_and_watchers_hold_up_nobody(running, monkeypatch) -> None:
     """Hundreds of streams of one connection that ask nothing, or ask for ever."""
     monkeypatch.setattr("edgegrasp_service.front.grpc.SMALL_READ_SECONDS", PATIENCE)
-    running = await serve()
     check = running.channel().stream_unary("/grpc.health.v1.Health/Check")
     silent = [check() for _ in range(400)]
     stub = health_pb2_grpc.HealthStub(running.channel(*OWN_CONNECTION))
@@ -356,8 +354,7 @@ async def test_silent_health_checks_and_watchers_hold_up_nobody(serve, monkeypat
         call.cancel()
 
 
-async def test_errors_in_a_stream_that_is_left_open_hold_up_nobody(serve, cloud) -> None:
-    running = await serve()
+async def test_errors_in_a_stream_that_is_left_open_hold_up_nobody(running, cloud) -> None:
     stream = running.stub().DetectGraspsStream()
     for _ in range(2):
         await stream.write(request("", cloud[:0]))
@@ -385,9 +382,8 @@ async def test_silent_streams_give_their_places_to_others(serve, cloud, monkeypa
     await asyncio.wait(ended)
 
 
-async def test_a_message_of_a_stream_with_very_many_fields(serve) -> None:
-    channel = (await serve()).channel()
-    call = channel.stream_stream("/edgegrasp.v1.GraspService/DetectGraspsStream")()
+async def test_a_message_of_a_stream_with_very_many_fields(running) -> None:
+    call = running.channel().stream_stream("/edgegrasp.v1.GraspService/DetectGraspsStream")()
     await call.write(b"\x08\x01" * 10**7)
     assert await call.code() is grpc.StatusCode.INVALID_ARGUMENT
 

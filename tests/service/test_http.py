@@ -90,8 +90,7 @@ def test_what_is_no_good_request_is_told_why(dummy_server, data: bytes, status: 
     assert b'"status":%d' % status in body
 
 
-async def test_a_refused_client_that_sends_on_leaves_no_traceback(serve, caplog) -> None:
-    running = await serve()
+async def test_a_refused_client_that_sends_on_leaves_no_traceback(running, caplog) -> None:
     refused = POST + b"Content-Length: 99999999\r\n\r\n"
     said = await asyncio.to_thread(talk, running.server.http_url, refused + 2 * POST + bytes(10**6))
     assert said.startswith(b"HTTP/1.1 413")
@@ -129,9 +128,8 @@ async def test_names_of_the_server(serve, host: str, given: dict[str, Any], stat
     assert (await http.get("/health/live", headers={"host": host})).status_code == 200
 
 
-async def test_every_answer_says_what_a_browser_may_do_with_it(serve) -> None:
-    http = (await serve()).http()
+async def test_every_answer_says_what_a_browser_may_do_with_it(running) -> None:
     for path in ("/docs", "/playground/", "/v1/models", "/none", "/openapi.json"):
-        headers = (await http.get(path)).headers
+        headers = (await running.http().get(path)).headers
         assert "frame-ancestors 'none'" in headers["content-security-policy"]
         assert headers["x-content-type-options"] == "nosniff"

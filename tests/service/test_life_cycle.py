@@ -81,8 +81,7 @@ async def test_a_taken_port_is_named(begin, name: str) -> None:
             await running.serving
 
 
-async def test_while_draining_both_transports_say_so(serve, transport, cloud) -> None:
-    running = await serve()
+async def test_while_draining_both_transports_say_so(running, transport, cloud) -> None:
     client, by_grpc, http = running.connect(transport), running.connect("grpc"), running.http()
     health = health_pb2_grpc.HealthStub(by_grpc.channel)
     watch = health.Watch(health_pb2.HealthCheckRequest())

@@ -166,8 +166,7 @@ def requests_total(found: dict[Any, float]) -> dict[tuple[str, str, str], float]
     }
 
 
-async def test_requests_are_counted_on_both_transports(serve, cloud: np.ndarray) -> None:
-    running = await serve()
+async def test_requests_are_counted_on_both_transports(running, cloud: np.ndarray) -> None:
     for transport in ("grpc", "rest"):
         async with AsyncGraspClient(running.address(transport)) as client:
             await client.detect(cloud)
@@ -198,8 +197,7 @@ async def test_requests_are_counted_on_both_transports(serve, cloud: np.ndarray)
     ]
 
 
-async def test_streams_are_counted_by_result(serve, cloud: np.ndarray) -> None:
-    running = await serve()
+async def test_streams_are_counted_by_result(running, cloud: np.ndarray) -> None:
     async with AsyncGraspClient(running.address("grpc")) as client:
         requests = [StreamRequest(points) for points in (cloud, cloud[:0], cloud)]
         answers = [answer async for answer in client.detect_stream(requests)]
@@ -210,8 +208,7 @@ async def test_streams_are_counted_by_result(serve, cloud: np.ndarray) -> None:
     assert requests_total(found)["grpc", "DetectGraspsStream", "OK"] == 1.0
 
 
-async def test_hostile_callers_add_no_labels(serve, cloud: np.ndarray) -> None:
-    running = await serve()
+async def test_hostile_callers_add_no_labels(running, cloud: np.ndarray) -> None:
     before, http, client = set(await read(running)), running.http(), running.connect("grpc")
     for number in range(5):
         evil = {"model": f"evil-{number}\n{{}}"}

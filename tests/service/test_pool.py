@@ -40,9 +40,8 @@ async def test_a_worker_that_is_lost_fails_its_own_request_only(
     assert "edgegrasp_workers_replaced_total 1.0" in running.metrics()
 
 
-async def test_a_request_that_workers_die_of_is_not_tried_again(serve, transport, cloud):
+async def test_a_request_that_workers_die_of_is_not_tried_again(running, transport, cloud):
     """A crash is enough; a worker that was killed may have been killed for something else."""
-    running = await serve()
     client = running.connect(transport)
     running.stages.fail("evaluate", "crash")
     for _ in range(3):
@@ -56,10 +55,10 @@ async def test_a_request_that_workers_die_of_is_not_tried_again(serve, transport
 
 
 async def test_a_request_cancelled_as_it_is_answered_leaves_its_worker_to_the_next(
-    serve, cloud, monkeypatch
+    running, cloud, monkeypatch
 ) -> None:
     monkeypatch.setattr("edgegrasp_service.worker.pool.KILL_SECONDS", 0.0)
-    pool = (await serve()).server.pool
+    pool = running.server.pool
     message = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes()).SerializeToString()
     deadline = asyncio.get_running_loop().time() + 60.0
 
@@ -75,9 +74,8 @@ async def test_a_request_cancelled_as_it_is_answered_leaves_its_worker_to_the_ne
         await first
 
 
-async def test_a_nursery_that_is_stopped_is_replaced(serve, cloud, monkeypatch) -> None:
+async def test_a_nursery_that_is_stopped_is_replaced(running, cloud, monkeypatch) -> None:
     monkeypatch.setattr("edgegrasp_service.worker.pool.START_SECONDS", 1.0)
-    running = await serve()
     pool, client = running.server.pool, running.connect("rest")
     nursery = pool._nursery.pid
     os.kill(nursery, signal.SIGSTOP)
@@ -127,8 +125,7 @@ async def test_workers_killed_under_load(serve, cloud) -> None:
     assert outcomes["worker-lost"] <= 4
 
 
-async def test_a_nursery_that_dies_is_replaced(serve, cloud) -> None:
-    running = await serve()
+async def test_a_nursery_that_dies_is_replaced(running, cloud) -> None:
     client, pool = running.connect("rest"), running.server.pool
     pool._nursery._process.kill()
     assert (await client.detect(cloud)).fine
@@ -149,9 +146,8 @@ async def test_workers_end_with_the_server(serve) -> None:
 
 
 async def test_a_request_that_expires_or_is_left_while_it_waits_is_never_computed(
-    serve, transport, cloud
+    running, transport, cloud
 ) -> None:
-    running = await serve()
     client = running.connect(transport)
     first = await running.hold(client.detect(cloud))
     left = asyncio.create_task(client.detect(cloud))
@@ -165,8 +161,7 @@ async def test_a_request_that_expires_or_is_left_while_it_waits_is_never_compute
     assert running.stages.begun["prepare"] == 1
 
 
-async def test_the_worker_itself_stops_after_the_deadline(serve, transport, cloud):
-    running = await serve()
+async def test_the_worker_itself_stops_after_the_deadline(running, transport, cloud):
     client, before = running.connect(transport), running.server.pool.pids
     running.stages.shut("prepare")
     assert is_error(await client.detect(cloud, timeout=0.2), "deadline-exceeded")
@@ -177,8 +172,7 @@ async def test_the_worker_itself_stops_after_the_deadline(serve, transport, clou
     assert running.server.pool.pids == before
 
 
-async def test_a_request_whose_client_left_frees_its_worker(serve, transport, cloud) -> None:
-    running = await serve()
+async def test_a_request_whose_client_left_frees_its_worker(running, transport, cloud) -> None:
     asked = await running.hold(running.connect(transport).detect(cloud))
     asked.cancel()
     await running.until(lambda: running.ended == ["cancelled"])
@@ -214,17 +208,17 @@ async def test_a_client_that_vanishes_mid_body_leaves_its_place(serve) -> None:
     await running.until(lambda: running.ended == ["cancelled"])
 
 
-async def test_a_body_that_never_ends_is_given_up_at_the_deadline(serve) -> None:
-    running = await serve()
+async def test_a_body_that_never_ends_is_given_up_at_the_deadline(running) -> None:
     reader, writer = await running.speak(HEAD + b'X-Request-Timeout: 0.2\r\n\r\n{"points": [')
     assert b" 504 " in await asyncio.wait_for(reader.readline(), 20)
     writer.close()
     await running.until(lambda: running.ended == ["deadline-exceeded"])
 
 
-async def test_clocks_that_jump(serve, cloud: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_clocks_that_jump(
+    running, cloud: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The wall clock goes back a day, and on by thirty years, each time it is read."""
-    running = await serve()
     real, jumps = time.time, itertools.cycle([-86400.0, 3600.0, 1e9, -1e9])
     monkeypatch.setattr(time, "time", lambda: real() + next(jumps))
     monkeypatch.setattr(time, "time_ns", lambda: int(time.time() * 1e9))

@@ -16,8 +16,7 @@ def request(name: str, points: np.ndarray, **options: Any) -> grasp_pb2.DetectGr
     return grasp_pb2.DetectGraspsStreamRequest(request_id=name, request=detect)
 
 
-async def test_an_error_is_an_answer_and_the_stream_goes_on(serve, cloud) -> None:
-    running = await serve()
+async def test_an_error_is_an_answer_and_the_stream_goes_on(running, cloud) -> None:
     stream = running.stub().DetectGraspsStream()
     bad = request("negative", cloud)
     bad.timeout = -1.0
@@ -38,8 +37,7 @@ async def test_an_error_is_an_answer_and_the_stream_goes_on(serve, cloud) -> Non
         assert error.message.startswith(error.detail.field)
 
 
-async def test_a_request_of_a_stream_has_a_deadline_of_its_own(serve, cloud) -> None:
-    running = await serve()
+async def test_a_request_of_a_stream_has_a_deadline_of_its_own(running, cloud) -> None:
     stream = running.stub().DetectGraspsStream()
     await running.hold(stream.write(request("patient", cloud)))
     hasty = request("hasty", cloud)
@@ -113,8 +111,7 @@ async def test_streams_are_bounded(serve, cloud) -> None:
     assert await first.code() is grpc.StatusCode.OK
 
 
-async def test_a_stream_whose_client_left_ends(serve, cloud) -> None:
-    running = await serve()
+async def test_a_stream_whose_client_left_ends(running, cloud) -> None:
     stream = running.stub().DetectGraspsStream()
     running.stages.shut("evaluate")
     for name in ("first", "second"):
@@ -128,8 +125,7 @@ async def test_a_stream_whose_client_left_ends(serve, cloud) -> None:
     assert running.stages.begun["prepare"] == 1
 
 
-async def test_a_stopping_server_answers_what_it_read_and_ends_the_stream(serve, cloud):
-    running = await serve()
+async def test_a_stopping_server_answers_what_it_read_and_ends_the_stream(running, cloud):
     stream, idle = running.stub().DetectGraspsStream(), running.stub().DetectGraspsStream()
     await running.hold(stream.write(request("read", cloud)))
     running.stop.set()
