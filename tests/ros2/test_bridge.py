@@ -35,6 +35,12 @@ def lookup(target: str, source: str, stamp: Any) -> np.ndarray:
     return np.linalg.inv(FRAMES[target]) @ FRAMES[source]
 
 
+def detect(
+    client: Any, scene: Scene, settings: Any = None, options: Any = None, **more: Any
+) -> Any:
+    return bridge.detect(client, scene, settings or Settings(), options or {}, lookup, **more)
+
+
 @pytest.fixture(scope="module")
 def client(dummy_server) -> Iterator[GraspClient]:
     with GraspClient(dummy_server.grpc_address) as client:
@@ -78,7 +84,7 @@ def camera(sent) -> Any:
 def test_a_cloud_and_its_grasps_in_every_message(client, sent, make_cloud, cloud) -> None:
     settings = Settings(target_frame="base", hand_frame="hand", parent_link="link8")
     options = {"seed": 3, "top_k": 5}
-    found = bridge.detect(client, Scene(make_cloud(cloud)), settings, options, lookup)
+    found = detect(client, Scene(make_cloud(cloud)), settings, options)
     expected = client.detect(cloud, viewpoint=[0, 0, 0], seed=3, top_k=5).grasps
     hands = [T_base_camera @ grasp.T_cloud_hand for grasp in expected]
     assert len(hands) == 5
@@ -129,7 +135,7 @@ def test_the_first_pose_follows_its_object_from_message_to_message(real_server, 
     with GraspClient(real_server.grpc_address) as client:
         for number in range(3):
             scene = Scene(make_cloud(test_tracking.image(number)["cloud"], "base"))
-            found = bridge.detect(client, scene, settings, {}, lookup, tracker=tracker)
+            found = detect(client, scene, settings, tracker=tracker)
             poses = sent("geometry_msgs/msg/PoseArray", bridge.pose_array(found)).poses
             places.append(matrix(poses[0])[:3, 3])
     np.testing.assert_allclose(
@@ -149,7 +155,7 @@ def matrix(pose: Any) -> np.ndarray:
 def test_a_depth_image_with_its_camera(client, make_image, camera, kind, encoding) -> None:
     depth = DEPTH if kind == np.uint16 else DEPTH.astype(kind) / 1000
     scene = Scene(depth=make_image(depth, encoding, padding=6), camera=camera)
-    found = bridge.detect(client, scene, Settings(), {}, lookup)
+    found = detect(client, scene)
     expected = client.detect(depth_images=[{"depth": depth, "intrinsics": MATRIX}]).grasps
     assert found.header["frame_id"] == "camera"
     assert bridge.trajectories(found) == []
@@ -178,18 +184,16 @@ def asked(client, cloud) -> Asked:
 
 def test_frames_say_where_the_camera_stands_and_what_is_up(asked, make_cloud, cloud) -> None:
     settings = Settings(camera_frame="camera", gravity_frame="base")
-    bridge.detect(asked, Scene(make_cloud(cloud, "base")), settings, {}, lookup)
+    detect(asked, Scene(make_cloud(cloud, "base")), settings)
     np.testing.assert_allclose(asked.given["viewpoint"], [0.4, 0.0, 0.7])
     np.testing.assert_allclose(asked.given["up"], [0, 0, 1], atol=1e-12)
-    bridge.detect(asked, Scene(make_cloud(cloud)), settings, {"viewpoint": [1, 2, 3]}, lookup)
+    detect(asked, Scene(make_cloud(cloud)), settings, {"viewpoint": [1, 2, 3]})
     assert asked.given["viewpoint"] == [1, 2, 3]
     np.testing.assert_allclose(asked.given["up"], T_base_camera[2, :3], atol=1e-12)
     in_base = Settings(target_frame="base")
-    bridge.detect(asked, Scene(make_cloud(cloud)), in_base, {}, lookup)
+    detect(asked, Scene(make_cloud(cloud)), in_base)
     np.testing.assert_allclose(asked.given["up"], T_base_camera[2, :3], atol=1e-12)
-    bridge.detect(
-        asked, Scene(make_cloud(cloud)), replace(in_base, gravity_frame="none"), {}, lookup
-    )
+    detect(asked, Scene(make_cloud(cloud)), replace(in_base, gravity_frame="none"))
     assert "up" not in asked.given
 
 
@@ -201,7 +205,7 @@ def test_a_mask_says_where(asked, make_image, camera, encoding) -> None:
     if encoding == "rgb8":
         pixels = np.stack([pixels * 0, pixels, pixels * 0], axis=-1)
     scene = Scene(None, make_image(DEPTH, "16UC1"), camera, make_image(pixels, encoding))
-    bridge.detect(asked, scene, Settings(), {}, lookup)
+    detect(asked, scene)
     (outside,) = asked.given["contact_region"]["exclude"]
     np.testing.assert_array_equal(outside["mask"], ~wanted)
 
@@ -214,30 +218,23 @@ def test_an_object_and_its_scene_come_apart(asked, make_cloud, make_image, camer
     in_base = wanted @ T_base_camera[:3, :3].T + T_base_camera[:3, 3]
     cluster = make_cloud(in_base, "base", bigendian)
     scene = Scene(make_cloud(organised, bigendian=bigendian))
-    bridge.detect(asked, scene, Settings(), {}, lookup, cluster)
+    detect(asked, scene, object_cloud=cluster)
     segment_ids = asked.given["segment_ids"]
     np.testing.assert_allclose(asked.cloud[segment_ids == 1], wanted, atol=1e-5)
     assert len(wanted) + 100 < len(asked.cloud) <= 150
 
-    bridge.detect(
-        asked,
-        Scene(depth=make_image(DEPTH, "16UC1"), camera=camera),
-        Settings(),
-        {},
-        lookup,
-        cluster,
-    )
+    detect(asked, Scene(depth=make_image(DEPTH, "16UC1"), camera=camera), object_cloud=cluster)
     around = asked.cloud[asked.given["segment_ids"] == 0]
     assert len(around) == DEPTH.size
     column = 60.0 * around[:, 0] / around[:, 2] + 15.5
     np.testing.assert_allclose(column.reshape(24, 32)[0], np.arange(32), atol=1e-3)
 
-    bridge.detect(asked, Scene(), Settings(), {}, lookup, cluster)
+    detect(asked, Scene(), object_cloud=cluster)
     assert asked.cloud is cluster
 
 
 def test_no_grasp_and_an_aborted_goal_say_why(asked, sent, make_cloud, cloud) -> None:
-    found = bridge.detect(asked, Scene(make_cloud(cloud)), Settings(), {}, lookup)
+    found = detect(asked, Scene(make_cloud(cloud)))
     for fields, message in (
         (bridge.object_results(found, Settings(), "mug"), "No grasp: 500 points"),
         (bridge.failed_result("mug", LookupError("no frame")), "LookupError: no frame"),
@@ -278,7 +275,7 @@ def test_images_of_several_cameras_are_one_cloud(asked, make_image, camera) -> N
     inbox.take("camera", camera, 0.0)
     for image in (aside, make_image(DEPTH, "16UC1")):
         inbox.take("depth", image, 0.0)
-    bridge.detect(asked, inbox.scene(0.0), Settings(), {}, lookup)
+    detect(asked, inbox.scene(0.0))
     poses = [image["T_cloud_camera"] for image in asked.given["depth_images"]]
     expected = [np.eye(4), np.linalg.inv(T_base_camera) @ PANDA_LINK8]
     np.testing.assert_allclose(poses, expected, atol=1e-12)
@@ -298,11 +295,11 @@ def test_every_option_is_a_parameter(client, make_cloud, cloud) -> None:
     settings, options = bridge.read_parameters(given)
     assert settings.joints.at(0.08) == {"finger": 0.04}
     assert options["workspace"]["max"] == [1, 1, 1]
-    found = bridge.detect(client, Scene(make_cloud(cloud)), settings, options, lookup)
+    found = detect(client, Scene(make_cloud(cloud)), settings, options)
     assert len(found.grasps) == 2
     wrong = options | {"top_k": "many"}
     with pytest.raises(InvalidRequestError, match="top_k"):
-        bridge.detect(client, Scene(make_cloud(cloud)), settings, wrong, lookup)
+        detect(client, Scene(make_cloud(cloud)), settings, wrong)
 
 
 def test_messages_that_cannot_be_used(client, sent, make_cloud, make_image, camera, cloud) -> None:
@@ -319,7 +316,7 @@ def test_messages_that_cannot_be_used(client, sent, make_cloud, make_image, came
         (Scene(make_cloud(cloud)), flat, "Send x too, as 7"),
     ):
         with pytest.raises((ValueError, InvalidRequest), match=message):
-            bridge.detect(client, scene, Settings(), {}, lookup, cluster)
+            detect(client, scene, object_cloud=cluster)
 
 
 ARM = Robot(
@@ -347,7 +344,7 @@ def test_the_best_pick_is_a_trajectory_of_the_arm(planning, sent, make_cloud, cl
         state = {"name": names, "position": positions}
         assert not inbox.take("joints", sent("sensor_msgs/msg/JointState", state), 1.0)
     _, options = bridge.read_parameters(bridge.parameters() | {"options.robot": "arm"})
-    found = bridge.detect(planning, inbox.scene(1.0), Settings(), options, lookup)
+    found = detect(planning, inbox.scene(1.0), options=options)
     robot, first = planning.given["robot"], 0
     assert robot["joints"] == [0.1, 0.2]
     np.testing.assert_allclose(np.reshape(robot["T_base_cloud"], (4, 4)), T_base_camera)
@@ -364,7 +361,7 @@ def test_the_best_pick_is_a_trajectory_of_the_arm(planning, sent, make_cloud, cl
 def test_an_arm_is_where_it_is_before_the_first_scene(planning, make_cloud, cloud) -> None:
     """The cloud of an action's object may be the only one."""
     scene, options = Scene(joints={"a": 0.1, "b": 0.2}), {"robot": "arm"}
-    bridge.detect(planning, scene, Settings(), options, lookup, make_cloud(cloud))
+    detect(planning, scene, options=options, object_cloud=make_cloud(cloud))
     assert planning.given["robot"]["joints"] == [0.1, 0.2]
 
 
@@ -377,4 +374,4 @@ def test_an_arm_that_is_not_known_is_not_planned_for(
 ) -> None:
     scene = Scene(make_cloud(cloud), joints=joints)
     with pytest.raises(ValueError, match=message):
-        bridge.detect(planning, scene, Settings(), {"robot": {"name": name}}, lookup)
+        detect(planning, scene, options={"robot": {"name": name}})
