@@ -3,6 +3,7 @@
 import hashlib
 import json
 import pickle
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -73,25 +74,26 @@ def test_a_checkpoint_survives_the_round_trip(path: Path, network: torch.nn.Modu
         assert torch.equal(value, expected[name]), name
 
 
+def assert_refused(read: Callable[[Path], object], path: Path, complaint: str) -> None:
+    with pytest.raises(InvalidCheckpoint, match=complaint):
+        read(path)
+
+
 @pytest.mark.parametrize("kept", [0.0, 0.001, 0.2, 0.999])
 def test_a_truncated_file_is_refused(path: Path, kept: float) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * kept)])
-    with pytest.raises(InvalidCheckpoint, match=path.name):
-        load_checkpoint(path)
+    assert_refused(load_checkpoint, path, path.name)
 
 
 def test_a_missing_a_pickled_and_a_foreign_file_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.safetensors"
-    with pytest.raises(InvalidCheckpoint, match=path.name):
-        load_checkpoint(path)
+    assert_refused(load_checkpoint, path, path.name)
     path.write_bytes(pickle.dumps(Trap(tmp_path / "sprung")))
-    with pytest.raises(InvalidCheckpoint, match=path.name):
-        load_checkpoint(path)
+    assert_refused(load_checkpoint, path, path.name)
     assert not (tmp_path / "sprung").exists()
     save_file({"weight": torch.zeros(3)}, path)
-    with pytest.raises(InvalidCheckpoint, match="metadata"):
-        load_checkpoint(path)
+    assert_refused(load_checkpoint, path, "metadata")
 
 
 @pytest.mark.parametrize(
@@ -122,8 +124,7 @@ def test_unusable_metadata_is_refused(path: Path, changes: dict[str, Any], compl
         values = json.loads(file.metadata()["edgegrasp"]) | changes
     values = {name: value for name, value in values.items() if value is not None}
     save_file(load_file(path), path, metadata={"edgegrasp": json.dumps(values)})
-    with pytest.raises(InvalidCheckpoint, match=f"(?s){path.name}.*{complaint}"):
-        load_checkpoint(path)
+    assert_refused(load_checkpoint, path, f"(?s){path.name}.*{complaint}")
 
 
 @pytest.mark.parametrize("value", [7.0, float("nan")])
@@ -133,8 +134,7 @@ def test_damaged_weights_are_refused(path: Path, value: float) -> None:
     tensors = load_file(path)
     tensors["mean"][3] = value
     save_file(tensors, path, metadata=metadata)
-    with pytest.raises(InvalidCheckpoint, match=path.name):
-        load_checkpoint(path)
+    assert_refused(load_checkpoint, path, path.name)
 
 
 def test_a_network_that_computes_something_else_than_when_it_was_written_is_refused(path) -> None:
@@ -152,27 +152,22 @@ def write_layout(directory: Path, number: int = 1, **weights: object) -> None:
 
 
 def test_none_and_two_checkpoints_in_one_directory_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidCheckpoint, match="0 files"):
-        import_checkpoint(tmp_path)
+    assert_refused(import_checkpoint, tmp_path, "0 files")
     write_layout(tmp_path, 1)
     write_layout(tmp_path, 2)
-    with pytest.raises(InvalidCheckpoint, match="2 files"):
-        import_checkpoint(tmp_path)
+    assert_refused(import_checkpoint, tmp_path, "2 files")
 
 
 def test_a_missing_a_truncated_and_a_trapped_part_are_named(tmp_path: Path) -> None:
     write_layout(tmp_path, local_emd_model={"weight": torch.zeros(1000)})
     first, second, third = (tmp_path / f"{part}-ckpt-1.pt" for part in PARTS)
     third.unlink()
-    with pytest.raises(InvalidCheckpoint, match=third.name):
-        import_checkpoint(tmp_path)
+    assert_refused(import_checkpoint, tmp_path, third.name)
     torch.save({"weight": Trap(tmp_path / "sprung")}, second, pickle_module=pickle)
-    with pytest.raises(InvalidCheckpoint, match=second.name):
-        import_checkpoint(tmp_path)
+    assert_refused(import_checkpoint, tmp_path, second.name)
     assert not (tmp_path / "sprung").exists()
     first.write_bytes(first.read_bytes()[:500])
-    with pytest.raises(InvalidCheckpoint, match=first.name):
-        import_checkpoint(tmp_path)
+    assert_refused(import_checkpoint, tmp_path, first.name)
 
 
 @pytest.mark.parametrize(
@@ -186,5 +181,4 @@ def test_a_missing_a_truncated_and_a_trapped_part_are_named(tmp_path: Path) -> N
 )
 def test_other_weights_are_refused(tmp_path: Path, weights: object, complaint: str) -> None:
     write_layout(tmp_path, classifier_model=weights)
-    with pytest.raises(InvalidCheckpoint, match=f"(?s){complaint}"):
-        import_checkpoint(tmp_path)
+    assert_refused(import_checkpoint, tmp_path, f"(?s){complaint}")
