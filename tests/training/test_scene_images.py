@@ -13,10 +13,7 @@ from tests.cloud_files import block_obj
 from edgegrasp_training import scene_images, scene_training
 from edgegrasp_training.scene_images import DEPTH_UNIT, generate, make_images
 from edgegrasp_training.scene_layouts import OBJECT, SUPPORT, PoolMesh, box, draw_scene, pool_mesh
-from edgegrasp_training.scene_training import (
-    image_points,
-    train,
-)
+from edgegrasp_training.scene_training import image_points, train
 
 
 @pytest.fixture(scope="module")
