@@ -178,12 +178,13 @@ def planned(**changes: object) -> PlannedGrasp:
     return grasp
 
 
-def test_a_model_may_be_a_file_of_weights(tmp_path: Path) -> None:
+def test_a_planner_has_the_weights_and_the_time_of_its_flags(tmp_path: Path) -> None:
     ablation = tmp_path / "no-augmentation.safetensors"
     ablation.write_bytes((WEIGHTS_FOLDER / "edgegrasp-plus.safetensors").read_bytes())
-    file = PlannerFlags(planner="in-process", model=str(ablation))
+    file = PlannerFlags(planner="in-process", model=str(ablation), timeout=7.0)
     with open_planner(file, PAPER, {}) as made:
         assert len(made.facts["digest"]) == len(made.facts["scene_digest"]) == 64
+        assert made.make().timeout == 7.0
     assert planned(model=str(ablation)).score == planned().score
     for changes in ({"planner": "in-process"}, {"weights": (ablation,)}):
         with (
@@ -191,12 +192,6 @@ def test_a_model_may_be_a_file_of_weights(tmp_path: Path) -> None:
             open_planner(PlannerFlags(server="127.0.0.1:1", **changes), PAPER, {}),
         ):
             pass
-
-
-def test_a_planner_waits_for_a_server_as_long_as_the_flag_says() -> None:
-    choice = PlannerFlags(planner="in-process", timeout=7.0)
-    with open_planner(choice, PAPER, {}) as made:
-        assert made.make().timeout == 7.0
 
 
 def test_a_view_in_which_the_arm_touches_the_table_is_told_from_other_errors() -> None:
