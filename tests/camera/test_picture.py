@@ -1,5 +1,4 @@
 import io
-from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,13 +7,6 @@ from PIL import Image
 
 from edgegrasp_camera.clouds import CloudInput
 from edgegrasp_camera.picture import Picture, View, draw_detection, draw_grasps
-
-
-@dataclass
-class Planned:
-    T_cloud_hand: np.ndarray
-    score: float = 1.0
-    width: float = 0.08
 
 
 def pixels(written: io.BytesIO) -> np.ndarray:
@@ -37,8 +29,8 @@ def test_what_the_cloud_hides_of_a_hand_is_faint(behind: bool) -> None:
     T = np.eye(4)
     T[:3, :3] = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
     T[:3, 3] = (0.0, 0.2 if behind else -0.2, 0.1)
-    stream = io.BytesIO()
-    draw_grasps(stream, wall, [Planned(T)], camera_position=(0.0, -1.0, 0.0), title="")
+    stream, grasp = io.BytesIO(), SimpleNamespace(T_cloud_hand=T, score=1.0, width=0.08)
+    draw_grasps(stream, wall, [grasp], camera_position=(0.0, -1.0, 0.0), title="")
     red, green, blue = np.moveaxis(pixels(stream), 2, 0)
     strong = ((red > 220) & (green > 200) & (blue < 80)).sum()
     assert (strong < 50) == behind
