@@ -99,30 +99,26 @@ LISTS = st.one_of(
 )
 
 
-def changed(good: dict[str, Any]) -> st.SearchStrategy[dict[str, Any]]:
+@st.composite
+def changed(draw: st.DrawFn, good: dict[str, Any]) -> dict[str, Any]:
     """An object with some of its fields, at any depth, taken out or put to other values."""
-
-    @st.composite
-    def change(draw: st.DrawFn) -> dict[str, Any]:
-        found = deepcopy(good)
-        for _ in range(draw(st.integers(1, 3))):
-            at: Any = found
-            while True:
-                keys = list(at) if isinstance(at, dict) else list(range(len(at)))
-                if not keys:
-                    break
-                key = draw(st.sampled_from(keys))
-                if isinstance(at[key], dict | list) and at[key] and draw(st.integers(0, 3)):
-                    at = at[key]
-                    continue
-                if isinstance(at, dict) and not draw(st.integers(0, 4)):
-                    del at[key]
-                else:
-                    at[key] = draw(VALUES | st.binary(max_size=8))
+    found = deepcopy(good)
+    for _ in range(draw(st.integers(1, 3))):
+        at: Any = found
+        while True:
+            keys = list(at) if isinstance(at, dict) else list(range(len(at)))
+            if not keys:
                 break
-        return found
-
-    return change()
+            key = draw(st.sampled_from(keys))
+            if isinstance(at[key], dict | list) and at[key] and draw(st.integers(0, 3)):
+                at = at[key]
+                continue
+            if isinstance(at, dict) and not draw(st.integers(0, 4)):
+                del at[key]
+            else:
+                at[key] = draw(VALUES | st.binary(max_size=8))
+            break
+    return found
 
 
 def base64_of(value: Any) -> str:
