@@ -67,9 +67,11 @@ async def test_the_oldest_are_deleted_with_those_of_earlier_runs(serve, cloud, t
     assert running.server.service.admission.held_bytes == 0
 
 
-def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+def test_what_cannot_be_written_is_told_at_the_start(tmp_path: Path) -> None:
     with pytest.raises(InvalidSettings, match="record_folder"):
         Recorder(tmp_path / "none" / "recorded", 2**20, lambda size: True)
+    with pytest.raises(InvalidSettings, match="No such file"):
+        check_outcomes(tmp_path / "none" / "outcomes.jsonl")
     assert not (tmp_path / "none").exists()
 
 
@@ -156,8 +158,3 @@ def test_lines_are_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monkey
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert file.read_bytes() == b'{"a": 1}\n{"b": 2}\n'
-
-
-def test_a_file_that_cannot_be_written_is_told_at_the_start(tmp_path: Path) -> None:
-    with pytest.raises(InvalidSettings, match="No such file"):
-        check_outcomes(tmp_path / "none" / "outcomes.jsonl")

@@ -63,20 +63,19 @@ def test_lists_in_the_environment_are_json(monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
-        ({"http_port": -1}, "http_port: got -1. Input should be greater"),
+        ({"http_port": -1}, r"http_port: got -1\. Input should be greater"),
         ({"htp_port": 1}, "htp_port: no such setting"),
         ({"log_level": "none"}, "log_level: got 'none'"),
         ({"max_body_bytes": "many"}, "max_body_bytes: got 'many'"),
-        ({"weights": [1]}, "weights.0: got 1"),
+        ({"weights": [1]}, r"weights\.0: got 1"),
         ({"tls_key": "key.pem"}, "tls_certificate and tls_key go together"),
         ({"tls_client_ca": "ca.pem"}, "tls_client_ca needs tls_certificate"),
         ({"grace_seconds": float("nan")}, "grace_seconds: got nan"),
     ],
 )
 def test_bad_settings_are_named(given: dict[str, object], sentence: str) -> None:
-    with pytest.raises(InvalidSettings) as caught:
+    with pytest.raises(InvalidSettings, match=sentence):
         load_settings(**given)
-    assert sentence in str(caught.value)
 
 
 @pytest.mark.parametrize(
