@@ -23,6 +23,7 @@ import pytest
 import trustme
 from benchmarks import serve_dummy
 from hypothesis import HealthCheck, settings
+from tests.programs import EDGEGRASP, started
 
 # PyTorch with CUDA loads it for training, which on Debian 12 crashes once MuJoCo has drawn: both
 # bring an LLVM.
@@ -68,30 +69,16 @@ class RunningServer:
 
 @contextlib.contextmanager
 def running_server(
-    *flags: str,
-    program: Sequence[str] = ("-c", "from edgegrasp_cli.main import main; main()"),
-    seconds: float = 0.0,
-    **more: Any,
+    *flags: str, program: Sequence[str] = EDGEGRASP[1:], seconds: float = 0.0, **more: Any
 ) -> Iterator[RunningServer]:
-    ports = ("--http-port", "0", "--grpc-port", "0")
-    process = subprocess.Popen(
-        [sys.executable, *program, "serve", *ports, *flags],
-        stdout=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"DUMMY_SECONDS": str(seconds)},
-        **more,
-    )
-    assert process.stdout is not None
-    try:
+    words = (sys.executable, *program, "serve", "--http-port", "0", "--grpc-port", "0", *flags)
+    environment = os.environ | {"DUMMY_SECONDS": str(seconds)}
+    with started(*words, env=environment, **more) as process:
+        assert process.stdout is not None
         line = process.stdout.readline()  # empty once the process is gone
         match = READY_LINE.fullmatch(line)
         assert match, f"the server said {line!r}"
         yield RunningServer(match[1], match[2], process)
-    finally:
-        if process.poll() is None:
-            process.terminate()
-            process.wait(timeout=20)
-        process.stdout.close()
 
 
 @pytest.fixture(scope="session")
