@@ -152,11 +152,6 @@ def test_what_is_out_of_reach_is_counted_and_comes_last(fr3):
     assert detection.grasps[0].object == 1  # of a lower score
 
 
-def test_a_motion_may_have_no_straight_approach(fr3):
-    found = picks_of(fr3, np.eye(4), options={"collision": {"approach_length": 0.0}})
-    assert found.counts["with_trajectory"] == len(BOXES)
-
-
 def test_a_lid_over_an_object_is_a_collision_of_the_arm(fr3):
     lid = {"min": (0.4, -0.1, 0.2), "max": (0.6, 0.1, 0.22)}
     detection = picks_of(
@@ -205,9 +200,12 @@ def test_what_no_camera_saw_is_avoided_where_asked(fr3, eyes, reachable):
         assert detection.counts["arm_collision"] == 1 - expected
 
 
-def test_obstacles_may_touch_each_other(fr3):
-    boxes = [{"kind": "box", "min": (x, 0.5, -0.1), "max": (x + 0.2, 0.9, 0.3)} for x in (0.4, 0.5)]
-    detection = picks_of(fr3, np.eye(4), options={"collision": {"obstacles": boxes}})
+TOUCHING = [{"kind": "box", "min": (x, 0.5, -0.1), "max": (x + 0.2, 0.9, 0.3)} for x in (0.4, 0.5)]
+
+
+@pytest.mark.parametrize("collision", [{"approach_length": 0.0}, {"obstacles": TOUCHING}])
+def test_a_motion_may_have_no_straight_approach_and_obstacles_may_touch(fr3, collision):
+    detection = picks_of(fr3, np.eye(4), options={"collision": collision})
     assert detection.counts["with_trajectory"] == len(BOXES)
 
 
@@ -290,6 +288,7 @@ def test_a_colliding_hand_gets_no_motion(fr3):
     assert found.counts["hand_collision"] == len(BOXES)
 
 
+TRAY = {"min": [0.3, -0.5, 0.0], "max": [0.6, -0.3, 0.3]}
 START_IN_THE_TABLE = [0.0, 1.3, 0.0, -1.0, 0.0, 2.2, 0.8]
 START_IN_ITSELF = [0.0, -1.7, 0.0, -3.0, 0.0, 0.6, 0.0]
 REFUSED = [  # what changes, and what is said: a field, of its value, of the fix
@@ -301,10 +300,14 @@ REFUSED = [  # what changes, and what is said: a field, of its value, of the fix
     ({"boxes": ((0.08, 0.0, 0.1),)}, "robot.T_base_cloud", "object", ""),
     ({"options": {"collision": "ignore"}}, "collision.mode", "", ""),
     ({"options": {"gripper": "barrett"}}, "gripper", "", ""),
+    ({"place": {}}, "robot.place", "", ""),
+    ({"place": {"region": TRAY, "T_base_object": np.eye(4).tolist()}}, "robot.place", "", ""),
+    ({"place": {"T_base_object": [[0.0] * 4] * 4}}, "robot.place.T_base_object", "", ""),
+    ({"place": {"region": {"min": TRAY["max"], "max": TRAY["min"]}}}, "robot.place.region", "", ""),
 ]
 
 
-def test_a_robot_that_cannot_be_there_is_refused(fr3):
+def test_a_robot_or_a_place_that_cannot_be_is_refused(fr3):
     for changed, field, value, fix in REFUSED:
         with refusal(f"options.{field}", value, fix):
             picks_of(fr3, **changed)
@@ -316,9 +319,6 @@ def test_a_pose_that_is_none_is_refused(pose):
     robot = {"name": "fr3", "T_base_cloud": pose.ravel().tolist(), "joints": [0.0] * 7}
     with refusal("options.robot.T_base_cloud."):
         parse_options({"robot": robot})
-
-
-TRAY = {"min": [0.3, -0.5, 0.0], "max": [0.6, -0.3, 0.3]}
 
 
 def placed(grasp, plan):
@@ -375,17 +375,3 @@ def test_without_a_place_nothing_is_within_reach(fr3, region):
     assert detection.counts["no_place"] == len(BOXES)
     assert detection.counts["reachable"] == 0
     assert "arm's reach" in detection.warnings[0]
-
-
-@pytest.mark.parametrize(
-    ("place", "field"),
-    [
-        ({}, "options.robot.place"),
-        ({"region": TRAY, "T_base_object": np.eye(4).tolist()}, "options.robot.place"),
-        ({"T_base_object": np.zeros((4, 4)).tolist()}, "options.robot.place.T_base_object"),
-        ({"region": {"min": TRAY["max"], "max": TRAY["min"]}}, "options.robot.place.region"),
-    ],
-)
-def test_a_place_that_is_none_is_refused(fr3, place, field):
-    with refusal(field):
-        picks_of(fr3, place=place)
