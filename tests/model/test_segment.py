@@ -1,6 +1,5 @@
 """What is found in a view without further options: the support, and the objects on it."""
 
-import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from tests.checks import refusal
+from tests.checks import bounded_memory, refusal
 
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.results import SUPPORT
@@ -152,17 +151,16 @@ def test_a_workspace_is_where_grasps_are_and_what_is_beyond_stays() -> None:
     assert len(found.objects) == 1
 
 
+ABOVE, FOUR = camera(0.8, -1.5, 0.7), boxes_on_table(5)
+ON_TABLE = render([table(), *FOUR], ABOVE)
+PLACES = np.nan_to_num(to_world(ABOVE, ON_TABLE.reshape(-1, 3)), nan=9.0)
+
+
 def test_segments_are_the_objects_where_they_are_sent() -> None:
     number = 2**31 - 1000
-    boxes, T_world_camera = boxes_on_table(5), camera(0.8, -1.5, 0.7)
-    cloud = render([table(), *boxes], T_world_camera)
-    near = np.nan_to_num(to_world(T_world_camera, cloud.reshape(-1, 3)), nan=9.0)
-    segment = np.where(boxes[2].distance(near) < 0.004, number, 0).reshape(cloud.shape[:2])
-    tracemalloc.start()
-    found = detect(CloudInput(cloud, segment_ids=segment), previous={}, debug=True)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 2**30  # bytes, however high the numbers are
+    segment = np.where(FOUR[2].distance(PLACES) < 0.004, number, 0).reshape(ON_TABLE.shape[:2])
+    with bounded_memory(2**30):  # however high the numbers are
+        found = detect(CloudInput(ON_TABLE, segment_ids=segment), previous={}, debug=True)
     assert {grasp.object for grasp in found.grasps} == {number}
     assert [each.number for each in found.objects] == [number]
     assert found.debug is not None
@@ -193,14 +191,11 @@ def test_a_chosen_object_is_not_taken_for_one_beside_it_that_was_left_out() -> N
 
 @pytest.mark.parametrize("search", [True, False])
 def test_followed_objects_have_the_numbers_of_the_segments_they_are_in(search: bool) -> None:
-    boxes, T_world_camera = boxes_on_table(5), camera(0.8, -1.5, 0.7)
-    cloud = render([table(), *boxes], T_world_camera)
-    near = np.nan_to_num(to_world(T_world_camera, cloud.reshape(-1, 3)), nan=9.0)
-    on = np.array([one.distance(near) < 0.004 for one in boxes])
+    on = np.array([one.distance(PLACES) < 0.004 for one in FOUR])
     segment = np.argmax([~on.any(axis=0), *on], axis=0)
-    previous = continued(detect(CloudInput(cloud, segment_ids=segment), previous={}))
-    renumbered = np.array([0, 4, 3, 2, 1])[segment]
-    now = detect(CloudInput(cloud, segment_ids=renumbered), previous=previous | {"search": search})
+    previous = continued(detect(CloudInput(ON_TABLE, segment_ids=segment), previous={}))
+    cloud = CloudInput(ON_TABLE, segment_ids=np.array([0, 4, 3, 2, 1])[segment])
+    now = detect(cloud, previous=previous | {"search": search})
     assert now.tracking is not None
     assert now.tracking.first == "kept"
     for number, there in [
@@ -208,14 +203,13 @@ def test_followed_objects_have_the_numbers_of_the_segments_they_are_in(search: b
         *((one.object, one.contact_point[None]) for one in now.grasps),
     ]:
         assert number is not None
-        assert boxes[4 - number].distance(to_world(T_world_camera, there)).max() < 0.01
+        assert FOUR[4 - number].distance(to_world(ABOVE, there)).max() < 0.01
 
 
 def test_objects_are_chosen_by_the_numbers_that_following_gives_them() -> None:
-    cloud = render([table(), *boxes_on_table(5)], camera(0.8, -1.5, 0.7))
-    previous = continued(detect(cloud, previous={"next_id": 20}))
+    previous = continued(detect(ON_TABLE, previous={"next_id": 20}))
     for chosen, numbers in (("include", {22}), ("exclude", {20, 21, 23})):
-        now = detect(cloud, previous=previous, objects={chosen: [22]})
+        now = detect(ON_TABLE, previous=previous, objects={chosen: [22]})
         assert {grasp.object for grasp in now.grasps} == numbers
         assert {each.number for each in now.objects} == numbers
         assert not now.warnings
@@ -223,19 +217,17 @@ def test_objects_are_chosen_by_the_numbers_that_following_gives_them() -> None:
 
 @pytest.mark.parametrize("search", [True, False])
 def test_of_two_earlier_objects_in_one_place_only_one_is_there(search: bool) -> None:
-    cloud = render([table(), *boxes_on_table(5)], camera(0.8, -1.5, 0.7))
-    previous = continued(detect(cloud, previous={})) | {"search": search}
-    few = detect(cloud, previous=previous, num_candidates=1)
+    previous = continued(detect(ON_TABLE, previous={})) | {"search": search}
+    few = detect(ON_TABLE, previous=previous, num_candidates=1)
     assert not any(one.reason for one in few.objects if (one.best_score or 0.0) >= 0.5)
     previous["objects"] += [previous["objects"][0] | {"number": 9}]
-    now = detect(cloud, previous=previous)
+    now = detect(ON_TABLE, previous=previous)
     assert {grasp.object for grasp in now.grasps} <= {each.number for each in now.objects}
 
 
 def test_a_segment_for_every_pixel_takes_no_more_approach_points() -> None:
-    cloud = render([table(), *boxes_on_table(5)], camera(0.8, -1.5, 0.7))
-    segment = np.arange(1, cloud.shape[0] * cloud.shape[1] + 1).reshape(cloud.shape[:2])
-    found = detect(CloudInput(cloud, segment_ids=segment))
+    segment = np.arange(1, len(PLACES) + 1).reshape(ON_TABLE.shape[:2])
+    found = detect(CloudInput(ON_TABLE, segment_ids=segment))
     assert len(found.objects) > 256
     assert found.counts["approach_points"] <= 128
     assert found.grasps
@@ -319,10 +311,9 @@ def test_a_sparse_cloud_of_the_whole_view_shows_the_same_objects(count: int) -> 
 @pytest.mark.parametrize("place", [(0.0, 0.0), (0.1, -0.05), (-0.08, 0.1)])
 def test_a_small_object_alone_on_a_table_is_found(place: tuple[float, float]) -> None:
     small = box((*place, 0.009), (0.012, 0.009, 0.009), 0.5)
-    T_world_camera = camera(0.8, -1.5, 0.7)
-    found = detect(render([table(), small], T_world_camera))
+    found = detect(render([table(), small], ABOVE))
     assert len(found.objects) == 1
-    assert_grasped(found, [small], T_world_camera)
+    assert_grasped(found, [small], ABOVE)
 
 
 def test_a_plane_far_from_the_sent_up_is_no_support() -> None:
