@@ -100,21 +100,14 @@ def test_requests_outlive_a_log_that_nobody_reads(start_dummy, cloud: np.ndarray
         while os.write(write, bytes(4096)):
             pass
     os.set_blocking(write, True)
-    kept = os.dup(2)
-    os.dup2(write, 2)
-    try:
-        server = contextlib.ExitStack()
-        running = server.enter_context(start_dummy("--log-level", "debug"))
-    finally:
-        os.dup2(kept, 2)
-    with server:
+    with start_dummy("--log-level", "debug", stderr=write) as running:
         for address in (running.http_url, running.grpc_address):
             with GraspClient(address) as client:
                 for _ in range(5):
                     assert len(client.detect(cloud).grasps) == 10
         assert running.stop() == 0
-    for descriptor in (kept, read, write):
-        os.close(descriptor)
+    os.close(read)
+    os.close(write)
 
 
 class Closed(io.TextIOBase):
@@ -143,19 +136,16 @@ def test_lines_not_written_are_counted(name: str) -> None:
 DASHBOARD = Path(__file__).parents[2] / "docker" / "grafana" / "edgegrasp.json"
 
 
-def samples(page: str) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
-    return {
-        (sample.name, tuple(sorted(sample.labels.items()))): sample.value
-        for family in text_string_to_metric_families(page)
-        for sample in family.samples
-    }
-
-
 async def read(running: Any) -> dict[Any, float]:
+    """The samples by their name and labels."""
     answer = await running.http().get("/metrics")
     assert answer.status_code == 200
     assert answer.headers["content-type"].startswith("text/plain")
-    return samples(answer.text)
+    return {
+        (sample.name, tuple(sorted(sample.labels.items()))): sample.value
+        for family in text_string_to_metric_families(answer.text)
+        for sample in family.samples
+    }
 
 
 def requests_total(found: dict[Any, float]) -> dict[tuple[str, str, str], float]:
