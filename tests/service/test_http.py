@@ -2,11 +2,12 @@
 
 import asyncio
 import re
-import socket
+from functools import partial
 from typing import Any
 
 import httpx
 import pytest
+from benchmarks.soak import connect
 
 from edgegrasp_service.errors import InvalidSettings
 
@@ -54,13 +55,9 @@ def test_no_redirect_to_a_host_that_the_caller_names(dummy_server) -> None:
 
 def talk(url: str, data: bytes) -> bytes:
     """All that the server says before it closes."""
-    host, port = url.removeprefix("http://").split(":")
-    with socket.create_connection((host, int(port)), timeout=20) as connection:
+    with connect(url) as connection:
         connection.sendall(data)
-        said = b""
-        while part := connection.recv(65536):
-            said += part
-        return said
+        return b"".join(iter(partial(connection.recv, 65536), b""))
 
 
 POST = b"POST /v1/grasps HTTP/1.1\r\nHost: x\r\n"
