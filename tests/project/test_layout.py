@@ -1,11 +1,14 @@
-"""The tree holds what it should, and nothing of the machine it was made on."""
+"""The tree holds what it should, nothing of the machine it was made on, and scripts that work."""
 
 import ast
+import os
 import re
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
+from tests.programs import run
 
 ROOT = Path(__file__).parents[2]
 
@@ -61,3 +64,79 @@ def test_functions_fit_on_a_screen() -> None:
                 if lines > 60 or count > 10:
                     large.append(f"{path.name}: {node.name}, {lines} lines, {count} parameters")
     assert large == []
+
+
+# scripts/system_packages.sh on machines that lack something, played by stand-in programs.
+
+
+SCRIPT = ROOT / "scripts" / "system_packages.sh"
+VENV_CHECK = "import ensurepip, venv"
+
+
+def stand_in(folder: Path, name: str, body: str) -> None:
+    path = folder / name
+    path.write_text(f"#!/bin/bash\n{body}\n")
+    path.chmod(0o755)
+
+
+def machine(folder: Path, *, lacks: str, user: int = 0, apt: bool = True) -> dict[str, str]:
+    """A folder of stand-ins as PATH; the interpreter fails where a bash pattern matches."""
+    fails = f'case "$*" in {lacks}) exit 1;; *print*) echo python3.11-venv;; esac'
+    stand_in(folder, "python3", fails)
+    stand_in(folder, "id", f"echo {user}")
+    stand_in(folder, "uname", "echo Linux")
+    if apt:
+        stand_in(folder, "apt-get", f'echo "$DEBIAN_FRONTEND $*" >>"{folder}/apt.log"')
+    return {"PATH": str(folder), "HOME": os.devnull}
+
+
+@pytest.mark.parametrize(
+    ("lacks", "machine_is", "code", "message"),
+    [
+        ("none", {}, 0, ""),
+        (f'*"{VENV_CHECK}"*|*libusb*', {}, 0, ""),
+        ("*libGL.so.1*|*libEGL*", {"user": 1000}, 1, "sudo apt-get update && sudo apt-get install"),
+        ("*libGL.so.1*|*libEGL*", {"user": 1000}, 1, "libgl1 libegl1"),
+        ("*libgomp*", {"apt": False}, 0, "warning"),
+        ("*libgomp*", {"apt": False}, 0, "libgomp1"),
+        ("*version_info*3,*11*", {}, 1, "make PYTHON="),
+    ],
+)
+def test_root_installs_missing_packages_and_others_get_the_command(
+    tmp_path: Path, lacks: str, machine_is: dict[str, Any], code: int, message: str
+) -> None:
+    done = run("/bin/bash", SCRIPT, code=code, env=machine(tmp_path, lacks=lacks, **machine_is))
+    assert message in done.stdout + done.stderr
+    installed = tmp_path / "apt.log"
+    assert installed.exists() == (VENV_CHECK in lacks)
+    if installed.exists():
+        assert installed.read_text().splitlines() == [
+            "noninteractive update -q",
+            "noninteractive install -q -y --no-install-recommends python3.11-venv libusb-1.0-0",
+        ]
+    elif lacks == "none":
+        assert done.stdout + done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("machine", "flags", "loops"),
+    [
+        ("aarch64", "", "generic"),
+        ("x86_64", "flags : fpu avx2", "x86-64-v3"),
+        ("x86_64", "flags : fpu avx2 avx512vl", "x86-64-v4"),
+        ("x86_64", "flags : fpu", "of its own"),
+    ],
+)
+def test_the_server_starts_with_the_loops_of_its_processor(machine, flags, loops, tmp_path) -> None:
+    programs = {
+        "uname": f"echo {machine}",
+        "grep": f"echo '{flags}'",
+        "cp": "true",
+        "edgegrasp": 'echo "${NUMBA_CPU_NAME-of its own}: $*"',
+    }
+    for name, line in programs.items():
+        stand_in(tmp_path, name, line)
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CPU_NAME"}
+    here = {**environment, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    started = run("/bin/sh", ROOT / "docker" / "start.sh", "--workers", "2", env=here)
+    assert started.stdout == f"{loops}: serve --workers 2\n"
