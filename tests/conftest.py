@@ -131,13 +131,11 @@ def pem(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     files: dict[str, Path] = {}
     for prefix in ("", "other_"):
         authority = trustme.CA()
-        files[f"{prefix}ca"] = folder / f"{prefix}ca.pem"
-        authority.cert_pem.write_to_path(files[f"{prefix}ca"])
+        blobs = {"ca": authority.cert_pem}
         for name in ("server", "client"):
             issued = authority.issue_cert("127.0.0.1", "localhost")
-            files[f"{prefix}{name}"] = folder / f"{prefix}{name}.pem"
-            files[f"{prefix}{name}_key"] = folder / f"{prefix}{name}_key.pem"
-            chain = b"".join(blob.bytes() for blob in issued.cert_chain_pems)
-            files[f"{prefix}{name}"].write_bytes(chain)
-            issued.private_key_pem.write_to_path(files[f"{prefix}{name}_key"])
+            blobs |= {name: issued.cert_chain_pems[0], f"{name}_key": issued.private_key_pem}
+        for name, blob in blobs.items():
+            files[prefix + name] = folder / f"{prefix}{name}.pem"
+            blob.write_to_path(files[prefix + name])
     return files
