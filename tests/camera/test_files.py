@@ -306,10 +306,6 @@ def npz_of_many_members() -> bytes:
     return b"PK\3\4" + entries + end
 
 
-def npz_of_zeros() -> bytes:
-    return npz_packed_by(zipfile.ZIP_DEFLATED, bytes(200 * MIB))
-
-
 def hidden_directory() -> bytes:
     """Two ends of a directory in one, of which a reader may take either."""
     data = bytearray(npz_of_many_members())
@@ -331,8 +327,8 @@ PLY = "ply\nformat ascii 1.0\nelement vertex {}\n"
 PLY += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
 
 BOMBS: dict[str, Callable[[], bytes]] = {  # the format is the first word
-    "npz ratio": npz_of_zeros,
-    "npz lies": lambda: npz_of_zeros().replace(
+    "npz ratio": lambda: npz_packed_by(zipfile.ZIP_DEFLATED, bytes(200 * MIB)),
+    "npz lies": lambda: BOMBS["npz ratio"]().replace(
         struct.pack("<I", 200 * MIB), struct.pack("<I", 100)
     ),
     "npz members": npz_of_many_members,

@@ -2,7 +2,6 @@
 
 import tomllib
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,12 +24,9 @@ from edgegrasp_model.options import DetectOptions, GripperGeometry, SupportPlane
 
 from .scenes import PANDA, VIEW, box_on_table, detector
 
+PANDA_FILE = (GRIPPER_FOLDER / "panda.toml").read_text()
 GRIPPERS = [load_gripper(name) for name in gripper_names()]
 by_name = pytest.mark.parametrize("gripper", GRIPPERS, ids=lambda gripper: gripper.name)
-
-
-def panda_fields() -> dict[str, Any]:
-    return tomllib.loads((GRIPPER_FOLDER / "panda.toml").read_text())
 
 
 @by_name
@@ -63,8 +59,7 @@ def test_a_gripper_stays_clear_of_the_support_as_it_closes(gripper: Gripper) -> 
     ],
 )
 def test_contradictory_fields_of_a_gripper_are_refused_by_name(path, value, message) -> None:
-    fields = panda_fields()
-    part = fields
+    fields = part = tomllib.loads(PANDA_FILE)
     for name in path[:-1]:
         part = part[name]
     part[path[-1]] = value
@@ -75,15 +70,15 @@ def test_contradictory_fields_of_a_gripper_are_refused_by_name(path, value, mess
 
 
 def test_a_file_and_a_request_make_the_same_gripper_and_a_broken_file_is_refused(tmp_path) -> None:
-    assert gripper_from_fields(GripperGeometry.model_validate(panda_fields())) == PANDA
-    text, path = (GRIPPER_FOLDER / "panda.toml").read_text(), tmp_path / "mine.toml"
-    path.write_text(text)
+    assert gripper_from_fields(GripperGeometry.model_validate(tomllib.loads(PANDA_FILE))) == PANDA
+    path = tmp_path / "mine.toml"
+    path.write_text(PANDA_FILE)
     assert load_gripper(path) == PANDA
     for old, new, message in (
         ("max_opening = 0.08", "", "mine.toml: gripper.max_opening"),
         ("[hand]", "[hand", "mine.toml"),
     ):
-        path.write_text(text.replace(old, new))
+        path.write_text(PANDA_FILE.replace(old, new))
         with pytest.raises(InvalidGripper, match=message):
             load_gripper(path)
     with pytest.raises(InvalidGripper, match="'panda', 'robotiq-2f-140'"):
