@@ -122,7 +122,7 @@ def test_arms_are_an_extra(words: tuple[object, ...], tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("transport", ["http", "grpc"])
-def test_a_recorded_request_is_answered_again(transport, run, refused, tmp_path, monkeypatch):
+def test_a_recorded_request_is_answered_again(transport, run, refused, monkeypatch) -> None:
     def body(model: str, seconds: float) -> bytes:
         if transport == "http":
             return json.dumps({"model": model, "seconds": {"total": seconds}}).encode()

@@ -97,9 +97,8 @@ class Rest:
     name = "rest"
 
     def __init__(self, server: Server) -> None:
-        self.url = server.http_url
         limits = httpx.Limits(max_connections=None)
-        self.http = httpx.AsyncClient(base_url=self.url, timeout=PATIENCE, limits=limits)
+        self.http = httpx.AsyncClient(base_url=server.http_url, timeout=PATIENCE, limits=limits)
 
     async def detect(
         self, points: np.ndarray, timeout: float | None = None, **options: Any

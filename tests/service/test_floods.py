@@ -240,7 +240,7 @@ async def test_bodies_that_trickle_give_their_places_back(serve, cloud, transpor
         writer.close()
 
 
-async def test_answers_that_nobody_takes_are_given_up(serve, cloud, transport: str) -> None:
+async def test_answers_that_nobody_takes_are_given_up(serve, transport: str) -> None:
     """Clients that send and never read."""
     running = await serve(write_seconds=0.5, min_bytes_per_second=10**9)
     crowd = np.random.default_rng(0).uniform(-0.1, 0.1, (300_000, 3)).astype("<f4")

@@ -83,7 +83,7 @@ def bright(page: Any) -> int:
 
 
 def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(
-    real_server, open_page, tmp_path: Path
+    real_server, open_page
 ) -> None:
     page = open_page(real_server.http_url)
     assert len(shown(page)) == 12
@@ -136,7 +136,7 @@ def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(
             assert done.stdout.count("[[") == len(contacts)
 
 
-def test_objects_and_points_are_asked_for_and_answers_saved(real_server, open_page, tmp_path):
+def test_objects_and_points_are_asked_for_and_answers_saved(real_server, open_page) -> None:
     page = open_page(real_server.http_url)
     open_touching(page, real_server.http_url)
     number = int(page.locator("#grasps small").first.inner_text().removeprefix("object "))

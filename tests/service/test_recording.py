@@ -144,7 +144,7 @@ def test_files_that_hold_no_outcomes(tmp_path: Path, body: str) -> None:
         read_outcomes(file, "abc")
 
 
-def test_lines_are_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_are_whole_or_not_there(tmp_path: Path) -> None:
     file = tmp_path / "outcomes.jsonl"
     file.write_bytes(b'{"a": 1}\n{"half')
     append_line(file, b'{"b": 2}\n')
