@@ -1,17 +1,12 @@
 """Clouds, hands and small detectors that several tests take."""
 
-from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.kernels import nearest_in_groups
-from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
@@ -20,7 +15,6 @@ from edgegrasp_model.scene.scene import Scene
 SEED = 2**32 - 1  # the greatest
 PANDA = load_gripper("panda")
 VIEW = (0.3, 0.2, 0.5)
-RADIUS = 0.05
 # Networks of the paper's shape, narrow enough for many examples.
 TINY = {
     name: NetworkConfig(name, (8, 12, 16), (16, 20, 24), (28, 32), (24, 16), crop_radius=0.04)
@@ -75,66 +69,3 @@ def random_hands(count: int, seed: int, reach: float = 0.2) -> np.ndarray:
     poses[:, :3, :3] = Rotation.random(count, rng=rng).as_matrix()
     poses[:, :3, 3] = rng.uniform(-reach, reach, (count, 3))
     return poses
-
-
-@dataclass(frozen=True)
-class RandomScene:
-    """A cloud with candidate edge grasps, as the ball networks take them."""
-
-    points: np.ndarray  # (N, 3)
-    normals: np.ndarray  # (N, 3)
-    approach_index: np.ndarray  # (A,)
-    edges: np.ndarray  # (E, 2) ball, contact row of the cloud
-
-    @staticmethod
-    def of_seed(seed: int) -> "RandomScene":
-        """4 balls, some 40 edge grasps."""
-        rng = np.random.default_rng(seed)
-        points = rng.uniform(-0.06, 0.06, (150, 3)) * (1.0, 1.0, 0.4)
-        normals = rng.normal(size=(150, 3))
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        approach_index = rng.choice(150, 4, replace=False)
-        distance = np.linalg.norm(points[approach_index][:, None] - points, axis=2)  # (A, N)
-        edges = np.argwhere((distance > 0.003) & (distance < 0.038))
-        return RandomScene(points, normals, approach_index, edges[:: max(1, len(edges) // 40)])
-
-    def turned(self, rotation: np.ndarray, translation: np.ndarray) -> "RandomScene":
-        return replace(
-            self, points=self.points @ rotation.T + translation, normals=self.normals @ rotation.T
-        )
-
-    def reordered(self, order: np.ndarray) -> "RandomScene":
-        """The same scene with its point order[i] at row i."""
-        row_of = np.argsort(order)
-        edges = np.column_stack((self.edges[:, 0], row_of[self.edges[:, 1]]))
-        return RandomScene(
-            self.points[order], self.normals[order], row_of[self.approach_index], edges
-        )
-
-    def only_ball(self, ball: int) -> "RandomScene":
-        edges = self.edges[self.edges[:, 0] == ball] * (0, 1)
-        return replace(self, approach_index=self.approach_index[[ball]], edges=edges)
-
-    def batch(self, dtype: torch.dtype = torch.float64) -> BallBatch:
-        crop = crop_balls(self.points, self.approach_index, RADIUS)
-        size = len(self.points)
-        row = np.searchsorted(
-            crop.ball_of_point * size + crop.ball_rows, self.edges @ np.array([size, 1])
-        )
-        edge = self.points[self.edges[:, 1]] - self.points[self.approach_index[self.edges[:, 0]]]
-        normal = self.normals[self.edges[:, 1]]
-        ahead = edge - (edge * normal).sum(axis=1, keepdims=True) * normal
-        depth = np.linalg.norm(ahead, axis=1)
-        centre = self.points[self.approach_index][crop.ball_of_point]
-        centred = self.points[crop.ball_rows] - centre
-        bounds = np.searchsorted(crop.ball_of_point, np.arange(len(self.approach_index) + 1))
-        return BallBatch(
-            points=torch.from_numpy(centred).to(dtype),
-            normals=torch.from_numpy(self.normals[crop.ball_rows]).to(dtype),
-            neighbors=torch.from_numpy(nearest_in_groups(centred, bounds, 16)),
-            ball_of_point=torch.from_numpy(crop.ball_of_point),
-            num_balls=len(self.approach_index),
-            contact=torch.from_numpy(row),
-            approach=torch.from_numpy(-ahead / depth[:, None]).to(dtype),
-            depth=torch.from_numpy(depth).to(dtype),
-        )

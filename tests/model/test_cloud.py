@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from tests.checks import bounded_memory, refusal
 from tests.cloud_files import npz, point_cloud2
 
-from edgegrasp_camera.clouds import read_point_cloud2
+from edgegrasp_camera.clouds import CloudInput, read_point_cloud2
 from edgegrasp_model.options import DetectOptions, Indices, Mask, Region, Segments
 from edgegrasp_model.request_cloud import (
     File,
@@ -23,13 +23,7 @@ from edgegrasp_model.request_cloud import (
     parse,
     read_depth_images,
 )
-from edgegrasp_model.scene.cloud import (
-    CheckedCloud,
-    CloudInput,
-    check_cloud,
-    seen_from_origin,
-    voxelise,
-)
+from edgegrasp_model.scene.cloud import CheckedCloud, check_cloud, seen_from_origin, voxelise
 from edgegrasp_model.scene.regions import check_region, inside_region
 from edgegrasp_service.errors import PayloadTooLarge
 

@@ -1,6 +1,6 @@
 """The ball networks, what all networks share, and their configuration."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.candidates.edge_grasps import edge_grasps
+from edgegrasp_model.candidates.edge_grasps import crop_balls, edge_grasps
 from edgegrasp_model.hand_description import Surroundings
+from edgegrasp_model.kernels import nearest_in_groups
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import EDGEGRASP_SMALL, HAND, NetworkConfig
@@ -18,9 +19,72 @@ from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 
-from .scenes import PANDA, SEED, TINY, RandomScene
+from .scenes import PANDA, SEED, TINY
 
 architectures = pytest.mark.parametrize("architecture", ["edgegrasp", "vn-edgegrasp"])
+
+
+@dataclass(frozen=True)
+class RandomScene:
+    """A cloud with candidate edge grasps, as the ball networks take them."""
+
+    points: np.ndarray  # (N, 3)
+    normals: np.ndarray  # (N, 3)
+    approach_index: np.ndarray  # (A,)
+    edges: np.ndarray  # (E, 2) ball, contact row of the cloud
+
+    @staticmethod
+    def of_seed(seed: int) -> "RandomScene":
+        """4 balls, some 40 edge grasps."""
+        rng = np.random.default_rng(seed)
+        points = rng.uniform(-0.06, 0.06, (150, 3)) * (1.0, 1.0, 0.4)
+        normals = rng.normal(size=(150, 3))
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        approach_index = rng.choice(150, 4, replace=False)
+        distance = np.linalg.norm(points[approach_index][:, None] - points, axis=2)  # (A, N)
+        edges = np.argwhere((distance > 0.003) & (distance < 0.038))
+        return RandomScene(points, normals, approach_index, edges[:: max(1, len(edges) // 40)])
+
+    def turned(self, rotation: np.ndarray, translation: np.ndarray) -> "RandomScene":
+        return replace(
+            self, points=self.points @ rotation.T + translation, normals=self.normals @ rotation.T
+        )
+
+    def reordered(self, order: np.ndarray) -> "RandomScene":
+        """The same scene with its point order[i] at row i."""
+        row_of = np.argsort(order)
+        edges = np.column_stack((self.edges[:, 0], row_of[self.edges[:, 1]]))
+        return RandomScene(
+            self.points[order], self.normals[order], row_of[self.approach_index], edges
+        )
+
+    def only_ball(self, ball: int) -> "RandomScene":
+        edges = self.edges[self.edges[:, 0] == ball] * (0, 1)
+        return replace(self, approach_index=self.approach_index[[ball]], edges=edges)
+
+    def batch(self, dtype: torch.dtype = torch.float64) -> BallBatch:
+        crop = crop_balls(self.points, self.approach_index, 0.05)
+        size = len(self.points)
+        row = np.searchsorted(
+            crop.ball_of_point * size + crop.ball_rows, self.edges @ np.array([size, 1])
+        )
+        edge = self.points[self.edges[:, 1]] - self.points[self.approach_index[self.edges[:, 0]]]
+        normal = self.normals[self.edges[:, 1]]
+        ahead = edge - (edge * normal).sum(axis=1, keepdims=True) * normal
+        depth = np.linalg.norm(ahead, axis=1)
+        centre = self.points[self.approach_index][crop.ball_of_point]
+        centred = self.points[crop.ball_rows] - centre
+        bounds = np.searchsorted(crop.ball_of_point, np.arange(len(self.approach_index) + 1))
+        return BallBatch(
+            points=torch.from_numpy(centred).to(dtype),
+            normals=torch.from_numpy(self.normals[crop.ball_rows]).to(dtype),
+            neighbors=torch.from_numpy(nearest_in_groups(centred, bounds, 16)),
+            ball_of_point=torch.from_numpy(crop.ball_of_point),
+            num_balls=len(self.approach_index),
+            contact=torch.from_numpy(row),
+            approach=torch.from_numpy(-ahead / depth[:, None]).to(dtype),
+            depth=torch.from_numpy(depth).to(dtype),
+        )
 
 
 def scores(network: torch.nn.Module, batch: BallBatch | HandBatch) -> torch.Tensor:
