@@ -1,18 +1,10 @@
 """Fuzzing: short in `make test`, long in `make fuzz` (--hypothesis-profile=fuzz)."""
 
-import base64
-import warnings
-from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
 
-import hypothesis
 import numpy as np
 from hypothesis import strategies as st
-from tests.checks import bounded_memory
-from tests.cloud_files import npy, npz, pcd, ply, point_cloud2, xyz
-
-given = hypothesis.given  # `make fuzz` sets the profile with many examples
 
 POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (40, 3)).astype(np.float32)
 
@@ -25,24 +17,6 @@ WORDS = [
     b"(0, 3)", b"(-1, 3)", b"(99999999999, 3)", b"'|O'", b"'<f8'", b"True", b"PK\x03\x04",
     "\u0663".encode(), b"_", b"1" * 400, b"x" * 5000,
 ]  # fmt: skip
-
-
-FILES: dict[str, list[bytes]] = {
-    "npy": [
-        npy(POINTS), npy(POINTS.astype(">f8")), npy(np.asfortranarray(POINTS)),
-        npy(POINTS.reshape(5, 8, 3)), npy(np.zeros((0, 3))), npy(np.zeros(3, "i4,f8")),
-    ],
-    "npz": [
-        npz(False, points=POINTS), npz(points=POINTS, normals=POINTS),
-        npz(points=POINTS, segment_ids=np.arange(40), colors=POINTS),
-    ],
-    "ply": [ply(POINTS, kind) for kind in ("ascii", "binary_little_endian", "binary_big_endian")],
-    "pcd": [
-        *(pcd(POINTS, kind) for kind in ("ascii", "binary", "binary_compressed")),
-        pcd(POINTS, height=4),
-    ],
-    "xyz": [xyz(POINTS), b"# c\n0 0 0\n"],
-}  # fmt: skip
 
 
 @st.composite
@@ -88,15 +62,6 @@ VALUES: st.SearchStrategy[Any] = st.recursive(
     ),
     max_leaves=12,
 )
-LISTS = st.one_of(
-    VALUES,
-    st.lists(st.lists(NUMBERS | st.none(), min_size=3, max_size=3), min_size=1, max_size=40),
-    st.lists(
-        st.lists(st.lists(NUMBERS | st.none(), min_size=3, max_size=3), min_size=2, max_size=2),
-        min_size=1,
-        max_size=4,
-    ),
-)
 
 
 @st.composite
@@ -119,36 +84,3 @@ def changed(draw: st.DrawFn, good: dict[str, Any]) -> dict[str, Any]:
                 at[key] = draw(VALUES | st.binary(max_size=8))
             break
     return found
-
-
-def base64_of(value: Any) -> str:
-    return base64.b64encode(value).decode()
-
-
-DEPTH_IMAGE = {
-    "depth": {
-        "height": 5, "width": 8, "encoding": "32FC1",
-        "data": np.linspace(0.4, 0.5, 40, dtype="<f4").tobytes(),
-    },
-    "intrinsics": {"fx": 20.0, "fy": 20.0, "cx": 3.5, "cy": 2.0},
-    "T_cloud_camera": np.eye(4).tolist(),
-}  # fmt: skip
-DEPTH_ROWS = DEPTH_IMAGE | {"depth": np.full((5, 8), 0.4).tolist()}
-POINT_CLOUD2 = point_cloud2(POINTS)
-
-
-def decodes_or_refuses(work: Callable[[], object], size: int, max_points: int) -> None:
-    """Run a decoder on `size` bytes; anything but an answer or an error of the table fails."""
-    from tests.service.worker.conftest import check_problem
-
-    from edgegrasp_model.errors import EdgeGraspError
-    from edgegrasp_service.errors import report
-
-    # Text costs most: a list and an object for each word; files unpack to five arrays at most.
-    allowed = 200 * size + 5 * (48 * max_points + 65536) + 2**20
-    with bounded_memory(allowed), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            work()
-        except EdgeGraspError as error:
-            check_problem(report(error))

@@ -1,40 +1,69 @@
 """Whatever comes in, a decoder gives arrays or a 4xx, within memory that the bytes explain."""
 
+import base64
 import json
+import re
 import struct
+import sys
+import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
 from typing import Any
 
+import grpc
+import httpx
 import numpy as np
+import psutil
 import pytest
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.cloud_files import npy, png
+from tests.checks import bounded_memory
+from tests.cloud_files import npy, npz, pcd, ply, png, point_cloud2, xyz
+from tests.programs import run
 from tests.service.worker.conftest import ask as ask_worker
-from tests.service.worker.conftest import form, part
+from tests.service.worker.conftest import check_problem, form, part
 
 from edgegrasp.v1 import grasp_pb2
+from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.request_cloud import GIVEN, PER_POINT, File, decode_cloud
 from edgegrasp_model.scene.cloud import check_cloud
+from edgegrasp_service.errors import report
 from edgegrasp_service.settings import Settings
 
-from .conftest import (
-    DEPTH_IMAGE,
-    DEPTH_ROWS,
-    FILES,
-    LISTS,
-    POINT_CLOUD2,
-    POINTS,
-    VALUES,
-    base64_of,
-    changed,
-    decodes_or_refuses,
-    given,
-    mutated,
-)
+from .conftest import NUMBERS, POINTS, VALUES, changed, mutated
 
 MAX_POINTS = 5000
+FILES: dict[str, list[bytes]] = {
+    "npy": [
+        npy(POINTS), npy(POINTS.astype(">f8")), npy(np.asfortranarray(POINTS)),
+        npy(POINTS.reshape(5, 8, 3)), npy(np.zeros((0, 3))), npy(np.zeros(3, "i4,f8")),
+    ],
+    "npz": [
+        npz(False, points=POINTS), npz(points=POINTS, normals=POINTS),
+        npz(points=POINTS, segment_ids=np.arange(40), colors=POINTS),
+    ],
+    "ply": [ply(POINTS, kind) for kind in ("ascii", "binary_little_endian", "binary_big_endian")],
+    "pcd": [
+        *(pcd(POINTS, kind) for kind in ("ascii", "binary", "binary_compressed")),
+        pcd(POINTS, height=4),
+    ],
+    "xyz": [xyz(POINTS), b"# c\n0 0 0\n"],
+}  # fmt: skip
+
+
+def decodes_or_refuses(work: Callable[[], object], size: int) -> None:
+    """Run a decoder on `size` bytes; anything but an answer or an error of the table fails."""
+    # Text costs most: a list and an object for each word; files unpack to five arrays at most.
+    allowed = 200 * size + 5 * (48 * MAX_POINTS + 65536) + 2**20
+    with bounded_memory(allowed), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            work()
+        except EdgeGraspError as error:
+            check_problem(report(error))
 
 
 def decode(size: int, **fields: Any) -> None:
@@ -42,7 +71,7 @@ def decode(size: int, **fields: Any) -> None:
         cloud, _ = decode_cloud(fields, DetectOptions(), MAX_POINTS)
         check_cloud(cloud, 32)
 
-    decodes_or_refuses(work, size, MAX_POINTS)
+    decodes_or_refuses(work, size)
 
 
 @pytest.mark.parametrize("file_format", FILES)
@@ -85,6 +114,16 @@ def test_images_of_arbitrary_chunks_decode_or_are_refused(chunks) -> None:
     decode(len(content), points=POINTS.tobytes(), colors=File("png", content))
 
 
+DEPTH_IMAGE = {
+    "depth": {
+        "height": 5, "width": 8, "encoding": "32FC1",
+        "data": np.linspace(0.4, 0.5, 40, dtype="<f4").tobytes(),
+    },
+    "intrinsics": {"fx": 20.0, "fy": 20.0, "cx": 3.5, "cy": 2.0},
+    "T_cloud_camera": np.eye(4).tolist(),
+}  # fmt: skip
+DEPTH_ROWS = DEPTH_IMAGE | {"depth": np.full((5, 8), 0.4).tolist()}
+POINT_CLOUD2 = point_cloud2(POINTS)
 MESSAGES = [
     grasp_pb2.DetectGraspsRequest(points=POINTS.tobytes(), options={"seed": 3, "top_k": 2}),
     grasp_pb2.DetectGraspsRequest(encoded={"format": "ply", "data": FILES["ply"][0]}),
@@ -123,6 +162,21 @@ FORM = form(
 
 # Whole requests
 
+LISTS = st.one_of(
+    VALUES,
+    st.lists(st.lists(NUMBERS | st.none(), min_size=3, max_size=3), min_size=1, max_size=40),
+    st.lists(
+        st.lists(st.lists(NUMBERS | st.none(), min_size=3, max_size=3), min_size=2, max_size=2),
+        min_size=1,
+        max_size=4,
+    ),
+)
+
+
+def base64_of(value: Any) -> str:
+    return base64.b64encode(value).decode()
+
+
 SETTINGS = Settings(max_points=MAX_POINTS)
 DOCUMENTS = {
     "points": POINTS.tolist(),
@@ -137,11 +191,8 @@ BESIDE = {"edges": [[0, 1], [2, 3]], "hand_poses": [np.eye(4).tolist()], "option
 
 def ask(transport: str, body: bytes, scores: bool, media_type: str = "", query: str = "") -> None:
     """Ask, within memory; anything but an answer or an error of the caller's fails."""
-    decodes_or_refuses(
-        lambda: ask_worker(transport, body, media_type, query, scores, SETTINGS),
-        len(body) + len(query),
-        MAX_POINTS,
-    )
+    asked = partial(ask_worker, transport, body, media_type, query, scores, SETTINGS)
+    decodes_or_refuses(asked, len(body) + len(query))
 
 
 @given(mutated([message.SerializeToString() for message in MESSAGES]), st.booleans())
@@ -209,3 +260,101 @@ def test_what_is_mutated_is_good() -> None:
     for file_format in FILES:
         for content in FILES[file_format]:
             decode_cloud({"cloud": File(file_format, content)}, DetectOptions(), MAX_POINTS)
+
+
+# Whatever is sent to a running server, it answers with less than 500, and stays as large.
+
+
+MAX_GROWTH = 100e6  # bytes; a request here is a few kB
+PATIENCE = 20
+ANSWERS = {
+    grpc.StatusCode.OK,
+    grpc.StatusCode.INVALID_ARGUMENT,
+    grpc.StatusCode.NOT_FOUND,
+    grpc.StatusCode.RESOURCE_EXHAUSTED,
+}
+
+
+@pytest.fixture(scope="module")
+def channel(dummy_server) -> Iterator[grpc.Channel]:
+    """A connection to a server that goes on and does not grow."""
+    front, url = psutil.Process(dummy_server.process.pid), f"{dummy_server.http_url}/v1/grasps"
+    good = {"content": FILES["npy"][0], "headers": {"content-type": "application/x-npy"}}
+    assert httpx.post(url, **good, timeout=PATIENCE).status_code == 200
+    before = front.memory_info().rss
+    with grpc.insecure_channel(dummy_server.grpc_address) as channel:
+        yield channel
+    assert httpx.post(url, **good, timeout=PATIENCE).status_code == 200
+    assert front.memory_info().rss - before < MAX_GROWTH
+
+
+REQUESTS = [
+    grasp_pb2.DetectGraspsStreamRequest(request_id="a", request=message).SerializeToString()
+    for message in MESSAGES[:4]
+]
+
+
+@given(st.lists(mutated(REQUESTS), max_size=3))
+def test_each_mutated_message_of_a_stream_is_answered(channel, contents) -> None:
+    """Each is answered, or ends the stream where it is no message at all."""
+    method = channel.stream_stream("/edgegrasp.v1.GraspService/DetectGraspsStream")
+    call: Any = method(iter(contents), timeout=PATIENCE)
+    answers = []
+    try:
+        for response in call:
+            answers.append(grasp_pb2.DetectGraspsStreamResponse.FromString(response))
+    except grpc.RpcError:
+        assert call.code() in ANSWERS
+    else:
+        assert len(answers) == len(contents)
+    for answer in answers:
+        if answer.WhichOneof("answer") == "error":
+            assert answer.error.code in {code.value[0] for code in ANSWERS}
+
+
+def test_long_words_come_back_short(channel: grpc.Channel) -> None:
+    """Or they would not fit into gRPC's metadata, and nobody would hear what is wrong."""
+    points = POINTS.tobytes()
+    for fields in (
+        {"encoded": {"format": "x" * 100_000, "data": b"a"}},
+        {"points": points, "options": {"model": "x" * 100_000}},
+        {"points": points, "options": {"sampling": "\u00e9" * 90_000}},
+    ):
+        content = grasp_pb2.DetectGraspsRequest(**fields).SerializeToString()
+        method = channel.unary_unary("/edgegrasp.v1.GraspService/DetectGrasps")
+        code = method.future(content).code()
+        assert code in (grpc.StatusCode.INVALID_ARGUMENT, grpc.StatusCode.NOT_FOUND)
+
+
+SHORT = ("--phases", "fuzzing", "--max-examples", "5")
+LONG = ("--phases", "coverage,fuzzing", "--max-examples", "100", "--max-time", "120")
+CHECKS = (
+    "not_a_server_error",
+    "status_code_conformance",
+    "content_type_conformance",
+    "response_headers_conformance",
+    "response_schema_conformance",
+    "unsupported_method",
+)
+
+
+def test_the_server_keeps_to_its_document(start_dummy, tmp_path: Path) -> None:
+    program = Path(sys.executable).parent / "schemathesis"
+    if not program.exists():
+        pytest.skip("schemathesis is not installed")
+    long = settings.get_current_profile_name() == "fuzz"
+    token = "fuzz-0123456789abcdef0123456789abcdef"
+    file = tmp_path / "tokens"
+    file.write_text(token)
+    flags = ("--log-level", "error", "--admin-token-file", str(file))
+    with start_dummy(*flags) as server:
+        command = [program, "run", f"{server.http_url}/openapi.json", "--no-color", "--seed", "1"]
+        command += ["--header", f"Authorization: Bearer {token}"]
+        # What the document allows may be shorter than any answer takes: a 504 is no fault.
+        command += ["--header", "X-Request-Timeout: 60", "--request-timeout", "60"]
+        checks = ("--checks", ",".join(CHECKS))
+        done = run(*command, *checks, *(LONG if long else SHORT), cwd=tmp_path)
+        counted = re.search(r"(\d+) generated, (\d+) passed", done.stdout)
+        assert counted, done.stdout[-5000:]
+        assert int(counted[1]) == int(counted[2]) > 10
+        assert server.stop() == 0

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from google.protobuf.message import DecodeError
+from hypothesis import given
 from hypothesis import strategies as st
 from mcp.server.mcpserver.exceptions import ToolError, UnexpectedToolError
 
@@ -18,7 +19,7 @@ from edgegrasp_cli import mcp, open_inference
 from edgegrasp_client import GraspClientError
 from edgegrasp_client.requests import cloud_file, depth_image_fields
 
-from .conftest import POINTS, VALUES, changed, given, mutated
+from .conftest import POINTS, VALUES, changed, mutated
 
 
 class Client:
