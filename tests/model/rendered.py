@@ -33,26 +33,6 @@ def table(half_width: float = 0.5, half_depth: float = 0.4) -> SolidBox:
     return box((0, 0, -0.015), (half_width, half_depth, 0.015))
 
 
-BACKGROUND = {
-    "floor": [box((0, 0, -0.75), (4, 4, 0.05))],
-    "wall": [box((0, 0.5, 0.4), (3, 0.05, 1.6))],
-    "monitor": [box((-0.38, 0.05, 0.2), (0.03, 0.25, 0.2))],
-    "carton": [box((0.02, 0.36, 0.12), (0.28, 0.11, 0.12), 0.2)],
-}
-
-
-def bin_walls(length: float, width: float, height: float, wall: float = 0.005) -> list[SolidBox]:
-    """An open box on z = 0 around the origin."""
-    x, y, z = length / 2, width / 2, height / 2
-    return [
-        box((x, 0, z), (wall / 2, y, z)),
-        box((-x, 0, z), (wall / 2, y, z)),
-        box((0, y, z), (x, wall / 2, z)),
-        box((0, -y, z), (x, wall / 2, z)),
-        box((0, 0, wall / 2), (x, y, wall / 2)),
-    ]
-
-
 def boxes_on_table(seed: int, count: int = 4) -> list[SolidBox]:
     """Boxes a hand can grasp, standing apart from each other on z = 0."""
     rng = np.random.default_rng(seed)
@@ -81,13 +61,6 @@ def camera(polar: float, azimuth: float, distance: float) -> np.ndarray:
 def to_world(T_world_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points (..., 3) of the camera's frame in the world's."""
     return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-
-
-def seen_in_world(boxes: list[SolidBox], T_world_camera: np.ndarray) -> np.ndarray:
-    """The points (N, 3) of boxes that a camera sees, in the world's frame."""
-    cloud = render(boxes, T_world_camera).reshape(-1, 3)
-    seen = cloud[np.isfinite(cloud).all(axis=1)]
-    return to_world(T_world_camera, seen).astype(np.float32)
 
 
 def render(boxes: list[SolidBox], T_world_camera: np.ndarray, seed: int = 0) -> np.ndarray:

@@ -17,24 +17,36 @@ from edgegrasp_model.scene.segment import FIXED, Segmentation
 from edgegrasp_model.scene.support import Seen, choose_support
 from edgegrasp_results import Detection
 
-from .rendered import (
-    BACKGROUND,
-    HEIGHT,
-    SolidBox,
-    bin_walls,
-    box,
-    boxes_on_table,
-    camera,
-    render,
-    seen_box,
-    seen_in_world,
-    table,
-    to_world,
-)
+from .rendered import SolidBox, box, boxes_on_table, camera, render, seen_box, table, to_world
 from .scenes import SEED, detector
 
 AROUND = ["floor", "wall", "carton", "edge"]  # of the table, near the objects
 AT_CAMERA = {"viewpoint": (0.0, 0.0, 0.0)}
+BACKGROUND = {
+    "floor": [box((0, 0, -0.75), (4, 4, 0.05))],
+    "wall": [box((0, 0.5, 0.4), (3, 0.05, 1.6))],
+    "monitor": [box((-0.38, 0.05, 0.2), (0.03, 0.25, 0.2))],
+    "carton": [box((0.02, 0.36, 0.12), (0.28, 0.11, 0.12), 0.2)],
+}
+
+
+def bin_walls(length: float, width: float, height: float, wall: float = 0.005) -> list[SolidBox]:
+    """An open box on z = 0 around the origin."""
+    x, y, z = length / 2, width / 2, height / 2
+    return [
+        box((x, 0, z), (wall / 2, y, z)),
+        box((-x, 0, z), (wall / 2, y, z)),
+        box((0, y, z), (x, wall / 2, z)),
+        box((0, -y, z), (x, wall / 2, z)),
+        box((0, 0, wall / 2), (x, y, wall / 2)),
+    ]
+
+
+def seen_in_world(boxes: list[SolidBox], T_world_camera: np.ndarray) -> np.ndarray:
+    """The points (N, 3) of boxes that a camera sees, in the world's frame."""
+    cloud = render(boxes, T_world_camera).reshape(-1, 3)
+    seen = cloud[np.isfinite(cloud).all(axis=1)]
+    return to_world(T_world_camera, seen).astype(np.float32)
 
 
 def detect(cloud: object, **options: object) -> Detection:
@@ -455,7 +467,7 @@ def test_every_row_is_labelled_with_an_object_the_support_or_neither(times: int)
     found = detect(image.repeat(times, axis=0).repeat(times, axis=1), debug=True)
     assert found.debug is not None
     labels, number = found.debug.labels, seen_box(boxes, pose)
-    labels = labels.reshape(times * HEIGHT, -1)[times - 1 :: times, times - 1 :: times].ravel()
+    labels = labels.reshape(times * len(image), -1)[times - 1 :: times, times - 1 :: times].ravel()
     assert set(labels[labels >= 0].tolist()) == {one.number for one in found.objects}
     assert (labels[number == 0] == SUPPORT).mean() > 0.95
     assert (labels[number == -1] < 0).all()
