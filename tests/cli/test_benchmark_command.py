@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,8 +28,9 @@ from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trial import PlannedGrasp, RoundDriver, StartCollides
 
-from .conftest import TOP_DOWN
+from .conftest import invoke
 
+TOP_DOWN = "examples.your_planner:plan"
 SMOKE_GATE = Path(__file__).parent / "smoke_gate.json"
 
 
@@ -41,7 +43,30 @@ def attempts(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_the_shipped_weights_are_not_below_the_gate(benchmark: Callable, run, tmp_path) -> None:
+def benchmark(folder: Path, planner: str, *flags: object, rounds: int = 2) -> dict[str, Any]:
+    """The summary of a small benchmark of packed scenes."""
+    where = ("--scene", "packed", "--seed", 0, "--workers", 1, "--output", folder)
+    asked = ("--planner", planner, "--rounds", rounds, "--no-report")
+    invoke(0, "benchmark", *where, *asked, *flags)
+    return figures(folder)
+
+
+@pytest.fixture(scope="session")
+def in_process(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("in_process")
+    benchmark(folder, "in-process", "--num-approach-points", 16, "--num-candidates", 200)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def top_down(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Without a model, over the same scenes, with a report."""
+    folder = tmp_path_factory.mktemp("top_down")
+    benchmark(folder, TOP_DOWN, "--report")
+    return folder
+
+
+def test_the_shipped_weights_are_not_below_the_gate(tmp_path) -> None:
     few = ("--num-approach-points", 16, "--num-candidates", 400)
     gate = tmp_path / "gate.json"  # all held, in the one engine and the other
     committed = json.loads(SMOKE_GATE.read_text()) | {"engine": choose_engine()}
@@ -51,7 +76,7 @@ def test_the_shipped_weights_are_not_below_the_gate(benchmark: Callable, run, tm
     assert planner["options"] == {"num_approach_points": 16, "num_candidates": 400}
 
 
-def test_another_hand_is_planned_for_and_simulated(benchmark, run, refused, tmp_path) -> None:
+def test_another_hand_is_planned_for_and_simulated(run, refused, tmp_path) -> None:
     few = ("--num-approach-points", 16, "--num-candidates", 400, "--gripper", "robotiq-2f-85")
     assert benchmark(tmp_path, "in-process", *few, rounds=1)["successes"] > 0
     manifest = json.loads((tmp_path / "manifest.json").read_text())["run"]
@@ -93,9 +118,7 @@ def test_a_recorded_attempt_comes_out_the_same(in_process: Path, run, tmp_path: 
     assert picture.read_bytes()[1:4] == b"PNG"
 
 
-def test_wrong_replays_and_comparisons_end_with_a_sentence(
-    in_process, benchmark, refused, tmp_path
-):
+def test_wrong_replays_and_comparisons_end_with_a_sentence(in_process, refused, tmp_path) -> None:
     assert "attempt is 99" in refused("replay", "attempt", in_process, "--attempt", 99)
     assert "round is 7" in refused("replay", "attempt", in_process, "--round", 7)
     assert "contains no benchmark" in refused("replay", "attempt", tmp_path)
@@ -120,7 +143,7 @@ def test_two_planners_are_compared_scene_by_scene(in_process, top_down, run, tmp
 
 
 def test_a_server_killed_and_restarted_changes_nothing(
-    start_dummy: Callable, dummy_server, benchmark: Callable, tmp_path: Path
+    start_dummy: Callable, dummy_server, tmp_path: Path
 ) -> None:
     address = dummy_server.grpc_address
     calm = benchmark(tmp_path / "calm", "server", "--server", address, rounds=2)
