@@ -5,7 +5,7 @@ import json
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -40,14 +40,10 @@ def gateway(dummy_server) -> Iterator[dict[str, str]]:
         bound.close()
 
 
-@pytest.fixture
-def post(gateway) -> Callable[..., httpx.Response]:
-    def post(body: Any, model: str = "grasps") -> httpx.Response:
-        url = f"http://{gateway['http']}/v2/models/{model}/infer"
-        content = body if isinstance(body, bytes) else json.dumps(body)
-        return httpx.post(url, content=content, timeout=60)
-
-    return post
+def post(gateway: dict[str, str], body: Any, model: str = "grasps") -> httpx.Response:
+    url = f"http://{gateway['http']}/v2/models/{model}/infer"
+    content = body if isinstance(body, bytes) else json.dumps(body)
+    return httpx.post(url, content=content, timeout=60)
 
 
 def points_of(cloud: np.ndarray, **changes: Any) -> dict[str, Any]:
@@ -83,14 +79,14 @@ def test_tritons_client_gets_grasps(gateway, transport, kind, cloud, tmp_path, d
     np.testing.assert_allclose(told["width"], [g.width for g in expected], atol=1e-6)
 
 
-def test_a_request_in_json(post, gateway, cloud) -> None:
+def test_a_request_in_json(gateway, cloud) -> None:
     body = points_of(cloud) | {"id": "a", "parameters": {"top_k": 2, "seed": 3}}
-    answer = post(body).json()
+    answer = post(gateway, body).json()
     assert (answer["id"], answer["model_name"]) == ("a", "grasps")
     shapes = {tensor["name"]: tensor["shape"] for tensor in answer["outputs"]}
     assert shapes == {"T_cloud_hand": [2, 4, 4], "score": [2], "width": [2], "object": [2]}
     assert answer["parameters"]["model"] == "dummy"
-    assert post(body, "dummy").json()["outputs"] == answer["outputs"]
+    assert post(gateway, body, "dummy").json()["outputs"] == answer["outputs"]
     base = f"http://{gateway['http']}/v2"
     assert httpx.get(base).json()["name"] == "edgegrasp"
     assert httpx.get(f"{base}/models/dummy").json()["platform"] == "edgegrasp"
@@ -98,7 +94,7 @@ def test_a_request_in_json(post, gateway, cloud) -> None:
     assert httpx.get(f"{base}/models/dummy/versions/1").json()["name"] == "dummy"
     assert httpx.get(f"{base}/models/dummy/versions/2").status_code == 404
     assert httpx.get(f"{base}/models").json() == {"models": ["grasps", "dummy"]}
-    unknown = post(body | {"outputs": [{"name": "pose"}]})
+    unknown = post(gateway, body | {"outputs": [{"name": "pose"}]})
     assert unknown.status_code == 400
     assert "outputs: got pose" in unknown.json()["error"]
 
@@ -124,12 +120,12 @@ def test_a_request_in_json(post, gateway, cloud) -> None:
         ({"parameters": {"seed": -1}}, "grasps", 400, "options.seed: got -1."),
     ],
 )
-def test_what_cannot_be_served(post, cloud, changes, model, status, told) -> None:
+def test_what_cannot_be_served(gateway, cloud, changes, model, status, told) -> None:
     body: Any = changes
     if isinstance(changes, dict):
         top = {name: changes.pop(name) for name in ("parameters", "id") if name in changes}
         body = points_of(cloud, **changes) | top
-    answer = post(body, model)
+    answer = post(gateway, body, model)
     assert answer.status_code == status, answer.text
     assert told in answer.json()["error"]
 

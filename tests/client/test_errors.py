@@ -1,7 +1,7 @@
 """What goes wrong is the same exception over either transport, or is tried again."""
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -80,26 +80,21 @@ class FailingServer(grasp_pb2_grpc.GraspServiceServicer):
         return httpx.Response(problem.status, json=document | {"retry_after": problem.retry_after})
 
 
-@pytest.fixture
-def answers_with(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
-    """Puts a function in the place of the network."""
-
-    def put(respond: Any) -> None:
-        fake = httpx.MockTransport(respond).handle_async_request
-        monkeypatch.setattr(httpx.AsyncHTTPTransport, "handle_async_request", fake)
-
-    return put
+def put_in_place_of_http(monkeypatch: pytest.MonkeyPatch, respond: Any) -> None:
+    """Answers come from a function, and from no network."""
+    fake = httpx.MockTransport(respond).handle_async_request
+    monkeypatch.setattr(httpx.AsyncHTTPTransport, "handle_async_request", fake)
 
 
 @pytest.fixture
-def failing(transport: str, make_client: Any, answers_with: Any) -> Iterator[Any]:
+def failing(transport: str, make_client: Any, monkeypatch: Any) -> Iterator[Any]:
     """Makes a server with problems, and a client of it."""
     started = []
 
     def make(problems: Iterable[Problem], **arguments: Any) -> tuple[Any, FailingServer]:
         failing = FailingServer(problems)
         if transport == "rest":
-            answers_with(failing.respond)
+            put_in_place_of_http(monkeypatch, failing.respond)
             return make_client("http://failing", **arguments), failing
         started.append(grpc.server(ThreadPoolExecutor(2)))
         grasp_pb2_grpc.add_GraspServiceServicer_to_server(failing, started[-1])
@@ -182,17 +177,17 @@ def test_errors_of_proxies_and_other_servers_are_classified(row, transport, fail
 
 @pytest.mark.parametrize("body", [[], {"grasps": [{}]}, {"grasps": 3}, {"detail": "Not Found"}])
 def test_json_of_another_server_is_a_protocol_error(
-    body: Any, make_client, answers_with, cloud
+    body: Any, make_client, monkeypatch, cloud
 ) -> None:
-    answers_with(lambda request: httpx.Response(200, json=body))
+    put_in_place_of_http(monkeypatch, lambda request: httpx.Response(200, json=body))
     client = make_client("http://elsewhere")
     with pytest.raises(ProtocolError, match="not the answer of a grasp service"):
         client.detect(cloud)
 
 
-def test_a_proxy_says_when_to_come_again(make_client, answers_with, cloud) -> None:
+def test_a_proxy_says_when_to_come_again(make_client, monkeypatch, cloud) -> None:
     busy = httpx.Response(503, headers={"retry-after": "7"})
-    answers_with(lambda request: busy)
+    put_in_place_of_http(monkeypatch, lambda request: busy)
     client = make_client("http://proxy", timeout=5)
     with pytest.raises(OverloadedError) as caught:
         client.detect(cloud)
