@@ -22,16 +22,11 @@ from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer
 from edgegrasp_service.worker.process import Job
 
-
-@pytest.fixture(scope="module")
-def scene() -> dict[str, np.ndarray]:
-    """A box on a table, as the arrays of an .npz file."""
-    points = box_on_table(3000, table=True)
-    return {
-        "points": points,
-        "segment_ids": np.repeat(np.array([2, 1], np.int32), [9000, 3000]),
-        "view_ids": (points[:, 0] < 0).astype(np.int32),
-    }
+POINTS = box_on_table(3000, table=True)
+BESIDE = {
+    "segment_ids": np.repeat(np.array([2, 1], np.int32), [9000, 3000]),
+    "view_ids": (POINTS[:, 0] < 0).astype(np.int32),
+}
 
 
 def as_list(grasp: Any) -> list[Any]:
@@ -42,20 +37,21 @@ def as_lists(detection: Any) -> list[list[Any]]:
     return [as_list(grasp) for grasp in detection.grasps]
 
 
-def test_many_options_give_the_same_grasps_everywhere(catalogue, scene, real_server, tmp_path):
-    expected = catalogue.get().detect(CloudInput(**scene), parse_options(MANY))
+def test_many_options_give_the_same_grasps_everywhere(catalogue, real_server, tmp_path):
+    expected = catalogue.get().detect(CloudInput(POINTS, **BESIDE), parse_options(MANY))
     assert expected.grasps
     assert expected.debug is not None
 
     file, options = tmp_path / "scene.npz", tmp_path / "options.json"
-    np.savez_compressed(file, **scene)
+    np.savez_compressed(file, points=POINTS, **BESIDE)
     options.write_text(json.dumps(MANY))
     flags = ["detect", str(file), "--json"]
     remote = [*flags, "--options", str(options), "--server", real_server.grpc_address]
     for name, value in MANY.items():
         words = [] if name == "debug" else [value if isinstance(value, str) else json.dumps(value)]
         flags += [f"--{name.replace('_', '-')}", *words]
-    body = {name: array.tolist() for name, array in scene.items()} | {"options": MANY}
+    body = {name: array.tolist() for name, array in BESIDE.items()}
+    body |= {"points": POINTS.tolist(), "options": MANY}
     documents = [httpx.post(f"{real_server.http_url}/v1/grasps", json=body, timeout=60).json()]
     documents += [json.loads(CliRunner().invoke(main.app, each).stdout) for each in (flags, remote)]
     for document in documents:
@@ -64,11 +60,10 @@ def test_many_options_give_the_same_grasps_everywhere(catalogue, scene, real_ser
         assert document["counts"] == expected.counts
         assert document["debug"]["outcome"] == expected.debug.outcome
 
-    beside = {name: array for name, array in scene.items() if name != "points"}
     with GraspClient(real_server.grpc_address) as client:
         found = [client.detect(file, **MANY)]
     with GraspClient(real_server.http_url) as client:
-        found.append(client.detect(scene["points"], **beside, **MANY))
+        found.append(client.detect(POINTS, **BESIDE, **MANY))
     for detection in found:
         assert as_lists(detection) == as_lists(expected)
         assert list(detection.counts.items()) == list(expected.counts.items())  # in their order
@@ -83,18 +78,18 @@ def evaluated(scoring: Any) -> list[Any]:
     return [one.reason or as_list(one.grasp) for one in scoring.evaluations]
 
 
-def test_scores_are_the_same_everywhere(catalogue, scene, real_server) -> None:
+def test_scores_are_the_same_everywhere(catalogue, real_server) -> None:
     options: dict[str, Any] = {"seed": 3, "viewpoint": [0.3, 0.1, 0.6]}
-    points, detector, parsed = scene["points"], catalogue.get(), parse_options(options)
-    found = detector.detect(points, parsed).grasps
+    detector, parsed = catalogue.get(), parse_options(options)
+    found = detector.detect(POINTS, parsed).grasps
     poses = np.stack([grasp.T_cloud_hand for grasp in found])
     edges = np.random.default_rng(2).integers(0, 9000, (40, 2))
     for given in ({"edges": edges}, {"hand_poses": poses}):
-        expected = detector.score(points, parsed, **given)
+        expected = detector.score(POINTS, parsed, **given)
         assert any(evaluation.grasp for evaluation in expected.evaluations)
         for address in (real_server.grpc_address, real_server.http_url):
             with GraspClient(address) as client:
-                scoring = client.score(points, **given, **options)
+                scoring = client.score(POINTS, **given, **options)
             assert evaluated(scoring) == evaluated(expected)
             assert list(scoring.counts.items()) == list(expected.counts.items())
 
