@@ -1,10 +1,8 @@
 from collections.abc import Iterator
-from dataclasses import replace
 
 import pytest
 
 from edgegrasp_sim.engine import ENGINES, World, choose_engine, make_world
-from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
 
 
@@ -28,9 +26,3 @@ def simulation(engine: str) -> Iterator[ClutterSimulation]:
 def world(engine: str) -> Iterator[World]:
     with make_world(engine) as world:
         yield world
-
-
-def paper_with(number: int) -> Protocol:
-    """The paper's protocol with so many objects in a scene."""
-    paper = load_protocol("edgegrasp")
-    return replace(paper, scene=replace(paper.scene, num_objects=(number,)))

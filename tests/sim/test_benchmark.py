@@ -6,7 +6,6 @@ import json
 import multiprocessing
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +18,7 @@ from edgegrasp_sim.benchmark import BenchmarkConfig, RoundRunner, manifest, run_
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
-from edgegrasp_sim.protocol import FOLDER, load_protocol, protocol_from, protocol_names
+from edgegrasp_sim.protocol import FOLDER, Protocol, load_protocol, protocol_from, protocol_names
 from edgegrasp_sim.results import (
     ResultFolder,
     attempts_digest,
@@ -40,7 +39,12 @@ from edgegrasp_sim.trial import (
 )
 from edgegrasp_sim.workers import run_tasks
 
-from .conftest import paper_with
+
+def paper_with(number: int) -> Protocol:
+    """The paper's protocol with so many objects in a scene."""
+    paper = load_protocol("edgegrasp")
+    return replace(paper, scene=replace(paper.scene, num_objects=(number,)))
+
 
 TWO_OBJECTS = paper_with(2)
 
@@ -209,25 +213,22 @@ IN_THE_AIR = np.diag([1.0, -1.0, -1.0, 1.0])
 IN_THE_AIR[:3, 3] = (0.15, 0.15, 0.5)
 
 
-@pytest.fixture
-def run(simulation: ClutterSimulation) -> Callable[..., Round]:
-    """Runs a round with so many objects."""
-
-    def run(planner: Planner, scene: SceneKind, number: int, **given: int) -> Round:
-        of = {"seed": 0, "index": 0} | given
-        return RoundDriver(simulation, scene, paper_with(number), **of).run(planner)
-
-    return run
+def run(
+    simulation: ClutterSimulation, planner: Planner, scene: SceneKind, number: int, **given: int
+) -> Round:
+    """A round with so many objects."""
+    of = {"seed": 0, "index": 0} | given
+    return RoundDriver(simulation, scene, paper_with(number), **of).run(planner)
 
 
-def test_two_failures_in_a_row_end_a_round(run: Callable[..., Round]) -> None:
-    done = run(lambda seen, seed: PlannedGrasp(IN_THE_AIR, 1.0, 0.04), PACKED, 2)
+def test_two_failures_in_a_row_end_a_round(simulation) -> None:
+    done = run(simulation, lambda seen, seed: PlannedGrasp(IN_THE_AIR, 1.0, 0.04), PACKED, 2)
     assert done.end is RoundEnd.FAILURES
     found = [(attempt.cause, attempt.target) for attempt in done.attempts]
     assert found == [(FailureCause.MISSED, None)] * 2
 
 
-def test_no_grasp_is_no_attempt_and_the_third_ends_a_round(run: Callable[..., Round]) -> None:
+def test_no_grasp_is_no_attempt_and_the_third_ends_a_round(simulation) -> None:
     clouds: list[int] = []
     seeds: list[int] = []
 
@@ -235,7 +236,7 @@ def test_no_grasp_is_no_attempt_and_the_third_ends_a_round(run: Callable[..., Ro
         clouds.append(len(seen.cloud))
         seeds.append(seed)
 
-    done = run(planner, PACKED, 2)
+    done = run(simulation, planner, PACKED, 2)
     assert done.end is RoundEnd.NO_GRASP
     assert (done.attempts, done.no_grasp) == ((), 3)
     assert len(set(seeds)) == 3
@@ -259,25 +260,25 @@ def test_cubes_are_cleared_though_the_first_view_shows_nothing(engine: str, monk
         assert attempt.object == ("cube" if attempt.success else None)
 
 
-def test_an_arm_that_cannot_start_in_a_view_takes_another_one(run: Callable[..., Round]) -> None:
+def test_an_arm_that_cannot_start_in_a_view_takes_another_one(simulation) -> None:
     def planner(seen: Observation, seed: int) -> None:
         raise StartCollides
 
-    done = run(planner, PACKED, 2)
+    done = run(simulation, planner, PACKED, 2)
     assert (done.end, done.no_grasp, done.start_collisions) == (RoundEnd.NO_GRASP, 3, 3)
     failures = summarise([done])["failures"]
     assert (failures["start in collision"], failures["no candidate"]) == (3, 0)
 
 
-def test_scenes_and_views_do_not_depend_on_the_planner(engine, run) -> None:
+def test_scenes_and_views_do_not_depend_on_the_planner(engine, simulation) -> None:
     first_clouds = []
 
     def keep_first(seen: Observation, seed: int) -> PlannedGrasp:
         first_clouds.append(seen.cloud)
         return PlannedGrasp(IN_THE_AIR, 1.0, 0.04)
 
-    run(plan, PILE, 2, seed=4, index=0)
-    run(keep_first, PILE, 2, seed=4, index=1)
+    run(simulation, plan, PILE, 2, seed=4, index=0)
+    run(simulation, keep_first, PILE, 2, seed=4, index=1)
     with ClutterSimulation(engine=engine) as other:
         RoundDriver(other, PILE, paper_with(2), seed=4, index=1).run(keep_first)
     assert np.array_equal(first_clouds[0], first_clouds[2])

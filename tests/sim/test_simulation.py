@@ -11,14 +11,7 @@ from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.poses import translation
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
-from edgegrasp_sim.surroundings import (
-    MIDDLE,
-    OPEN_TABLE,
-    TABLE_HEIGHT,
-    WORKSPACE,
-    Box,
-    Surroundings,
-)
+from edgegrasp_sim.surroundings import MIDDLE, OPEN_TABLE, TABLE_HEIGHT, Box, Surroundings
 
 CUBE = Path(__file__).parent / "cube.urdf"  # 0.05 m
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -141,7 +134,7 @@ def test_observation_holds_the_objects_and_not_the_table(simulation: ClutterSimu
     simulation.reset_from_poses([cube_at(0.15, 0.15)])
     seen = simulation.observe_from([FRONT], np.random.default_rng(0), noise_std=0.0)
     assert seen.cloud.dtype == np.float32
-    assert (seen.cloud >= np.float32(WORKSPACE[0])).all()
+    assert (seen.cloud >= np.float32(OPEN_TABLE.workspace[0])).all()
     assert seen.cloud.max(axis=0) == pytest.approx((0.175, 0.175, 0.1), abs=2e-3)
     assert seen.cloud[:, 1].min() == pytest.approx(0.125, abs=2e-3)
     assert seen.camera_position == pytest.approx((0.6, 0.15, 0.6))
