@@ -1,4 +1,3 @@
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -6,22 +5,11 @@ import pytest
 
 from edgegrasp_model.candidates.edge_grasps import edge_grasps
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
+from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.scene.cloud import Cloud
-from edgegrasp_training.examples import Teacher
-from edgegrasp_training.options import TrainingOptions
-from edgegrasp_training.training import Trainer
-from edgegrasp_training.views import LabelledView, find_views, split_by_scene
+from edgegrasp_training.views import LabelledView, find_views
 
 SAMPLE = Path(__file__).parents[2] / "examples" / "labelled_views"
-MakeTrainer = Callable[..., Trainer]
-FAST = {
-    "steps": 40,
-    "views_per_step": 2,
-    "balls_per_view": 3,
-    "learning_rate": 3e-3,
-    "evaluate_every": 10,
-}
 NETWORKS = {  # small ones of every architecture
     "balls": NetworkConfig("edgegrasp", (8, 8, 8), (8, 8, 8), (8, 8), (16, 8), crop_radius=0.04),
     "vn": NetworkConfig("vn-edgegrasp", (6, 6, 6), (6, 9, 9), (9, 9), (16, 8, 4), crop_radius=0.04),
@@ -63,25 +51,3 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     for number in range(8):
         made_up_view(number).save(folder / f"packed_{number}_0.npz")
     return find_views([folder])
-
-
-@pytest.fixture(scope="session")
-def make_trainer(views: list[Path]) -> MakeTrainer:
-    """Makes the trainer of a small network, on made-up views unless others are given."""
-
-    def make(
-        folder: Path,
-        network: str = "hands",
-        *,
-        name: str = "tiny",
-        views: list[Path] = views,
-        teacher: Teacher | None = None,
-        start: Path | None = None,
-        **options: object,
-    ) -> Trainer:
-        metadata = CheckpointMetadata(name, NETWORKS[network], voxel_size=0.0045, gripper="panda")
-        train, validation = split_by_scene(views, 0.25, seed=0)
-        chosen = TrainingOptions(**FAST | options)
-        return Trainer(metadata, train, validation, folder, chosen, teacher=teacher, start=start)
-
-    return make

@@ -1,4 +1,5 @@
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,36 @@ from edgegrasp_training.training import Trainer
 from edgegrasp_training.views import find_views, split_by_scene
 
 from .conftest import NETWORKS, SAMPLE, made_up_view
+
+FAST = {
+    "steps": 40,
+    "views_per_step": 2,
+    "balls_per_view": 3,
+    "learning_rate": 3e-3,
+    "evaluate_every": 10,
+}
+
+
+@pytest.fixture(scope="session")
+def make_trainer(views: list[Path]) -> Callable[..., Trainer]:
+    """Makes the trainer of a small network, on made-up views unless others are given."""
+
+    def make(
+        folder: Path,
+        network: str = "hands",
+        *,
+        name: str = "tiny",
+        views: list[Path] = views,
+        teacher: Teacher | None = None,
+        start: Path | None = None,
+        **options: object,
+    ) -> Trainer:
+        metadata = CheckpointMetadata(name, NETWORKS[network], voxel_size=0.0045, gripper="panda")
+        train, validation = split_by_scene(views, 0.25, seed=0)
+        chosen = TrainingOptions(**FAST | options)
+        return Trainer(metadata, train, validation, folder, chosen, teacher=teacher, start=start)
+
+    return make
 
 
 def ignore(step: int, loss: float) -> None:
