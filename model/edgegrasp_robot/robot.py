@@ -1,7 +1,5 @@
 """Robots: the robot file, which names an arm's model and its gripper, and the loaded robot."""
 
-import json
-import tempfile
 import tomllib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
@@ -121,23 +119,17 @@ class Model:
     """What the planner's scenes are built from."""
 
     arm: str  # URDF without what is beyond the flange, and with the meshes' absolute paths
-    urdf: str  # the same with the gripper's boxes
-    packages: list[str]
+    urdf: str  # the same with the gripper's boxes and the robot file's limits
     links: list[str]  # those that have a shape
     standing: list[str]  # those of them that no joint moves: they may touch what they stand on
     allowed: list[tuple[str, str]]  # pairs of links that may touch
-    limits: str  # of velocity and acceleration, JSON
 
     def scene(self, arm: RobotFile | Robot) -> core.Scene:
         """A scene with the robot alone."""
-        scene = core.Scene(GROUP, core.loadUrdfSceneDescriptionFromXml(self.urdf, self.packages))
+        scene = core.Scene(GROUP, core.loadUrdfSceneDescriptionFromXml(self.urdf, []))
         scene.addGroupFromChain(GROUP, arm.base_frame, arm.flange_frame)
         scene.allowAdjacentLinkCollisions()
         scene.setCollisions(self.allowed, False)
-        with tempfile.NamedTemporaryFile("w", suffix=".yaml") as limits:
-            limits.write(f'{{"joint_limits": {self.limits}}}')
-            limits.flush()
-            scene.importJointLimitsFromConfig(core.loadJointLimitsConfig(limits.name))
         return scene
 
 
@@ -184,7 +176,6 @@ def _load(path: Path, file: RobotFile) -> Robot:
     root = ElementTree.fromstring(text)
     joints = _chain(path, root, file)
     joint_names = [str(joint.get("name")) for joint in joints]
-    limits: dict[str, dict[str, list[float]]] = {name: {} for name in joint_names}
     if not file.max_acceleration:
         file = file.model_copy(update={"max_acceleration": (CAREFUL,) * len(joints)})
     for field in ("home", "max_velocity", "max_acceleration"):
@@ -192,9 +183,6 @@ def _load(path: Path, file: RobotFile) -> Robot:
         if given and len(given) != len(joints):
             fix = f"The arm has {len(joints)} joints: {', '.join(joint_names)}."
             raise InvalidRobot(f"{path.name}: {field}: got {len(given)} numbers. {fix}")
-        if field != "home":
-            for name, value in zip(joint_names, given, strict=False):
-                limits[name][field] = [value]
     gripper_file = path.parent / file.gripper
     named = gripper_file if gripper_file.is_file() else file.gripper
     hand = GripperGeometry.model_validate(gripper_fields(named))
@@ -204,6 +192,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     _check_meshes(urdf, root, packages)
     arm = as_text(root)
     _add_hand(root, file, gripper)
+    _set_limits(path, root, joints, file)
     shaped = [link for link in root.findall("link") if link.find("collision") is not None]
     links = [str(link.get("name")) for link in shaped]
     srdf = _located(path, "srdf", file.srdf, packages) if file.srdf else None
@@ -211,7 +200,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     standing = [
         link for link in links if not any(one.get("type") in MOVING for one in _above(root, link))
     ]
-    model = Model(arm, as_text(root), packages, links, standing, allowed, json.dumps(limits))
+    model = Model(arm, as_text(root), links, standing, allowed)
     for link in shaped:
         for shape in link.findall("collision"):
             link.remove(shape)
@@ -222,15 +211,10 @@ def _load(path: Path, file: RobotFile) -> Robot:
     if ((home < lower) | (home > upper)).any():
         fix = f"Give joints between {lower.tolist()} and {upper.tolist()}."
         raise InvalidRobot(f"{path.name}: home: got {home.tolist()}. {fix}")
-    fastest, accelerations = scenes[0].getVelocityLimitVectors(GROUP)[1], file.max_acceleration
-    for field, most in (("max_velocity", fastest), ("max_acceleration", accelerations)):
-        if min(most) <= 0.0:  # some exporters of URDFs write 0
-            fix = "Give what each joint can do, above 0."
-            raise InvalidRobot(f"{path.name}: {field}: got {np.asarray(most).tolist()}. {fix}")
     robot = Robot(
         path.stem, gripper, hand, file.base_frame, file.flange_frame,
         scenes[0].forwardKinematics(home, HAND, file.flange_frame), joint_names, home, lower, upper,
-        fastest, np.array(accelerations),
+        scenes[0].getVelocityLimitVectors(GROUP)[1], np.array(file.max_acceleration),
         _kinematics(joints, scenes[0], file.base_frame), model, *scenes, SimpleIk(bare, IK),
     )  # fmt: skip
     if scenes[0].hasCollisions(home):
@@ -367,6 +351,19 @@ def _add_hand(root: Element, file: RobotFile, gripper: Gripper) -> None:
     turn = Rotation.from_quat(file.T_flange_hand.quaternion).as_euler("xyz")
     place = _numbers(file.T_flange_hand.position)
     ElementTree.SubElement(joint, "origin", xyz=place, rpy=_numbers(turn))
+
+
+def _set_limits(path: Path, root: Element, joints: Sequence[Element], file: RobotFile) -> None:
+    """Limit the joints' velocities and accelerations as the robot file does."""
+    root.set("version", "1.2")  # of URDF, which has accelerations from then on
+    limits = [limit for joint in joints for limit in joint.findall("limit")]
+    for name in ("velocity", "acceleration"):
+        for limit, value in zip(limits, getattr(file, f"max_{name}"), strict=False):
+            limit.set(name, str(value))
+        most = [float(limit.get(name, "0")) for limit in limits]
+        if min(most, default=1.0) <= 0.0:  # some exporters of URDFs write 0
+            fix = "Give what each joint can do, above 0."
+            raise InvalidRobot(f"{path.name}: max_{name}: got {most}. {fix}")
 
 
 def _numbers(values: ArrayLike) -> str:
