@@ -28,10 +28,7 @@ SECONDS = float(os.environ.get("DUMMY_SECONDS", "0"))  # of service time
 
 
 class DummyDetector:
-    """Makes top-down grasps on points drawn from the seed; its network takes `seconds`."""
-
-    def __init__(self, seconds: float = 0.0) -> None:
-        self._seconds = seconds
+    """Makes top-down grasps on points drawn from the seed; its network takes SECONDS."""
 
     def prepare(self, cloud: CloudInput, options: DetectOptions, *_: int) -> SimpleNamespace:
         """Draw approach points, the same ones for the same cloud and options."""
@@ -49,8 +46,8 @@ class DummyDetector:
 
     def evaluate(self, prepared: SimpleNamespace) -> Float32:
         """Wait as long as a network would take."""
-        time.sleep(self._seconds)
-        prepared.seconds["network"] = self._seconds
+        time.sleep(SECONDS)
+        prepared.seconds["network"] = SECONDS
         return prepared.batch
 
     def finish(self, prepared: SimpleNamespace, logits: Float32) -> Detection:
@@ -113,9 +110,7 @@ class DummyCatalogue:
     """A catalogue with the dummy detector alone."""
 
     pace = Pace()
-
-    def __init__(self, seconds: float = 0.0) -> None:
-        self._detector = DummyDetector(seconds)
+    _detector = DummyDetector()
 
     def get(self, name: str = "") -> DummyDetector:
         """The detector; raises UnknownModel for any name but its own."""

@@ -14,7 +14,7 @@ def main() -> None:
 
     if sys.argv[1].startswith("{"):
         dummy = runpy.run_path(str(Path(__file__).with_name("dummy.py")))
-        process.main(sys.argv[1], lambda settings: dummy["DummyCatalogue"](dummy["SECONDS"]))
+        process.main(sys.argv[1], lambda settings: dummy["DummyCatalogue"]())
         return
     pool.NURSERY = (sys.executable, "-P", __file__)
     from edgegrasp_cli.main import main
