@@ -70,16 +70,8 @@ SIDE_VIEWS = ViewRange((0.5, 1.2), (40.0, 80.0), _ANY_SIDE, _LOW_TARGET)
 # Metres from the nearest hand that was tried: from where the frame of a Panda's hand would be.
 KEPT_DISTANCE = 0.18
 AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
-# Of the views that are not cut off, where support and workspace are given.
-GIVEN_SHARE = {
-    PACKED: 0.0,
-    PILE: 0.0,
-    BIN: 0.7,
-    DEEP_BIN: 0.5,
-    FULL_BIN: 0.5,
-    TABLE: 0.3,
-    SHELF: 0.3,
-}
+# Of the views that are not cut off, where support and workspace are given; else none.
+GIVEN_SHARE = {BIN: 0.7, DEEP_BIN: 0.5, FULL_BIN: 0.5, TABLE: 0.3, SHELF: 0.3}
 AIMED_SHARE = 0.85  # of the views of bins and tables with grasps of the objects alone
 AIM_MARGIN = np.array([[-0.005], [0.005]])  # metres around an object
 AROUND_MARGIN = 0.006  # metres around an obstacle
@@ -272,7 +264,7 @@ def ask(
     support: SupportPlane | AutoPlane = _plane(noise) if around else TABLE_PLANE
     low, high = map(tuple, observation.workspace.tolist())
     workspace: Workspace | None = Workspace(min=low, max=high)
-    if around and choice.random() >= GIVEN_SHARE[kind]:
+    if around and choice.random() >= GIVEN_SHARE.get(kind, 0.0):
         support, workspace = AutoPlane(), None
     aimed = not open_table and not guided and choice.random() < AIMED_SHARE
     objects = _objects_of(simulation) if aimed else None
