@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,6 @@ from edgegrasp_model.hand_description import seen_part
 from edgegrasp_model.hand_kernels import mean_of_alike, non_max_suppression
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Outcome, Ungraspable
-from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.support import Support
 from edgegrasp_model.unseen import leaves_image, unseen_space
@@ -73,20 +71,17 @@ def select(
     hands = sample.candidates.T_cloud_hand
     T_cloud_tcp = hands @ gripper.T_hand_tcp
     clearance = clearances(scene, hands, gripper) if options.order == "clearance" else None
-    free = sample.collision_free | (options.collision.mode == "ignore")
-    preferred = rating
-    if options.order == "score":
-        preferred = rating - drawbacks(scene, sample.candidates.contact_index, hands, gripper)
-    order = ranked(preferred, free, options.order, T_cloud_tcp[:, :3, 3] @ UP, clearance)
-
+    contact = sample.candidates.contact_index
+    order = ranked(
+        scene, contact, hands, rating, sample.collision_free, gripper, options, clearance
+    )
     outcome = np.full(len(score), CODE[Outcome.BEYOND_TOP_K])
     good = score[order] >= options.min_score
     outcome[order[~good]] = CODE[Outcome.LOW_SCORE]
     order, dropped = order[good], order[:0]
     counts["above_min_score"] = len(order)
     if options.order == "score":
-        number = scene.object_of_point[sample.candidates.contact_index]
-        order = objects_first(order, rating, number)
+        order = objects_first(order, rating, scene.object_of_point[contact])
     if (rule := options.suppression) is not None:
         near = rule.translation, rule.rotation
         order, dropped = non_max_suppression(T_cloud_tcp, order, *near, options.top_k)
@@ -96,7 +91,7 @@ def select(
     return order, outcome
 
 
-def drawbacks(
+def _drawbacks(
     scene: Scene, contact_index: Int64, T_cloud_hand: Float32, gripper: Gripper
 ) -> Floats:
     """What is taken off ratings (E,), of which noise would else decide among equal ones.
@@ -127,21 +122,27 @@ def objects_first(order: Int64, score: Floats, number: Int64) -> Int64:
 
 
 def ranked(
+    scene: Scene,
+    contact_index: Int64,  # (E,) rows of the scene's cloud
+    hands: Float32,  # (E, 4, 4) T_cloud_hand
     score: Floats,  # (E,) probabilities
     collision_free: Bools,  # (E,) the scores of the others are multiplied by COLLIDING
+    gripper: Gripper,
     # `highest`: by height where the score is SURE_SCORE or more; `clearance`: collision-free ones
     # first, by clearance
-    order: Literal["score", "highest", "clearance"],
-    height: Floats,  # (E,) of the TCP along up, for `highest`
+    options: DetectOptions,
     clearance: Floats | None,  # (E,) for `clearance`
 ) -> Int64:
-    """Rows best first: by `order`, and then by score."""
+    """Rows best first: by the order asked for, and then by score; canonical frame."""
+    collision_free = collision_free | (options.collision.mode == "ignore")
+    if options.order == "score":
+        score = score - _drawbacks(scene, contact_index, hands, gripper)
     worth = np.where(collision_free, score, COLLIDING * score)
     keys: tuple[Array, ...] = (-worth,)
-    if order == "highest":
-        sure = worth >= SURE_SCORE
+    if options.order == "highest":
+        sure, height = worth >= SURE_SCORE, (hands @ gripper.T_hand_tcp)[:, 2, 3]
         keys = (-worth, np.where(sure, -height, -worth), ~sure)
-    if order == "clearance" and clearance is not None:
+    if options.order == "clearance" and clearance is not None:
         keys = (-score, -clearance, ~collision_free)
     return np.lexsort(keys).astype(np.int64)
 

@@ -26,7 +26,7 @@ from edgegrasp_model.options import (
     Suppression,
     Workspace,
 )
-from edgegrasp_model.ranking import COLLIDING, drawbacks, objects_first, ranked
+from edgegrasp_model.ranking import COLLIDING, objects_first, ranked
 from edgegrasp_model.results import OBSTACLE, Following
 from edgegrasp_model.scene.cloud import thinned
 from edgegrasp_model.scene.regions import numbers_chosen
@@ -226,15 +226,12 @@ def _order(
         rows, _ = non_max_suppression(T_cloud_tcp, rows, *near, len(rows))
     some = [grasps[row] for row in rows]
     score = np.array([one.score for one in some])
-    free = np.array([one.collision_free or options.collision.mode == "ignore" for one in some])
+    free = np.array([one.collision_free for one in some])
     clearance = np.array([one.clearance for one in some])
     hands = scene.frame.poses([one.T_cloud_hand for one in some])
-    height, preferred = (hands @ gripper.T_hand_tcp)[:, 2, 3], score
-    if options.order == "score":
-        places = np.stack([one.contact_point for one in some])
-        contact = np.asarray(cKDTree(scene.points_in_cloud).query(places)[1])
-        preferred = score - drawbacks(scene, contact, hands, gripper)
-    order = ranked(preferred, free, options.order, height, clearance)
+    places = np.stack([one.contact_point for one in some])
+    contact = np.asarray(cKDTree(scene.points_in_cloud).query(places)[1])
+    order = ranked(scene, contact, hands, score, free, gripper, options, clearance)
     if options.order == "score":
         number = np.array([-1 if one.object is None else one.object for one in some])
         order = objects_first(order, score, number)
