@@ -279,4 +279,4 @@ def _candidates(view: LabelledView, cloud: Cloud, rows: Int64) -> Candidates:
     edge = view.points[contact_index] - view.points[approach_index]  # (E, 3)
     depth = np.maximum(np.einsum("ed,ed->e", edge, pose[:, :3, 2]), 0.0)
     pair = np.arange(len(rows), dtype=np.int64)
-    return Candidates(pair, approach_index, contact_index, -pose[:, :3, 2], depth, pose)
+    return Candidates(pair, approach_index, contact_index, depth, pose)

@@ -90,19 +90,22 @@ class Candidates:
     pair: Int64  # (E,) which of the given pairs of points
     approach_index: Int64  # (E,) p_a, rows of the cloud
     contact_index: Int64  # (E,) p_c, rows of the cloud
-    approach: Float32  # (E, 3) unit, outward: from the object back to the hand
     depth: Float32  # (E,) d, metres the contact lies ahead of the approach point
     T_cloud_hand: Float32  # (E, 4, 4)
 
     def __len__(self) -> int:
         return len(self.pair)
 
+    @property
+    def approach(self) -> Float32:
+        """(E, 3) unit, outward: from the object back to the hand."""
+        return -self.T_cloud_hand[:, :3, 2]
+
     @staticmethod
     def none() -> "Candidates":
         """No candidate."""
         rows, numbers = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
-        vectors = np.empty((0, 3), dtype=np.float32)
-        return Candidates(rows, rows, rows, vectors, numbers, np.empty((0, 4, 4), np.float32))
+        return Candidates(rows, rows, rows, numbers, np.empty((0, 4, 4), np.float32))
 
     @staticmethod
     def concatenate(parts: Sequence["Candidates"]) -> "Candidates":
@@ -134,7 +137,7 @@ def edge_grasps(
     ahead, normal, depth = edge.ahead[pair], edge.normal[pair], edge.depth[pair]
     contact_z = gripper.contact_z_at(2 * np.abs(edge.along[pair]))
     pose = edge_grasp_poses(cloud.points[approach_index[pair]], ahead, normal, depth, contact_z)
-    return Candidates(pair, approach_index[pair], contact_index[pair], -pose[:, :3, 2], depth, pose)
+    return Candidates(pair, approach_index[pair], contact_index[pair], depth, pose)
 
 
 class EdgeMeasures(NamedTuple):

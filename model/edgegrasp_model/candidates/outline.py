@@ -116,7 +116,7 @@ def outline_grasps(
     pose[:, :3, 3] = middle - gripper.contact_z_at(width)[:, None] * z
     pose[:, 3, 3] = 1.0
     depth = np.maximum(edge[2][row], 0.0)
-    hands = Candidates(pair[row], approach[row], contact, -z, depth, pose)
+    hands = Candidates(pair[row], approach[row], contact, depth, pose)
     return _inserted(points, hands, support, gripper, margin)
 
 
