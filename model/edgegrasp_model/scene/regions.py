@@ -147,8 +147,7 @@ def inside_shape(shape: Box | OrientedBox | Sphere | HalfSpace, points: Float32)
     """Which points (V, 3), in the shape's frame, lie in it.  # (V,)."""
     match shape:
         case Box():
-            inside = (points >= np.asarray(shape.min)) & (points <= np.asarray(shape.max))
-            return np.asarray(inside.all(axis=1))
+            return inside_workspace(points, shape)
         case OrientedBox():
             turn = Rotation.from_quat(shape.quaternion).as_matrix()
             within = np.abs((points - np.asarray(shape.center)) @ turn)
