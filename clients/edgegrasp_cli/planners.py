@@ -109,14 +109,10 @@ class _OneThread(OwnDetector):
     """A detector on one thread, whose sums do not depend on the number of threads."""
 
     def detect(self, cloud: Any = None, **options: Any) -> Any:
-        import torch
+        from edgegrasp_model.scene.segment import one_thread
 
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
+        with one_thread():
             return super().detect(cloud, **options)
-        finally:
-            torch.set_num_threads(threads)
 
 
 @dataclass

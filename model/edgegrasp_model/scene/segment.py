@@ -140,7 +140,7 @@ def look(
 ) -> tuple[Pixels, Float64]:
     """A network's output for a range image, and its estimate of up (3,); camera frame."""
     features = scene_features(points, up, footprint)
-    with torch.inference_mode(), _one_thread():
+    with torch.inference_mode(), one_thread():
         output = network(torch.from_numpy(features)[None])
         classes = output.classes[0].softmax(dim=0).contiguous().numpy()
         votes = output.votes[0].permute(1, 2, 0).contiguous().numpy()
@@ -154,8 +154,8 @@ def look(
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """The network's output must not depend on the number of threads."""
+def one_thread() -> Iterator[None]:
+    """A network's output must not depend on the number of threads."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
