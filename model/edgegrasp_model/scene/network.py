@@ -19,7 +19,7 @@ HEIGHT, WIDTH = 352, 480  # pixels of the input
 MULTIPLE = 32  # its sides are multiples of
 CLASSES = ("other", "support", "object")
 CHANNELS = 12  # of `scene_features`
-WIDTHS = (16, 32, 48, 64, 96, 128)
+WIDTHS = (16, 32, 48, 64, 96, 128)  # channels at each resolution, the output's first
 STRIDE = 2  # pixels of the input between neighbours whose difference gives the normal
 VOTE_UNIT = 0.05  # metres
 OUTPUTS = len(CLASSES) + 3 + 2 + 3
@@ -37,17 +37,15 @@ class SceneOutput(NamedTuple):
 class SceneNet(nn.Module):
     """Predicts classes, votes for object centres, links between pixels, and the up direction."""
 
-    def __init__(self, widths: tuple[int, ...] = WIDTHS) -> None:
-        """Random weights; `widths` are the channels at each resolution, the output's first."""
+    def __init__(self) -> None:
         super().__init__()
-        first = widths[0]
+        first, last, pairs = WIDTHS[0], WIDTHS[-1], list(pairwise(WIDTHS))
         self.stem = _layer(CHANNELS, first, kernel=4, stride=2)
         self.fine = _layer(first, first)
-        pairs = list(pairwise(widths))
         self.down = nn.ModuleList(
             [nn.Sequential(_layer(a, b, stride=2), _Block(b)) for a, b in pairs]
         )
-        self.context = _Block(widths[-1], dilation=3)
+        self.context = _Block(last, dilation=3)
         self.across = nn.ModuleList([nn.Conv2d(b, a, 1) for a, b in pairs[::-1]])
         self.up = nn.ModuleList([_layer(a, a) for a, _ in pairs[::-1]])
         self.head = nn.Conv2d(first, OUTPUTS, 1)
@@ -85,10 +83,7 @@ class _Block(nn.Module):
     def __init__(self, width: int, dilation: int = 1) -> None:
         super().__init__()
         self.first = _layer(width, width, dilation=dilation)
-        self.second = nn.Sequential(
-            nn.Conv2d(width, width, 3, padding=dilation, dilation=dilation, bias=False),
-            nn.BatchNorm2d(width),
-        )
+        self.second = _layer(width, width, dilation=dilation)[:2]  # without its ReLU
 
     def forward(self, x: Tensor) -> Tensor:
         return functional.relu(x + self.second(self.first(x)))
