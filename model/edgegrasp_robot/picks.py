@@ -404,9 +404,7 @@ def _told(
     if asked.plan == "motion":
         counts["with_trajectory"] = moving
     counts["returned"] = len(grasps)
-    best: dict[int | None, float] = {}
-    for grasp in grasps:
-        best[grasp.object] = max(grasp.score, best.get(grasp.object, 0.0))
+    best = {grasp.object: grasp.score for grasp in sorted(grasps, key=lambda one: one.score)}
     total, tracking = detection.seconds.get("total", 0.0) + seconds, detection.tracking
     if tracking is not None and (kept := _kept(detection)) is not None:
         still = bool(grasps) and grasps[0].id == kept and tiers[0] < 3

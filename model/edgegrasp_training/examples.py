@@ -92,7 +92,9 @@ def tried_grasps(
         viewpoints = view.camera_position[None] if viewpoint_known else None
         batch = hand_batch(view, candidates, viewpoints, SPARE_POINTS * config.hand_points)
         seen = replace(batch, description=batch.description.half(), points=batch.points.half())
-    return TriedGrasps(cloud, candidates, seen, label, _turn_of(view))
+    frame = CanonicalFrame.of_scene(view.points, view.up, view.camera_position)
+    turn = frame.directions(np.eye(3)).T.astype(np.float32)
+    return TriedGrasps(cloud, candidates, seen, label, turn)
 
 
 def hand_batch(
@@ -260,14 +262,6 @@ def _labels(view: LabelledView) -> Float32:
         firm = np.where(view.firm == UNTRIED, FIRM_SHARE, view.firm == 1)
     label: Float32 = (held * (1.0 - SHAKEN_SHARE * (1.0 - firm))).astype(np.float32)
     return label
-
-
-def _turn_of(view: LabelledView) -> Float32:
-    """The rotation (3, 3) of a view's axes to those of the detector's frame."""
-    if len(view.points) == 0:
-        return np.eye(3, dtype=np.float32)
-    frame = CanonicalFrame.of_scene(view.points, view.up, view.camera_position)
-    return frame.directions(np.eye(3)).T.astype(np.float32)
 
 
 def _candidates(view: LabelledView, cloud: Cloud, rows: Int64) -> Candidates:

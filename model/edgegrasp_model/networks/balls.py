@@ -98,12 +98,6 @@ class BallBatch:
         """Ball (E,) int64 of each edge grasp."""
         return self.ball_of_point[self.contact]
 
-    @property
-    def ball_sizes(self) -> list[int]:
-        """Number of points of each ball, in order."""
-        sizes: list[int] = torch.bincount(self.ball_of_point, minlength=self.num_balls).tolist()
-        return sizes
-
     def to(self, device: torch.device | str) -> "BallBatch":
         """Moves every tensor to a device."""
         parts = vars(self).items()

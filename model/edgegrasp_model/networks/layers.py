@@ -142,7 +142,8 @@ class BallChunk(NamedTuple):
 
 def ball_chunks(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[BallChunk]:
     """Split values (P, ...) of a batch's points into chunks in float32 inference."""
-    ball_of_point, sizes = batch.ball_of_point, batch.ball_sizes
+    ball_of_point = batch.ball_of_point
+    sizes: list[int] = torch.bincount(ball_of_point, minlength=batch.num_balls).tolist()
     if not float32_inference(values):
         return [BallChunk(values, ball_of_point, list(range(len(sizes))), sizes)]
     ends = torch.tensor(sizes).cumsum(0).tolist()

@@ -280,7 +280,9 @@ def fit_plane(
     length = np.linalg.norm(normals, axis=1)
     wide = length > 1e-6
     normals, origin = normals[wide] / length[wide, None], corners[wide, 0]
-    toward = _toward(seen, origin, up)
+    # Toward the camera, else up, else +z.
+    toward = np.broadcast_to(np.array([0.0, 0.0, 1.0]) if up is None else up, origin.shape)
+    toward = toward if seen.viewpoint is None else seen.viewpoint - origin
     normals = np.where((np.einsum("td,td->t", normals, toward) < 0)[:, None], -normals, normals)
     if up is not None:
         level = normals @ up >= math.cos(max_tilt + 1e-9)
@@ -299,13 +301,6 @@ def fit_plane(
     if up is not None and normal @ up < math.cos(max_tilt + 1e-9):
         return None
     return SupportPlane(normal=tuple(normal.tolist()), offset=offset)
-
-
-def _toward(seen: Seen, origin: Float64, up: Float64 | None) -> Float64:
-    """Directions (T, 3) that normals should point toward: the camera, else up, else +z."""
-    if seen.viewpoint is not None:
-        return np.asarray(seen.viewpoint - origin)
-    return np.broadcast_to(np.array([0.0, 0.0, 1.0]) if up is None else up, origin.shape)
 
 
 def measured(seen: Seen, plane: SupportPlane, least: float, whole: bool) -> Support:
