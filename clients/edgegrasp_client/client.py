@@ -15,10 +15,11 @@ from collections.abc import (
     Iterator,
 )
 from concurrent.futures import CancelledError, Future
+from contextlib import AbstractAsyncContextManager, AbstractContextManager
 from functools import partial, wraps
 from typing import Any, Concatenate, ParamSpec
 
-from typing_extensions import Self, Unpack
+from typing_extensions import Unpack
 
 from edgegrasp_camera.arrays import Array
 from edgegrasp_client.connection import (
@@ -52,7 +53,7 @@ _STARTING = threading.Lock()
 _ASKED_OVER_GRPC: set[int] = set()  # this process and its ancestors
 
 
-class AsyncGraspClient:
+class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
     """Client of one server; use it as an async context manager, or close it.
 
     Its methods raise GraspClientErrors: see edgegrasp_client.errors.
@@ -182,9 +183,6 @@ class AsyncGraspClient:
         self._retry, self._closed = False, True
         await self._transport.close()
 
-    async def __aenter__(self) -> Self:
-        return self
-
     async def __aexit__(self, *_: object) -> None:
         await self.close()
 
@@ -239,7 +237,7 @@ def _waiting(
     return call
 
 
-class GraspClient:
+class GraspClient(AbstractContextManager["GraspClient"]):
     """Client of one server; use it as a context manager, or close it. Thread-safe.
 
     Arguments and methods are those of `AsyncGraspClient`.
@@ -288,9 +286,6 @@ class GraspClient:
                 yield answer
         finally:  # not awaited, since the garbage collector may call this in the loop's own thread
             asyncio.run_coroutine_threadsafe(answers.aclose(), _loop())
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -4,9 +4,10 @@ import base64
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from html import escape
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from edgegrasp_camera.picture import draw_grasps
 from edgegrasp_sim.camera import Observation
@@ -31,7 +32,7 @@ img { max-width: 100%; margin: 1.2em 0; }
 Row = Sequence[object]
 
 
-class Replay:
+class Replay(AbstractContextManager["Replay"]):
     """The recorded rounds of a folder, to repeat; raises FileNotFoundError or ValueError."""
 
     def __init__(self, folder: ResultFolder, objects: Path | None = None) -> None:
@@ -55,9 +56,6 @@ class Replay:
             gripper=run.get("gripper"),
             min_opening=self.protocol.round.min_opening,
         )
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.simulation.close()

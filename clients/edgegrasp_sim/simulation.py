@@ -1,9 +1,10 @@
 """Clutter removal in simulation: make a scene, look at it, grasp in it."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -63,7 +64,7 @@ class ObjectPlacement:
     quaternion_xyzw: tuple[float, float, float, float]  # orientation in the world
 
 
-class ClutterSimulation:
+class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
     """Objects, a camera and a hand; equal calls after equal seeds give equal results."""
 
     def __init__(
@@ -86,9 +87,6 @@ class ClutterSimulation:
         self._obstacles: frozenset[int] = frozenset()
         self._gripper: Gripper | None = None
         self._rest_state: Any = None
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
