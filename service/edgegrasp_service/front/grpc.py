@@ -130,8 +130,8 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
             "DetectGrasps": partial(self._answer, "DetectGrasps"),
             "ScoreGrasps": partial(self._answer, "ScoreGrasps"),
             "DetectGraspsStream": self._stream,
-            "ListModels": self._list_models,
-            "ListRobots": self._list_robots,
+            "ListModels": partial(self._list, "models"),
+            "ListRobots": partial(self._list, "robots"),
             "ReloadModels": self._reload_models,
         }
         # By path: what a method is called in metrics and the log, and what it does.
@@ -257,13 +257,9 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
                 if task is not None:
                     task.cancel()
 
-    async def _list_models(self, call: Call, context: Any) -> None:
-        models = [grasp_pb2.Model(**facts) for facts in self._service.loaded().models]
-        await context.write(grasp_pb2.ListModelsResponse(models=models))
-
-    async def _list_robots(self, call: Call, context: Any) -> None:
-        robots = [grasp_pb2.Robot(**facts) for facts in self._service.loaded().robots]
-        await context.write(grasp_pb2.ListRobotsResponse(robots=robots))
+    async def _list(self, name: str, call: Call, context: Any) -> None:
+        response = getattr(grasp_pb2, f"List{name.capitalize()}Response")
+        await context.write(response(**{name: getattr(self._service.loaded(), name)}))
 
     async def _reload_models(self, call: Call, context: Any) -> None:
         models = [grasp_pb2.Model(**facts) for facts in await self._service.reload(call)]

@@ -10,6 +10,7 @@ import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -185,11 +186,8 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
     """The routes. Starlette alone: the document is written by hand, and bodies are for workers."""
     settings = service.settings
 
-    async def list_models(request: Request) -> Response:
-        return JSONResponse({"models": service.loaded().models})
-
-    async def list_robots(request: Request) -> Response:
-        return JSONResponse({"robots": service.loaded().robots})
+    async def listed(name: str, request: Request) -> Response:
+        return JSONResponse({name: getattr(service.loaded(), name)})
 
     async def reload(request: Request) -> Response:
         return JSONResponse({"models": await service.reload(request.scope["call"])})
@@ -213,8 +211,8 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
     work = [path for path in WORK if path != "/v1/outcomes" or settings.outcomes_file is not None]
     routes: list[BaseRoute] = [
         *(Route(path, _Work(service, WORK[path]), methods=["POST"]) for path in work),
-        Route("/v1/models", list_models),
-        Route("/v1/robots", list_robots),
+        Route("/v1/models", partial(listed, "models")),
+        Route("/v1/robots", partial(listed, "robots")),
         Route("/v1/models:reload", reload, methods=["POST"]),
         Route("/health/live", JSONResponse({"status": "live"}), methods=["GET"]),
         Route("/health/ready", ready),
