@@ -84,14 +84,6 @@ def _missing(name: str, error: ModuleNotFoundError) -> str:
     return said if "pip install" in said else f"{said}. pip install 'edgegrasp[{extra}]'"
 
 
-def _print_version(asked: bool) -> None:
-    if asked:
-        from importlib.metadata import version
-
-        print(f"edgegrasp {version('edgegrasp')}")
-        raise typer.Exit
-
-
 app = typer.Typer(
     cls=LazyGroup,
     no_args_is_help=True,
@@ -104,19 +96,18 @@ for _name, (_, _, _text) in COMMANDS.items():
     app.command(_name, help=_text, cls=TyperCommand)(lambda: None)
 
 
-@app.callback(help="Grasp detection as a service: point clouds in, scored 6-DoF grasps out.")
+@app.callback(invoke_without_command=True)
 def _common(
     version: Annotated[
-        bool,
-        typer.Option(
-            "--version",
-            callback=_print_version,
-            is_eager=True,
-            help="Print the version, and stop.",
-        ),
+        bool, typer.Option("--version", help="Print the version, and stop.")
     ] = False,
 ) -> None:
-    """The flags of the program itself."""
+    """Grasp detection as a service: point clouds in, scored 6-DoF grasps out."""
+    if version:
+        from importlib.metadata import version as version_of
+
+        print(f"edgegrasp {version_of('edgegrasp')}")
+        raise typer.Exit
 
 
 def main() -> None:
