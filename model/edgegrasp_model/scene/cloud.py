@@ -1,6 +1,6 @@
 """From the caller's array to the small, clean cloud with normals that the network sees."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self, TypeVar, cast
 
 import numpy as np
@@ -47,17 +47,10 @@ class CheckedCloud:
     def take(self, kept: Bools | Int64) -> "CheckedCloud":
         """Some of the points, by mask (N,) or indices; `row` still refers to the cloud as sent."""
         place = np.flatnonzero(kept) if kept.dtype == np.bool_ else kept
-        return CheckedCloud(
-            self.points.take(place, axis=0),  # many times faster than indexing
-            self.row[place],
-            self.rows_sent,
-            None if self.normals is None else self.normals[place],
-            None if self.segment_ids is None else self.segment_ids[place],
-            None if self.view_ids is None else self.view_ids[place],
-            self.image_size,
-            self.step,
-            self.warnings,
-        )
+        beside = {name: getattr(self, name) for name in ("normals", "segment_ids", "view_ids")}
+        arrays = {name: array[place] for name, array in beside.items() if array is not None}
+        points = self.points.take(place, axis=0)  # many times faster than indexing
+        return replace(self, points=points, row=self.row[place], **arrays)
 
     def of_all_pixels(self, values: Int64) -> Int64:
         """Values (R,) of the rows sent, with those of the nearest kept pixel at pixels left out."""
