@@ -195,7 +195,7 @@ def load_scene(file: Path) -> RealScene:
     except InvalidRequest as error:
         raise ValueError(f"{file.name}: {error}") from None
     labels = checked.get("labels", "u", "an integer from 0 for each row", points.shape[:-1])
-    labels = np.where(np.isfinite(points).all(axis=-1), labels, 0)
+    labels = np.where(np.isfinite(points).all(axis=-1), labels, 0).ravel().astype(np.int64)
     if not (labels >= FIRST_OBJECT).any():
         checked.refuse("labels", "no label above 1", f"{FIRST_OBJECT} and up for the objects")
     rgb = arrays.get("rgb")
@@ -210,16 +210,8 @@ def load_scene(file: Path) -> RealScene:
     if camera is None:  # it is unknown, or could not have seen them
         seen = points[np.isfinite(points).all(axis=-1)].reshape(-1, 3)
         camera, rgb = View.of(seen, np.zeros(3), (0, -1, 0) if normal is None else normal), None
-    return RealScene(
-        file.stem,
-        request,
-        points.reshape(-1, 3),
-        labels.ravel().astype(np.int64),
-        normal,
-        offset,
-        camera,
-        rgb,
-    )
+    flat = points.reshape(-1, 3)
+    return RealScene(file.stem, request, flat, labels, normal, offset, camera, rgb)
 
 
 def judge(
