@@ -194,7 +194,9 @@ def load_scene(file: Path) -> RealScene:
         request, points = _cloud(checked)
     except InvalidRequest as error:
         raise ValueError(f"{file.name}: {error}") from None
-    labels = checked.get("labels", "u", "an integer from 0 for each row", points.shape[:-1])
+    labels = checked.get("labels", "iu", "an integer from 0 for each row", points.shape[:-1])
+    if labels.min(initial=0) < 0:
+        checked.refuse("labels", f"a label of {labels.min()}", "integers from 0")
     labels = np.where(np.isfinite(points).all(axis=-1), labels, 0).ravel().astype(np.int64)
     if not (labels >= FIRST_OBJECT).any():
         checked.refuse("labels", "no label above 1", f"{FIRST_OBJECT} and up for the objects")
