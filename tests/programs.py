@@ -4,7 +4,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 EDGEGRASP = (sys.executable, "-c", "from edgegrasp_cli.main import main; main()")
@@ -27,6 +27,9 @@ def started(*words: object, **more: Any) -> Iterator[subprocess.Popen[str]]:
             yield process
         finally:
             process.terminate()
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(30)
+            process.kill()  # one that does not heed it
 
 
 def free_ports(count: int) -> list[int]:
