@@ -123,7 +123,13 @@ def choose_support(
         around = np.inf if options.follows_only else BELOW_WORKSPACE * np.abs(request.normal)
         over = np.flatnonzero(inside_workspace(seen.points, options.workspace, around))
         some = over[thinned(len(over))]
-        whole = shown is not None and bool((shown.support > 0.5).mean() > CUT_OFF)
+        on = np.empty(0, np.int64) if shown is None else np.flatnonzero(shown.support > 0.5)
+        part = seen.points[on[thinned(len(on))]]
+        # The flat tops of objects, which are left where a support was cut off, are smaller.
+        whole = len(on) > CUT_OFF * len(seen.points) and bool(
+            _area(CanonicalFrame.of_scene(part, request.normal, None).points(part))
+            > LEAST_SCALED_AREA
+        )
         found = measured(Seen(seen.points[some], seen.viewpoint), request, GIVEN_MARGIN, whole)
     else:
         rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
