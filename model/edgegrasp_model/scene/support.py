@@ -125,11 +125,8 @@ def choose_support(
         some = over[thinned(len(over))]
         on = np.empty(0, np.int64) if shown is None else np.flatnonzero(shown.support > 0.5)
         part = seen.points[on[thinned(len(on))]]
-        # The flat tops of objects, which are left where a support was cut off, are smaller.
-        whole = len(on) > CUT_OFF * len(seen.points) and bool(
-            _area(CanonicalFrame.of_scene(part, request.normal, None).points(part))
-            > LEAST_SCALED_AREA
-        )
+        # Where a support was cut off, only flat tops may be classified as support.
+        whole = len(on) > CUT_OFF * len(seen.points) and _wide(part, request)
         found = measured(Seen(seen.points[some], seen.viewpoint), request, GIVEN_MARGIN, whole)
     else:
         rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
@@ -413,8 +410,13 @@ def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> floa
 def _covers(points: Floats, viewpoint: Float64, plane: SupportPlane, scale: float) -> bool:
     """Whether scaled points (N, 3) that lie in the plane cover more than an object's flat top."""
     scaled = viewpoint + scale * (points[thinned(len(points))] - viewpoint)
-    near = scaled[np.abs(plane.heights(scaled)) < NEAR]
-    return _area(CanonicalFrame.of_scene(near, plane.normal, None).points(near)) > LEAST_SCALED_AREA
+    return _wide(scaled[np.abs(plane.heights(scaled)) < NEAR], plane)
+
+
+def _wide(points: Floats, plane: SupportPlane) -> bool:
+    """Whether points (N, 3) cover more of a plane than an object's flat top."""
+    frame = CanonicalFrame.of_scene(points, plane.normal, None)
+    return _area(frame.points(points)) > LEAST_SCALED_AREA
 
 
 def _area(places: Float64) -> float:
