@@ -243,7 +243,8 @@ def run_rounds(
             below_gate(summary_of(facts["run"], []), asked.gate)
         if folder is not None:
             folder.open(facts)
-        finished = sum(folder.has(*task) for task in tasks) if folder is not None else 0
+        kept = folder.rounds() if folder is not None else []
+        finished = sum((done.seed, done.index) in tasks for done in kept)
         with Progress(*Progress.get_default_columns(), TimeElapsedColumn()) as progress:
             bar = progress.add_task(scene, total=len(tasks), completed=finished)
 

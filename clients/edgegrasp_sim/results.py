@@ -59,11 +59,8 @@ class ResultFolder:
 
     def add(self, done: Round) -> None:
         """Keep a finished round."""
-        _write(self._file(done.seed, done.index), json.dumps(asdict(done)) + "\n")
-
-    def has(self, seed: int, index: int) -> bool:
-        """Whether a round is finished."""
-        return self._file(seed, index).is_file()
+        file = self.path / "rounds" / f"{done.seed}-{done.index}.json"
+        _write(file, json.dumps(asdict(done)) + "\n")
 
     def rounds(self) -> list[Round]:
         """The finished rounds, by seed and index; raises FileNotFoundError without a benchmark."""
@@ -93,9 +90,6 @@ class ResultFolder:
                     pose = {"T_world_hand": json.dumps(attempt.T_world_hand)}
                     table.writerow(where | asdict(attempt) | pose)
         return summary
-
-    def _file(self, seed: int, index: int) -> Path:
-        return self.path / "rounds" / f"{seed}-{index}.json"
 
 
 def summary_of(run: dict[str, Any], rounds: Sequence[Round]) -> dict[str, Any]:
