@@ -5,8 +5,7 @@ import pytest
 
 from edgegrasp_model.detector import ModelCatalogue
 
-from .clouds import CASES
-from .make import GRASP_FIELDS, Record, answer, load, record
+from .make import CASES, GRASP_FIELDS, Record, answer, load, record
 
 CLOSE = 1e-5  # of scores, metres and matrix entries: another processor rounds otherwise
 TIED = 2e-5  # scores that differ by less may change places
