@@ -44,10 +44,7 @@ def choose_engine(asked: str | None = None, protocol: str = "") -> str:
 
 def installed(engine: str) -> bool:
     """Whether an engine can be used here."""
-    try:
-        return importlib.util.find_spec(engine) is not None
-    except ValueError:  # something stands in its place
-        return False
+    return importlib.util.find_spec(engine) is not None
 
 
 def make_world(engine: str | None = None) -> "World":
