@@ -92,10 +92,11 @@ class PybulletWorld(World):
             uid = self.client.loadURDF(str(path), position, quaternion_xyzw, globalScaling=scale)
         except pybullet.error as error:
             raise ValueError(f"PyBullet cannot read {path}: {error}") from error
-        body = PybulletBody(self.client, uid)
         # A given mass also makes the engine compute the inertia from the collision shape.
-        body.change(-1, lateralFriction=engine.OBJECT_FRICTION, mass=engine.OBJECT_MASS)
-        return body
+        self.client.changeDynamics(
+            uid, -1, lateralFriction=engine.OBJECT_FRICTION, mass=engine.OBJECT_MASS
+        )
+        return PybulletBody(self.client, uid)
 
     def add_box(
         self, size: Vector, centre: Vector, *, friction: float, yaw: float = 0.0
@@ -104,9 +105,8 @@ class PybulletWorld(World):
             pybullet.GEOM_BOX, halfExtents=[0.5 * extent for extent in size]
         )
         uid = self.client.createMultiBody(0.0, shape, -1, centre, about_z(yaw))
-        body = PybulletBody(self.client, uid)
-        body.change(-1, lateralFriction=friction)
-        return body
+        self.client.changeDynamics(uid, -1, lateralFriction=friction)
+        return PybulletBody(self.client, uid)
 
     def add_hand(self, model: HandModel, position: Matrix) -> "PybulletHand":
         self._hand = PybulletHand(self.client, model, position)
@@ -159,10 +159,6 @@ class PybulletBody(Body):
     def __init__(self, client: _Client, uid: int) -> None:
         self.client = client
         self.uid = uid
-
-    def change(self, link: int, **dynamics: float) -> None:
-        """Set properties of a link, -1 the base, by the engine's names for them."""
-        self.client.changeDynamics(self.uid, link, **dynamics)
 
     def remove(self) -> None:
         self.client.removeBody(self.uid)
@@ -225,9 +221,10 @@ class PybulletHand(PybulletBody, Hand):
         )
         super().__init__(client, int(uid))
         self._fingers = ahead, ahead + 1
-        self.change(-1, lateralFriction=model.friction, mass=model.mass)
+        client.changeDynamics(self.uid, -1, lateralFriction=model.friction, mass=model.mass)
         for finger in self._fingers:
-            self.change(
+            client.changeDynamics(
+                self.uid,
                 finger,
                 lateralFriction=model.finger_friction,
                 spinningFriction=FINGER_SPINNING_FRICTION,
