@@ -21,6 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.checks import bounded_memory
 from tests.cloud_files import npy, npz, pcd, ply, png, point_cloud2, xyz
+from tests.many_options import MANY
 from tests.programs import run
 from tests.service.worker.conftest import ask as ask_worker
 from tests.service.worker.conftest import check_problem, form, part
@@ -143,14 +144,8 @@ MESSAGES = [
 ]
 
 
-OPTIONS = {
-    "seed": 1, "up": [0.0, 0.0, 1.0], "viewpoint": [[0, 0, 1], [1, 0, 1]], "gripper": "panda",
-    "workspace": {"min": [-1, -1, -1], "max": [1, 1, 1]}, "collision": {"margin": 0.01},
-    "approach_region": {"include": [{"kind": "box", "min": [0, 0, 0], "max": [1, 1, 1]}]},
-    "contact_region": {"exclude": [{"kind": "segments", "ids": [1]}, {"kind": "mask", "mask": []}]},
-    "approach_direction": {"cones": [{"direction": [0, 0, -1], "max_angle": 1.0}]},
-    "support": {"kind": "ransac", "distance": 0.01}, "suppression": None, "sampling": "uniform",
-}  # fmt: skip
+MASK = {"kind": "mask", "mask": []}
+OPTIONS = MANY | {"suppression": None, "contact_region": {"exclude": [MASK]}}
 
 
 FORM = form(
