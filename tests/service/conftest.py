@@ -17,6 +17,7 @@ import pytest
 from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_client import AsyncGraspClient
 from edgegrasp_service.errors import STATUS, kind_of
 from edgegrasp_service.observability import Call
 from edgegrasp_service.server import Server
@@ -168,7 +169,7 @@ class Running:
     calls: list[Call]  # that have ended, and had to do with grasps
     stop: asyncio.Event
     serving: "asyncio.Task[None]"
-    clients: list[Grpc | Rest] = dataclasses.field(default_factory=list)
+    clients: list[Grpc | Rest | AsyncGraspClient] = dataclasses.field(default_factory=list)
 
     @property
     def ended(self) -> list[str]:
@@ -208,6 +209,11 @@ class Running:
     def stub(self) -> Any:
         """The calls of the service, until the test ends."""
         return self.connect("grpc").stub
+
+    def ours(self, transport: str, **given: Any) -> AsyncGraspClient:
+        """The client that ships, until the test ends."""
+        self.clients.append(AsyncGraspClient(self.address(transport), **given))
+        return self.clients[-1]
 
     def address(self, transport: str) -> str:
         return self.server.grpc_address if transport == "grpc" else self.server.http_url

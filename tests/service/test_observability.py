@@ -17,7 +17,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_client import AsyncGraspClient, GraspClient, StreamRequest
+from edgegrasp_client import GraspClient, StreamRequest
 from edgegrasp_service.observability import JsonFormatter, LogQueue
 
 from .conftest import ADMIN, USER, WRONG
@@ -63,12 +63,12 @@ async def test_json_lines_name_requests_and_no_secrets(serve, cloud, caplog) -> 
     caplog.set_level(logging.DEBUG, logger="edgegrasp_service")
     running = await serve(tokens=[f"arm-1:{USER}"], admin_tokens=[ADMIN])
     for transport in ("rest", "grpc"):
-        async with AsyncGraspClient(running.address(transport), token=USER) as client:
-            await client.ready()
-            await client.detect(cloud)
+        client = running.ours(transport, token=USER)
+        await client.ready()
+        await client.detect(cloud)
         for token in (ADMIN, WRONG):
-            async with AsyncGraspClient(running.address(transport), token=token) as client:
-                await asyncio.gather(client.models(), return_exceptions=True)
+            listing = running.ours(transport, token=token).models()
+            await asyncio.gather(listing, return_exceptions=True)
     await running.until(lambda: len(running.calls) == 2)
     ours = [record for record in caplog.records if record.name.startswith("edgegrasp")]
     lines = [json.loads(JsonFormatter().format(record)) for record in ours]
@@ -158,12 +158,12 @@ def requests_total(found: dict[Any, float]) -> dict[tuple[str, str, str], float]
 
 async def test_requests_are_counted_on_both_transports(running, cloud: np.ndarray) -> None:
     for transport in ("grpc", "rest"):
-        async with AsyncGraspClient(running.address(transport)) as client:
-            await client.detect(cloud)
-            await client.score(cloud, edges=np.array([[0, 1]]))
-            await client.models()
-            with pytest.raises(Exception, match="points"):
-                await client.detect(cloud[:0])
+        client = running.ours(transport)
+        await client.detect(cloud)
+        await client.score(cloud, edges=np.array([[0, 1]]))
+        await client.models()
+        with pytest.raises(Exception, match="points"):
+            await client.detect(cloud[:0])
     found = await read(running)
     total = requests_total(found)
     for transport, fine, bad in (("grpc", "OK", "INVALID_ARGUMENT"), ("http", "200", "400")):
@@ -188,9 +188,8 @@ async def test_requests_are_counted_on_both_transports(running, cloud: np.ndarra
 
 
 async def test_streams_are_counted_by_result(running, cloud: np.ndarray) -> None:
-    async with AsyncGraspClient(running.address("grpc")) as client:
-        requests = [StreamRequest(points) for points in (cloud, cloud[:0], cloud)]
-        answers = [answer async for answer in client.detect_stream(requests)]
+    requests = [StreamRequest(points) for points in (cloud, cloud[:0], cloud)]
+    answers = [answer async for answer in running.ours("grpc").detect_stream(requests)]
     assert len(answers) == 3
     found = await read(running)
     assert found["edgegrasp_stream_results_total", (("code", "OK"),)] == 2.0
@@ -222,9 +221,9 @@ async def test_hostile_callers_add_no_labels(running, cloud: np.ndarray) -> None
 
 
 async def test_the_dashboard_names_metrics_that_exist(serve, cloud: np.ndarray) -> None:
-    server = (await serve(admin_tokens=[ADMIN])).server
-    async with AsyncGraspClient(server.http_url) as client:
-        await client.detect(cloud)
+    running = await serve(admin_tokens=[ADMIN])
+    await running.ours("rest").detect(cloud)
+    server = running.server
     server.metrics.watch("log_lines_dropped", "as `edgegrasp serve` adds it", lambda: 0)
     page = server.metrics.page("")[0].decode()
     kinds = [line.split()[2:] for line in page.splitlines() if line.startswith("# TYPE ")]

@@ -21,16 +21,15 @@ from .conftest import ADMIN, USER
 NEW = "new-token-0123456789"
 
 
-async def digest(server: Any) -> str:
-    async with AsyncGraspClient(server.http_url) as client:
-        return (await client.models())[0].digest
+async def digest(running: Any) -> str:
+    return (await running.ours("rest").models())[0].digest
 
 
 async def test_a_reload_changes_the_digest(serve, transport: str) -> None:
     running = await serve(admin_tokens=[ADMIN])
-    assert await digest(running.server) == "1"
+    assert await digest(running) == "1"
     assert (await running.connect(transport).reload(ADMIN)).digest == "2"
-    assert await digest(running.server) == "2"
+    assert await digest(running) == "2"
     page = running.metrics()
     assert 'edgegrasp_reloads_total{outcome="succeeded"} 1.0' in page
     assert (
@@ -49,9 +48,8 @@ async def test_bad_weights_leave_the_old_ones(serve, transport: str, cloud: np.n
     running.stages.mend("weights")
     running.stages.fail("load", "kill")  # as where there is no memory for both
     assert (await admin.reload(ADMIN)).kind == "reload-failed"
-    assert await digest(running.server) == "1"
-    async with AsyncGraspClient(running.server.grpc_address) as client:
-        assert len((await client.detect(cloud)).grasps) == 10
+    assert await digest(running) == "1"
+    assert len((await running.ours("grpc").detect(cloud)).grasps) == 10
     assert 'edgegrasp_reloads_total{outcome="failed"} 2.0' in running.metrics()
     assert (await admin.reload(ADMIN)).digest == "3"
 
@@ -77,28 +75,24 @@ async def test_no_spelling_of_the_address_comes_around_the_token(serve) -> None:
 
 async def test_answers_keep_coming_while_weights_load(serve, transport, cloud) -> None:
     running = await serve(admin_tokens=[ADMIN])
-    server = running.server
-    async with (
-        AsyncGraspClient(server.grpc_address) as by_grpc,
-        AsyncGraspClient(server.http_url) as by_http,
-    ):
-        running.stages.shut("load")
-        reload = asyncio.create_task(running.connect(transport).reload(ADMIN))
-        for client in (by_grpc, by_http) * 5:
+    by_grpc, by_http = running.ours("grpc"), running.ours("rest")
+    running.stages.shut("load")
+    reload = asyncio.create_task(running.connect(transport).reload(ADMIN))
+    for client in (by_grpc, by_http) * 5:
+        assert len((await client.detect(cloud)).grasps) == 10
+    assert not reload.done()
+
+    async def ask(client: AsyncGraspClient) -> int:
+        count = 0
+        while not reload.done():
             assert len((await client.detect(cloud)).grasps) == 10
-        assert not reload.done()
+            count += 1
+        return count
 
-        async def ask(client: AsyncGraspClient) -> int:
-            count = 0
-            while not reload.done():
-                assert len((await client.detect(cloud)).grasps) == 10
-                count += 1
-            return count
-
-        asking = asyncio.gather(ask(by_grpc), ask(by_http), ask(by_grpc))
-        running.stages.open("load")
-        assert (await reload).digest == "2"
-        assert sum(await asking) >= 3
+    asking = asyncio.gather(ask(by_grpc), ask(by_http), ask(by_grpc))
+    running.stages.open("load")
+    assert (await reload).digest == "2"
+    assert sum(await asking) >= 3
 
 
 async def test_one_reload_at_a_time(serve) -> None:
@@ -110,7 +104,7 @@ async def test_one_reload_at_a_time(serve) -> None:
     running.stages.open("load")
     kinds = sorted([(await reload).kind for reload in reloads])
     assert kinds == ["", "reload-failed", "reload-failed", "reload-failed"]
-    assert await digest(running.server) == "2"
+    assert await digest(running) == "2"
 
 
 async def test_what_was_begun_with_the_old_weights_ends_with_them(serve, cloud) -> None:
@@ -127,20 +121,17 @@ async def test_tokens_are_read_anew(serve, tmp_path: Path, transport: str) -> No
     file = tmp_path / "tokens"
     file.write_text(USER)
     running = await serve(token_file=file, admin_tokens=[ADMIN])
-    admin, address = running.connect(transport), running.address(transport)
+    admin = running.connect(transport)
     file.write_text("short")
     reply = await admin.reload(ADMIN)
     assert reply.kind == "reload-failed"
     assert "token_file" in reply.detail
-    async with AsyncGraspClient(address, token=USER) as client:
-        await client.models()
+    await running.ours(transport, token=USER).models()
     file.write_text(NEW)
     assert (await admin.reload(ADMIN)).fine
-    async with AsyncGraspClient(address, token=NEW) as client:
-        await client.models()
-    async with AsyncGraspClient(address, token=USER) as client:
-        with pytest.raises(Exception, match="does not know"):
-            await client.models()
+    await running.ours(transport, token=NEW).models()
+    with pytest.raises(Exception, match="does not know"):
+        await running.ours(transport, token=USER).models()
 
 
 def test_sighup_swaps_real_weights_and_survives_truncated_ones(real_server, cloud) -> None:

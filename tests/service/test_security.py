@@ -37,9 +37,9 @@ async def refused(address: str, **security: Any) -> Exception:
 async def test_tls(serve, server_tls, pem, transport: str, cloud: np.ndarray) -> None:
     running = await serve(**server_tls)
     address = running.address(transport)
-    async with AsyncGraspClient(address, tls=Tls(ca=pem["ca"])) as client:
-        assert await client.ready()
-        assert len((await client.detect(cloud)).grasps) == 10
+    client = running.ours(transport, tls=Tls(ca=pem["ca"]))
+    assert await client.ready()
+    assert len((await client.detect(cloud)).grasps) == 10
     by_other = await refused(address, tls=Tls(ca=pem["other_ca"]))
     plain = await refused(address.replace("https", "http"))
     assert {type(by_other), type(plain)} == {ServerUnavailableError}
@@ -60,20 +60,19 @@ async def test_certificates_are_read_anew(serve, pem, transport, cloud, tmp_path
     given = {"tls_certificate": files["server"], "tls_key": files["server_key"]}
     running = await serve(**given, tls_client_ca=files["ca"])
     address = running.address(transport)
-    async with AsyncGraspClient(address, tls=tls("", "")) as before:
-        assert await before.models()
-        put("other_")
-        await running.server.service.reload()
-        async with AsyncGraspClient(address, tls=tls("other_", "other_")) as after:
-            assert len((await after.detect(cloud)).grasps) == 10
-        assert len((await before.detect(cloud)).grasps) == 10
+    before = running.ours(transport, tls=tls("", ""))
+    assert await before.models()
+    put("other_")
+    await running.server.service.reload()
+    after = running.ours(transport, tls=tls("other_", "other_"))
+    for client in (after, before):
+        assert len((await client.detect(cloud)).grasps) == 10
     for stranger in (tls("", ""), tls("other_", ""), Tls(ca=pem["other_ca"])):
         assert isinstance(await refused(address, tls=stranger), ServerUnavailableError)
     files["server_key"].write_text("half a k")
     with pytest.raises(ReloadFailed, match="cannot be read as a certificate with its key"):
         await running.server.service.reload()
-    async with AsyncGraspClient(address, tls=tls("other_", "other_")) as still:
-        assert await still.models()
+    assert await running.ours(transport, tls=tls("other_", "other_")).models()
 
 
 @pytest.mark.parametrize(
@@ -97,8 +96,7 @@ async def test_tokens(serve, transport: str, cloud: np.ndarray) -> None:
     running = await serve(tokens=[USER], admin_tokens=[ADMIN])
     address = running.address(transport)
     for token in (USER, ADMIN):
-        async with AsyncGraspClient(address, token=token) as client:
-            assert len((await client.detect(cloud)).grasps) == 10
+        assert len((await running.ours(transport, token=token).detect(cloud)).grasps) == 10
     for token in (None, WRONG, USER[:-1]):
         error = await refused(address, token=token)
         assert isinstance(error, AccessDeniedError)
