@@ -67,8 +67,13 @@ def main() -> None:
         for _, clients, name in itertools.product(range(given.rounds), given.clients, servers):
             processes = min(PROCESSES, clients)
             start = time.monotonic() + START_SECONDS
-            what = servers[name], clients // processes, start, given.seconds, given.points
-            shares = [pool.submit(run_clients, *what, seed) for seed in range(processes)]
+            what = start, given.seconds, given.points
+            shares = [
+                pool.submit(
+                    run_clients, servers[name], len(range(k, clients, processes)), *what, seed=k
+                )
+                for k in range(processes)
+            ]
             samples = [sample for share in shares for sample in share.result()]
             runs.setdefault((clients, name), []).append(samples)
     for (clients, name), found in runs.items():

@@ -224,7 +224,7 @@ class Scored(NamedTuple):
 
 
 def score_views(paths: list[Path], weights: list[Path]) -> Scored:
-    """Score the labelled grasps of views; raises ValueError unless all are hand networks."""
+    """Score the labelled grasps of views; ValueError: there are none, or other networks."""
     networks = [load_checkpoint(path) for path in weights]
     if any(metadata.network.architecture != "hand" for _, metadata in networks):
         raise ValueError("weights: hand networks are compared, such as edgegrasp-plus. Name those.")
@@ -244,6 +244,8 @@ def score_views(paths: list[Path], weights: list[Path]) -> Scored:
         hidden = (description[:, BEYOND] > HIDDEN).any(dim=1).numpy()
         kind = np.full(len(hidden), scene_of(path).split("_")[0])
         parts.append(Scored(kind, hidden, packed.label.numpy() > 0.5, np.stack(logits)))
+    if not parts:
+        raise ValueError("data: no grasp of these views was tried. Send others.")
     return Scored(*(np.concatenate(column, axis=-1) for column in zip(*parts, strict=True)))
 
 
