@@ -122,6 +122,11 @@ class HttpMiddleware:
                     if arriving or self._service.stopping.is_set():
                         extra.append((b"connection", b"close"))
                     message = {**message, "headers": [*message.get("headers", []), *extra]}
+                else:  # in pieces: it returns once the client has taken most of it
+                    body, message = message["body"], {**message, "body": b""}
+                    for place in range(0, len(body), PIECE):
+                        piece = body[place : place + PIECE]
+                        await send({**message, "body": piece, "more_body": True})
                 await send(message)
 
             # With an app in the scope, the router raises HTTPException for an unknown path.
@@ -238,23 +243,10 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
     return Router(routes, redirect_slashes=False)
 
 
-class _SlowResponse(Response):
-    """A response that is sent as the client takes it."""
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send it; returns once the client has taken most of it."""
-        start = {"type": "http.response.start", "status": self.status_code}
-        await send({**start, "headers": self.raw_headers})
-        for place in range(0, len(self.body), PIECE):
-            piece = self.body[place : place + PIECE]
-            await send({"type": "http.response.body", "body": piece, "more_body": True})
-        await send({"type": "http.response.body"})
-
-
 def _file(path: str, file: Path) -> Route:
     """A route to a file, read once at the start: reading in threads would delay other requests."""
     kind, _ = mimetypes.guess_type(file.name)
-    return Route(path, _SlowResponse(file.read_bytes(), media_type=kind), methods=["GET"])
+    return Route(path, Response(file.read_bytes(), media_type=kind), methods=["GET"])
 
 
 def _files(path: str, folder: Path) -> list[Route]:
@@ -299,7 +291,7 @@ class _Work:
             finally:
                 leaving.cancel()
                 answering.cancel()
-            response: Response = _SlowResponse(answer.body, media_type="application/json")
+            response = Response(answer.body, media_type="application/json")
             if answer.error is not None:
                 response = _problem_response(call, answer.error)
             sending = response(scope, receive, send)
