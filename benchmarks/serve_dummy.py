@@ -10,13 +10,13 @@ from pathlib import Path
 
 def main() -> None:
     """Run `edgegrasp` with the dummy detector; given settings as JSON, run its nursery instead."""
-    from edgegrasp_service.worker import pool, process
+    from edgegrasp_service.worker import process
 
     if sys.argv[1].startswith("{"):
         dummy = runpy.run_path(str(Path(__file__).with_name("dummy.py")))
         process.main(sys.argv[1], lambda settings: dummy["DummyCatalogue"]())
         return
-    pool.NURSERY = (sys.executable, "-P", __file__)
+    process.NURSERY = (sys.executable, "-P", __file__)
     from edgegrasp_cli.main import main
 
     main()

@@ -42,7 +42,7 @@ def serve(
     if print_config:
         print(loaded.model_dump_json(indent=2))
         return
-    from edgegrasp_service.worker.pool import launch
+    from edgegrasp_service.worker.process import launch
 
     nursery, control = launch(loaded)  # it loads while this process imports the rest
     try:

@@ -25,8 +25,7 @@ from edgegrasp_service.observability import LogQueue, Metrics, start_logging, wr
 from edgegrasp_service.recording import check_outcomes
 from edgegrasp_service.security import Tokens
 from edgegrasp_service.settings import UNIX, Settings
-from edgegrasp_service.worker.pool import Launched, WorkerPool
-from edgegrasp_service.worker.process import PIECE
+from edgegrasp_service.worker.process import PIECE, Launched, WorkerPool
 
 logger = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from edgegrasp_service.errors import STATUS, kind_of
 from edgegrasp_service.observability import Call
 from edgegrasp_service.server import Server
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.pool import ONE_THREAD
+from edgegrasp_service.worker.process import ONE_THREAD
 
 PATIENCE = 30  # seconds; longer than anything takes
 USER = "user-token-0123456789"

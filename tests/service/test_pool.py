@@ -57,7 +57,7 @@ async def test_a_request_that_workers_die_of_is_not_tried_again(running, transpo
 async def test_a_request_cancelled_as_it_is_answered_leaves_its_worker_to_the_next(
     running, cloud, monkeypatch
 ) -> None:
-    monkeypatch.setattr("edgegrasp_service.worker.pool.KILL_SECONDS", 0.0)
+    monkeypatch.setattr("edgegrasp_service.worker.process.KILL_SECONDS", 0.0)
     pool = running.server.pool
     message = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes()).SerializeToString()
     deadline = asyncio.get_running_loop().time() + 60.0
@@ -75,7 +75,7 @@ async def test_a_request_cancelled_as_it_is_answered_leaves_its_worker_to_the_ne
 
 
 async def test_a_nursery_that_is_stopped_is_replaced(running, cloud, monkeypatch) -> None:
-    monkeypatch.setattr("edgegrasp_service.worker.pool.START_SECONDS", 1.0)
+    monkeypatch.setattr("edgegrasp_service.worker.process.START_SECONDS", 1.0)
     pool, client = running.server.pool, running.connect("rest")
     nursery = pool._nursery.pid
     os.kill(nursery, signal.SIGSTOP)
@@ -88,7 +88,7 @@ async def test_a_nursery_that_is_stopped_is_replaced(running, cloud, monkeypatch
 
 async def test_a_worker_that_is_stopped_is_replaced(serve, monkeypatch) -> None:
     for name, seconds in (("BEAT", 0.2), ("PULSE", 1.0)):
-        monkeypatch.setattr(f"edgegrasp_service.worker.pool.{name}_SECONDS", seconds)
+        monkeypatch.setattr(f"edgegrasp_service.worker.process.{name}_SECONDS", seconds)
     running = await serve()
     (before,) = running.server.pool.pids
     os.kill(before, signal.SIGSTOP)

@@ -34,8 +34,14 @@ from edgegrasp_service.observability import CALL, Call, Metrics, log_call
 from edgegrasp_service.recording import Recorder
 from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.pool import CRASH_FIX, CRASHED, WORKER_LOST, WorkerPool
-from edgegrasp_service.worker.process import Answer, Job
+from edgegrasp_service.worker.process import (
+    CRASH_FIX,
+    CRASHED,
+    WORKER_LOST,
+    Answer,
+    Job,
+    WorkerPool,
+)
 
 logger = logging.getLogger(__name__)
 

@@ -1,38 +1,71 @@
-"""Worker processes: their messages with the front, the workers, and the nursery they fork from.
+"""Worker processes: the front's pool of them, their messages, and the nursery they fork from.
 
 usage: python -m edgegrasp_service.worker.process SETTINGS    as JSON; standard input: the pool's
 socket
 
-`main` runs the nursery. It imports and loads what a worker needs, then forks a worker whenever the
-pool asks for one; that takes milliseconds, and memory is shared until written to. The nursery never
-has a second thread. A message has plain values as JSON, and a body as bytes.
+`WorkerPool` runs jobs, replaces dead processes and reloads. `main` runs the nursery. It imports and
+loads what a worker needs, then forks a worker whenever the pool asks for one; that takes
+milliseconds, and memory is shared until written to. The nursery never has a second thread. A
+message has plain values as JSON, and a body as bytes.
 """
 
+import asyncio
 import contextlib
 import gc
 import json
+import logging
 import os
 import resource
 import signal
 import socket
 import struct
+import subprocess
 import sys
+import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections import defaultdict
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Any, BinaryIO, Literal, TypeAlias
 
 from edgegrasp_model.errors import EdgeGraspError
-from edgegrasp_service.errors import Problem, WorkerLost, report
+from edgegrasp_service.errors import (
+    HarmfulRequest,
+    InvalidSettings,
+    Problem,
+    WorkerLost,
+    kind_of,
+    report,
+)
 from edgegrasp_service.settings import Settings
+
+# -P: nothing is imported from the folder the server was started in.
+NURSERY = (sys.executable, "-P", "-m", "edgegrasp_service.worker.process")
+ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+# Freed memory is kept for the next request: the system hands out new pages slowly.
+KEPT_MEMORY = {"MALLOC_TRIM_THRESHOLD_": str(2**26), "MALLOC_MMAP_THRESHOLD_": str(2**24)}
+
+WORKER_LOST = kind_of(WorkerLost)
+CRASHES = {signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL}
+CRASHED = "one that ended the process that worked on it"
+CRASH_FIX = "Send another cloud or other options; this request is refused for 10 minutes."
+STATUS_SECONDS = 1.0  # seconds to learn how a worker ended
+START_SECONDS = 20.0  # seconds for a worker to fork, if it need not load
+BEAT_SECONDS = 3.0  # seconds between two checks that a worker is alive
+PULSE_SECONDS = 10.0  # seconds for it to answer
+ALIVE_SECONDS = 15.0  # seconds since the latest answer of any worker
+KILL_SECONDS = 0.5  # seconds that a worker may use to finish an abandoned job
+RETRY_SECONDS = 1.0  # seconds after a worker or the nursery failed to start
 
 ORPHAN_SECONDS = 10.0  # seconds after its deadline at which a worker ends itself if nobody kills it
 ENDED = struct.Struct("=ii")  # the nursery's message about a worker: process id and wait status
 LOST = "The worker of this request died or ran out of memory. Try again, or send fewer points."
 HEADER = struct.Struct(">QQ")  # bytes of a message's JSON, and of the body that follows it
 PIECE = 2**16  # bytes of a body that the front reads or writes at a time
+
+logger = logging.getLogger(__name__)
 
 Method = Literal["DetectGrasps", "ScoreGrasps", "RecordOutcome", "Beat"]  # Beat: is it alive?
 Transport = Literal["http", "grpc"]
@@ -112,6 +145,338 @@ def receive(file: BinaryIO) -> Any:
         return None
     length, body_length = HEADER.unpack(head)
     return unpack(file.read(length), file.read(body_length))
+
+
+# The pool
+
+Launched: TypeAlias = tuple[subprocess.Popen[bytes], socket.socket]  # and the socket to it
+
+
+def launch(settings: Settings, command: Sequence[str] = ()) -> Launched:
+    """Start the nursery, which loads meanwhile; `command` replaces NURSERY."""
+    control, theirs = socket.socketpair()
+    with theirs:
+        environment = KEPT_MEMORY | os.environ | dict.fromkeys(ONE_THREAD, "1")
+        command = [*(command or NURSERY), settings.model_dump_json()]
+        return subprocess.Popen(command, stdin=theirs.fileno(), env=environment), control
+
+
+class WorkerPool:
+    """Runs each job in a worker process of its own."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        nursery: Sequence[str] = (),
+        replaced: Callable[[], None] = lambda: None,
+        launched: Launched | None = None,
+    ) -> None:
+        self._settings = settings
+        self._nursery_command = nursery
+        self._replaced = replaced
+        self._launched = launched
+        self.models: list[dict[str, Any]] = []  # facts of loaded weights; empty before `start`
+        self.robots: list[dict[str, Any]] = []
+        self.size = settings.workers or len(os.sched_getaffinity(0))
+        self._nursery: _Nursery | None = None
+        self._workers: set[_Worker] = set()
+        # Last in, first out: its caches are warm.
+        self._idle: asyncio.LifoQueue[_Worker] = asyncio.LifoQueue()
+        self._tasks: set[asyncio.Task[Any]] = set()
+        self._answered = 0.0  # when a worker last answered
+
+    @property
+    def alive(self) -> bool:
+        """Whether a worker answered recently, or is busy, which a deadline limits."""
+        recent = time.monotonic() - self._answered < ALIVE_SECONDS
+        return bool(self._workers) and (self.busy > 0 or recent)
+
+    @property
+    def pids(self) -> list[int]:
+        """Process ids of the workers."""
+        return [worker.pid for worker in self._workers]
+
+    @property
+    def busy(self) -> int:
+        """Number of workers that have a request."""
+        return sum(worker.at_work for worker in self._workers)
+
+    async def start(self) -> None:
+        """Load weights and start workers; workers of an earlier start finish their request and end.
+
+        Raises:
+            EdgeGraspError: Weights cannot be used.
+        """
+        launched = self._launched or launch(self._settings, self._nursery_command)
+        self._launched = None
+        nursery = _Nursery(*launched)
+        workers = [_Worker(nursery) for _ in range(self.size)]
+        try:
+            await nursery.loaded()
+            await asyncio.gather(*(worker.start() for worker in workers))
+        except BaseException:
+            nursery.close()
+            for worker in workers:
+                worker.close()
+            raise
+        old_nursery, old_workers = self._nursery, self._workers
+        self._nursery, self._workers = nursery, set(workers)
+        while not self._idle.empty():
+            self._idle.get_nowait()
+        self.models, self.robots = workers[0].ready.models, workers[0].ready.robots
+        nursery.watch(lambda: self._nursery_lost(nursery))
+        for worker in workers:
+            self.spawn(self._tend(worker))
+        self._answered = time.monotonic()
+        if old_nursery is None:
+            self.spawn(self._beat())
+        else:
+            old_nursery.close()
+        for worker in old_workers:
+            if worker.answer is None:  # the others finish their current job
+                worker.close()
+
+    async def take(self) -> "_Worker":
+        """The next idle worker for a job; first come, first served."""
+        while True:
+            worker = await self._idle.get()
+            if worker in self._workers:  # and not dead
+                return worker
+
+    def spawn(self, work: Any) -> None:
+        """Run a coroutine beside the requests, until it ends or the pool is closed."""
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    def close(self) -> None:
+        """Kill every worker."""
+        for task in self._tasks:
+            task.cancel()
+        for worker in list(self._workers):
+            worker.kill()
+            worker.close()
+        if self._nursery is not None:
+            self._nursery.close()
+
+    async def _beat(self) -> None:
+        """Check regularly that an idle worker answers; one that does not is killed."""
+        while True:
+            await asyncio.sleep(BEAT_SECONDS)
+            with contextlib.suppress(TimeoutError, EdgeGraspError):
+                async with asyncio.timeout(PULSE_SECONDS):
+                    worker, beat = await self.take(), Job("Beat", "http", b"", 0.0)
+                    await worker.run(beat, time.monotonic() + PULSE_SECONDS)
+
+    async def _tend(self, worker: "_Worker") -> None:
+        """Offer a worker for jobs until it dies, then replace it."""
+        usable, lost = True, False
+        try:
+            while True:
+                if worker not in self._workers:
+                    worker.close()  # there are newer ones
+                elif usable:
+                    self._idle.put_nowait(worker)
+                answer = await worker.receive()
+                if answer is None:
+                    lost = worker in self._workers
+                    self._workers.discard(worker)  # `take` skips it
+                    if await worker.nursery.crashed(worker.pid):
+                        worker.finish(HarmfulRequest("request", CRASHED, CRASH_FIX))
+                    break
+                self._answered = time.monotonic()
+                worker.finish(answer)
+                if answer.error is not None and answer.error.kind == WORKER_LOST:
+                    worker.kill()  # it ran out of memory: its state cannot be trusted
+                usable = not worker.killed  # its last answer may arrive after that
+        finally:
+            worker.finish(WorkerLost(LOST))
+            worker.close()
+        if lost:
+            logger.warning("worker %d died and is replaced", worker.pid)
+            self._replaced()
+            await self._until_done(worker.nursery, lambda: self._replace(worker.nursery))
+
+    async def _replace(self, nursery: "_Nursery") -> None:
+        worker = _Worker(nursery)
+        try:
+            async with asyncio.timeout(START_SECONDS if self._settings.device == "cpu" else None):
+                await worker.start()
+        except TimeoutError:  # it is stopped or hangs; its death is handled like any other
+            worker.close()
+            nursery.kill()
+            raise InvalidSettings("the process that workers fork from does not answer") from None
+        except BaseException:
+            worker.close()
+            raise
+        if nursery is self._nursery:
+            self._workers.add(worker)
+        self.spawn(self._tend(worker))
+
+    async def _until_done(self, nursery: "_Nursery", start: Callable[[], Awaitable[None]]) -> None:
+        """Retry a start until it succeeds or there is a newer nursery."""
+        while nursery is self._nursery:
+            try:
+                return await start()
+            except (EdgeGraspError, OSError) as error:
+                logger.error("a dead process cannot be replaced yet: %s", error)
+                await asyncio.sleep(RETRY_SECONDS)
+
+    def _nursery_lost(self, nursery: "_Nursery") -> None:
+        """Load the weights again in a new nursery; the workers continue meanwhile."""
+        logger.error("the process that workers fork from died; weights are loaded again")
+        self.spawn(self._until_done(nursery, self.start))
+
+
+class _Nursery:
+    """The process that has loaded the weights and forks workers."""
+
+    def __init__(self, process: subprocess.Popen[bytes], control: socket.socket) -> None:
+        self._process = process
+        self.pid = process.pid
+        self._control = control
+        # Whether each ended worker, by process id, ended by itself.
+        self._crashed: defaultdict[int, asyncio.Future[bool]]
+        self._crashed = defaultdict(asyncio.get_running_loop().create_future)
+
+    async def loaded(self) -> None:
+        """Wait until it has loaded; raises InvalidSettings on failure."""
+        ready = await asyncio.to_thread(receive, self._control.makefile("rb"))
+        if ready is None or ready.failure:
+            raise InvalidSettings(ready.failure if ready else "the process that loads weights died")
+        self.pid = ready.pid
+        self._control.setblocking(False)
+
+    def watch(self, lost: Callable[[], None]) -> None:
+        """Call `lost` when the nursery dies."""
+        loop = asyncio.get_running_loop()
+
+        def readable() -> None:
+            ended = b""
+            with contextlib.suppress(OSError):
+                ended = self._control.recv(ENDED.size * 64)
+            for pid, status in ENDED.iter_unpack(ended[: len(ended) // ENDED.size * ENDED.size]):
+                crashed = os.WIFSIGNALED(status) and os.WTERMSIG(status) in CRASHES
+                if not self._crashed[pid].done():
+                    self._crashed[pid].set_result(crashed or os.WIFEXITED(status))
+            if not ended:
+                loop.remove_reader(self._control)
+                lost()
+
+        loop.add_reader(self._control, readable)
+
+    async def crashed(self, pid: int) -> bool:
+        """Whether a dead worker crashed or exited, and was not killed."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(STATUS_SECONDS):
+                return await self._crashed[pid]
+        return False
+
+    def fork(self) -> socket.socket:
+        """Fork a worker; returns the socket to it."""
+        ours, theirs = socket.socketpair()
+        with theirs:
+            try:
+                socket.send_fds(self._control, [b"w"], [theirs.fileno()])
+            except OSError:
+                ours.close()
+                raise
+        return ours
+
+    def kill(self) -> None:
+        """Kill the nursery, even if it is stopped; `watch` notices."""
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
+
+    def close(self) -> None:
+        """Kill the nursery; the workers that it forked continue."""
+        with contextlib.suppress(RuntimeError, ValueError):
+            asyncio.get_running_loop().remove_reader(self._control)
+        self._process.kill()
+        self._process.wait()
+        self._control.close()
+
+
+class _Worker:
+    """One worker process, at the other end of a socket."""
+
+    def __init__(self, nursery: _Nursery) -> None:
+        self.nursery = nursery
+        self.pid = 0
+        self.ready: Any = None  # the message that it sent when it had loaded
+        self.answer: asyncio.Future[Answer] | None = None  # of the job that it works on
+        self._writer: asyncio.StreamWriter | None = None
+        self._killing: asyncio.TimerHandle | None = None
+        self.at_work = False  # on a request
+        self.killed = False
+
+    async def start(self) -> None:
+        """Fork the worker and wait until it is ready; raises InvalidSettings if it cannot load."""
+        ours = self.nursery.fork()
+        self._reader, self._writer = await asyncio.open_unix_connection(sock=ours)
+        ready = await self.receive()
+        if ready is None or ready.failure:
+            raise InvalidSettings(ready.failure if ready else "a worker died as it started")
+        self.pid, self.ready = ready.pid, ready
+
+    async def receive(self) -> Any:
+        """The worker's next message; None when it has ended."""
+        try:
+            length, body_length = HEADER.unpack(await self._reader.readexactly(HEADER.size))
+            text = await self._reader.readexactly(length)
+            return unpack(text, await self._reader.readexactly(body_length))
+        except (asyncio.IncompleteReadError, OSError):
+            return None
+
+    async def run(self, job: Job, deadline: float) -> Answer:
+        """Run a job until a deadline of the event loop's clock; if cancelled, soon kill it.
+
+        Raises:
+            HarmfulRequest: The job killed the process.
+            WorkerLost: It died for another reason.
+        """
+        loop = asyncio.get_running_loop()
+        answer = self.answer = loop.create_future()
+        answer.add_done_callback(lambda answer: answer.exception())  # nobody may be waiting
+        self.at_work = job.method != "Beat"
+        assert self._writer is not None
+        try:
+            with contextlib.suppress(OSError):  # if it has died, that becomes the answer
+                for part in pack(replace(job, remaining=deadline - loop.time())):
+                    for place in range(0, len(part), PIECE):
+                        self._writer.write(memoryview(part)[place : place + PIECE])
+                        await self._writer.drain()
+            return await asyncio.shield(answer)
+        except asyncio.CancelledError:
+            if self.answer is answer:  # otherwise it has finished and may have another job
+                self._killing = loop.call_later(KILL_SECONDS, self.kill)
+            raise
+
+    def finish(self, answer: Answer | EdgeGraspError) -> None:
+        """Complete the worker's job, if any, with the answer or an error."""
+        self.at_work = False
+        if self._killing is not None:
+            self._killing.cancel()
+            self._killing = None
+        waiting, self.answer = self.answer, None
+        if waiting is None:
+            return
+        if isinstance(answer, EdgeGraspError):
+            waiting.set_exception(answer)
+        else:
+            waiting.set_result(answer)
+
+    def kill(self) -> None:
+        """Kill the worker."""
+        self.killed = True
+        if self.pid:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.pid, signal.SIGKILL)
+
+    def close(self) -> None:
+        """Close the connection; the process ends when it is idle."""
+        if self._writer is not None:
+            self._writer.close()
 
 
 # The nursery and its workers
