@@ -72,54 +72,18 @@ STATUS_METADATA = "grpc-status-details-bin"  # trailing: a google.rpc.Status
 Behaviour = Callable[[Call, Any], Awaitable[None]]  # takes the call and its context
 
 
-class GrpcServer:
+class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in its stubs only
     """A grpc.aio server with the grasp service, health checks and reflection.
 
-    Must be made in the running event loop.
+    Each call is named, counted and logged. Must be made in the running event loop.
 
     Raises:
         AddressInUse: The port cannot be bound.
     """
 
     def __init__(self, service: GraspService) -> None:
-        settings = service.settings
-        self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
-        self.server = aio.server(options=grpc_bounds(settings))
-        methods = _Methods(service, self._health)
-        self.server.add_generic_rpc_handlers((methods,))
-        # It has a queue of its own: no other calls come before it.
-        checking = grpc.stream_stream_rpc_method_handler(
-            methods.check, response_serializer=_serialized
-        )
-        self.server.add_registered_method_handlers(  # type: ignore[attr-defined]
-            HEALTH, {"Check": checking}
-        )
-        sockets = settings.host.startswith(UNIX)
-        host = f"[{settings.host}]" if ":" in settings.host else settings.host
-        place = f"{settings.host}/grpc.sock" if sockets else f"{host}:{settings.grpc_port}"
-        try:
-            if service.tls is None:
-                port = self.server.add_insecure_port(place)
-            else:
-                port = self.server.add_secure_port(place, service.tls.grpc)
-        except RuntimeError as error:
-            raise AddressInUse("gRPC", place, str(error)) from None
-        self.address = place if sockets else f"{host}:{port}"
-        self.port = 0 if sockets else port
-
-    async def set_serving(self, serving: bool) -> None:
-        """Set the status that health checks report."""
-        status = STATES.SERVING if serving else STATES.NOT_SERVING
-        for name in ("", SERVICE.full_name):
-            await self._health.set(name, status)
-
-
-class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in its stubs only
-    """The methods of GraspService, health checks and reflection, each named, counted and logged."""
-
-    def __init__(self, service: GraspService, checks: Any) -> None:
         self._service = service
-        self._checks = checks
+        self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
         names = (SERVICE.full_name, HEALTH, *REFLECTION)
         self._reflection = reflection.aio.ReflectionServicer(names)  # type: ignore[attr-defined]
         self._small_reads = Places(SMALL_READS)
@@ -144,6 +108,37 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
                 for name in REFLECTION
             },
         }
+        self.server = aio.server(options=grpc_bounds(service.settings))
+        self.server.add_generic_rpc_handlers((self,))
+        # It has a queue of its own: no other calls come before it.
+        checking = grpc.stream_stream_rpc_method_handler(
+            self._check, response_serializer=_serialized
+        )
+        self.server.add_registered_method_handlers(  # type: ignore[attr-defined]
+            HEALTH, {"Check": checking}
+        )
+        self.address, self.port = self._listen()
+
+    def _listen(self) -> tuple[str, int]:
+        """Open the port; returns its address and number, 0 for a socket."""
+        settings, tls = self._service.settings, self._service.tls
+        sockets = settings.host.startswith(UNIX)
+        host = f"[{settings.host}]" if ":" in settings.host else settings.host
+        place = f"{settings.host}/grpc.sock" if sockets else f"{host}:{settings.grpc_port}"
+        try:
+            if tls is None:
+                port = self.server.add_insecure_port(place)
+            else:
+                port = self.server.add_secure_port(place, tls.grpc)
+        except RuntimeError as error:
+            raise AddressInUse("gRPC", place, str(error)) from None
+        return (place, 0) if sockets else (f"{host}:{port}", port)
+
+    async def set_serving(self, serving: bool) -> None:
+        """Set the status that health checks report."""
+        status = STATES.SERVING if serving else STATES.NOT_SERVING
+        for name in ("", SERVICE.full_name):
+            await self._health.set(name, status)
 
     def service(self, handler_call_details: grpc.HandlerCallDetails) -> Any:
         """The handler of a path, known or not."""
@@ -154,7 +149,7 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
 
         return grpc.stream_stream_rpc_method_handler(handle, response_serializer=_serialized)
 
-    async def check(self, messages: Any, context: Any) -> None:
+    async def _check(self, messages: Any, context: Any) -> None:
         """Answer a health check, or refuse one of many silent ones at little cost."""
         peer = context.peer()
         if self._checking[peer] and len(self._small_reads.taken) >= SMALL_READS:
@@ -275,7 +270,7 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
     async def _watch_health(self, call: Call, context: Any) -> None:
         request = await self._read_health(context)
         async with self._watchers.hold(call.client):
-            await self._checks.Watch(request, context)
+            await self._health.Watch(request, context)
 
     async def _read_health(self, context: Any) -> Any:
         kind = health_pb2.HealthCheckRequest
