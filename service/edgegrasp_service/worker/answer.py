@@ -24,8 +24,8 @@ from edgegrasp_results import Detection
 from edgegrasp_service import recording
 from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, UnsupportedMediaType, report
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker import http_bodies, messages
-from edgegrasp_service.worker.process import Answer, Facts, Job, Transport, limited_memory
+from edgegrasp_service.worker import bodies
+from edgegrasp_service.worker.process import Answer, Facts, Job, limited_memory
 
 if TYPE_CHECKING:
     from edgegrasp_model.detector import ModelCatalogue
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 # Memory for reading a request: numbers take about 12 times as much in Python as in JSON.
 DECODE_BYTES, DECODE_FACTOR = 512 * 2**20, 24
-ENCODINGS: dict[Transport, Any] = {"http": http_bodies, "grpc": messages}
 ENCODE_SHARE = 0.1  # share of a request's time that is kept for writing its answer
 
 
@@ -124,18 +123,18 @@ class _Work:
         self.facts.model = result.model
         self.facts.counts = dict(result.counts)
         with self._stage("encode"):
-            body: bytes = ENCODINGS[self.job.transport].write(result)
+            body = bodies.write(self.job.transport, result)
         return body
 
     def _record_outcome(self) -> None:
         """Append a tried grasp, the digest of its weights and the time to the outcomes' file."""
         kind, path = self.job.content_type, self.settings.outcomes_file
-        if not kind.lower().startswith(http_bodies.JSON):  # foreign web pages cannot send it
-            fix = f"Send {http_bodies.JSON}."
+        if not kind.lower().startswith(bodies.JSON):  # foreign web pages cannot send it
+            fix = f"Send {bodies.JSON}."
             raise UnsupportedMediaType("Content-Type", repr(kind[:40]), fix)
         if path is None:  # Ray has this path without the setting too
             raise InvalidRequest("path", "/v1/outcomes", "Set the setting `outcomes_file`.")
-        fields = http_bodies.read_json("body", self.job.body)
+        fields = bodies.read_json("body", self.job.body)
         tried = parse(recording.TriedGrasp, fields, "body")
         self.catalogue.get(tried.model)  # raises UnknownModel
         digests = {row["name"]: row["digest"] for row in self.catalogue.describe()}
@@ -175,7 +174,7 @@ class _Work:
         in_time = most
         try:
             with limited_memory(DECODE_BYTES + DECODE_FACTOR * size):
-                fields = ENCODINGS[self.job.transport].read_request(self.job)
+                fields = bodies.read_request(self.job)
                 self.options = options = parse_options(fields["options"])
                 detector = self.catalogue.get(options.model)
                 given = {} if self.job.method == "DetectGrasps" else _given(fields, most)
