@@ -1,5 +1,6 @@
 """Request state, logs and metrics."""
 
+import asyncio
 import contextlib
 import ipaddress
 import json
@@ -21,6 +22,7 @@ from typing import Any, TextIO
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from prometheus_client.exposition import choose_encoder
 
+from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import Problem
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.process import Facts, Transport
@@ -30,7 +32,7 @@ REQUEST_ID_HEADER = "x-request-id"  # of HTTP requests and answers, and in gRPC 
 _USABLE_ID = re.compile(r"[\w.:+/=@-]{1,128}", re.ASCII)
 
 
-@dataclass
+@dataclass(eq=False)
 class Call:
     """One request, or one stream of them."""
 
@@ -39,11 +41,16 @@ class Call:
     request_id: str = ""  # the caller's own if usable, else a new one
     peer: str = ""  # address without port
     token: str = ""  # name of the token it came with
+    client: str = ""  # whose share of the server it uses: the token's name or the network
     is_admin: bool = False
     long: bool = False  # a stream, whose duration means nothing
     in_stream: bool = False  # one request of a stream
     start: float = field(default_factory=time.monotonic)  # as the event loop's clock
     deadline: float = float("inf")
+    timeout: asyncio.Timeout | None = None  # that ends it, once it is let in
+    refusal: EdgeGraspError | None = None  # why that was early
+    held_bytes: int = 0
+    at_work: bool = False  # whether a worker has it
     bytes_in: int = 0
     bytes_out: int = 0
     code: str = ""  # it ended with: a gRPC code or an HTTP status
@@ -55,15 +62,17 @@ class Call:
     def __post_init__(self) -> None:
         if not _USABLE_ID.fullmatch(self.request_id):
             self.request_id = uuid.uuid4().hex
-
-    @property
-    def client(self) -> str:
-        """The client whose share of the server it uses: its token's name or its network."""
-        return self.token or network_of(self.peer)
+        self.client = self.token or network_of(self.peer)
 
     def end_stage(self, name: str) -> None:
         """Record the end of a stage, which began when the previous one ended."""
         self.stages[name] = time.monotonic() - self.start - sum(self.stages.values())
+
+    def refuse(self, reason: EdgeGraspError) -> None:
+        """End it with an error, at any stage."""
+        self.refusal = reason
+        if self.timeout is not None and not self.timeout.expired():
+            self.timeout.reschedule(asyncio.get_running_loop().time())
 
 
 @lru_cache(1024)

@@ -62,7 +62,7 @@ class Server:
         watch("requests_in_flight", "requests not yet answered", lambda: service.in_flight)
         watch("requests_active", "requests that workers have", lambda: pool.busy)
         waiting = "requests let in that no worker has"
-        watch("queue_depth", waiting, lambda: max(0, len(admission.tickets) - pool.busy))
+        watch("queue_depth", waiting, lambda: max(0, len(admission.calls) - pool.busy))
         watch("held_bytes", "bytes of bodies in the server", lambda: admission.held_bytes)
         watch("workers", "worker processes", lambda: len(pool.pids))
         self.http_url = self.grpc_address = ""  # once ports are open: http://host:port, host:port

@@ -8,7 +8,7 @@ import pytest
 
 from edgegrasp_client import GraspClient
 from edgegrasp_service.errors import DeadlineExceeded, Overloaded
-from edgegrasp_service.front.service import Admission, Ticket
+from edgegrasp_service.front.service import Admission
 from edgegrasp_service.observability import Call
 
 from .conftest import PATIENCE, is_error
@@ -22,14 +22,15 @@ class Inside:
     def __init__(self, admission: Admission) -> None:
         self.admission = admission
         self.tasks: list[asyncio.Task[None]] = []
-        self.tickets: list[Ticket] = []
+        self.calls: list[Call] = []
         self._go = asyncio.Event()
 
     async def enter(self, client: str, seconds: float = FAR, size: int = 1) -> "asyncio.Task[None]":
         async def stay() -> None:
-            deadline = asyncio.get_running_loop().time() + seconds
-            async with self.admission.admit(client, deadline, size) as ticket:
-                self.tickets.append(ticket)
+            call = Call("http", "DetectGrasps", token=client)
+            call.deadline = asyncio.get_running_loop().time() + seconds
+            async with self.admission.admit(call, size):
+                self.calls.append(call)
                 await self._go.wait()
 
         task = asyncio.create_task(stay())
@@ -56,7 +57,7 @@ async def test_a_client_alone_may_have_every_place() -> None:
 async def test_who_holds_most_places_gives_one_up_to_another() -> None:
     inside = Inside(Admission(workers=2, max_waiting=4, max_bytes=100))
     greedy = [await inside.enter("a") for _ in range(6)]
-    inside.tickets[5].at_work = True  # what a worker has is not taken from it
+    inside.calls[5].at_work = True  # what a worker has is not taken from it
     modest = [await inside.enter("b") for _ in range(3)]
     assert not any(task.done() for task in modest)
     await asyncio.wait(greedy[2:5])
@@ -73,10 +74,10 @@ async def test_bytes_are_waited_for_and_one_client_leaves_some_to_others() -> No
     await inside.enter("a", size=40)
     await inside.enter("a", size=40)  # more than half of them: it waits
     await inside.enter("b", size=40)
-    assert (len(inside.tickets), inside.admission.held_bytes) == (2, 80)
-    inside.admission.resize(inside.tickets[0], 10)
+    assert (len(inside.calls), inside.admission.held_bytes) == (2, 80)
+    inside.admission.resize(inside.calls[0], 10)
     await inside.enter("c", size=10)
-    assert (len(inside.tickets), inside.admission.held_bytes) == (4, 100)
+    assert (len(inside.calls), inside.admission.held_bytes) == (4, 100)
     await inside.leave()
     assert inside.admission.held_bytes == 0
 
@@ -88,7 +89,7 @@ async def test_two_clients_leave_room_to_a_third() -> None:
     modest = [await inside.enter("c", size=15) for _ in range(2)]
     await asyncio.wait([greedy[2], greedy[5]])
     assert not any(task.done() for task in modest)
-    assert len(inside.tickets) == 8
+    assert len(inside.calls) == 8
     assert sum(task.done() for task in greedy) == 2
     assert inside.admission.held_bytes <= 100
     await inside.leave()
@@ -96,7 +97,7 @@ async def test_two_clients_leave_room_to_a_third() -> None:
     greedy = [await inside.enter(client, size=25) for client in "aabb"]
     await inside.enter("c", size=20)
     await asyncio.wait(greedy, return_when=asyncio.FIRST_COMPLETED)
-    assert len(inside.tickets) == 5
+    assert len(inside.calls) == 5
     assert sum(task.done() for task in greedy) == 1
     await inside.leave()
     assert inside.admission.held_bytes == 0
@@ -114,9 +115,9 @@ async def test_a_body_larger_than_all_the_bytes_comes_in_alone() -> None:
     inside = Inside(Admission(workers=2, max_waiting=0, max_bytes=100))
     await inside.enter("a", size=1000)
     await inside.enter("b", size=1)
-    assert len(inside.tickets) == 1
+    assert len(inside.calls) == 1
     await inside.leave()
-    assert len(inside.tickets) == 2
+    assert len(inside.calls) == 2
 
 
 async def test_a_deadline_that_cannot_be_met_is_refused() -> None:
@@ -125,8 +126,8 @@ async def test_a_deadline_that_cannot_be_met_is_refused() -> None:
     for _ in range(3):
         await inside.enter("a")
     assert not (await inside.enter("b", seconds=5.0)).done()  # nobody knows when bodies arrive
-    for ticket in inside.tickets[:3]:
-        ticket.body_arrived = True
+    for call in inside.calls[:3]:
+        call.end_stage("read")
     with pytest.raises(Overloaded, match="4 requests come first, which take about 4 s") as caught:
         await (await inside.enter("a", seconds=5.0))
     assert caught.value.retry_after == 4

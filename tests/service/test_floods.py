@@ -287,7 +287,7 @@ async def test_health_is_answered_while_every_connection_has_a_request(serve, cl
         return asyncio.create_task(http.post("/v1/grasps", content=npy(cloud), headers=kind))
 
     held = [ask(), ask()]
-    await running.until(lambda: len(running.server.service.admission.tickets) == 2)
+    await running.until(lambda: len(running.server.service.admission.calls) == 2)
     assert (await ask()).status_code == 429
     for path in ("/health/live", "/health/ready"):
         assert (await http.get(path)).status_code == 200

@@ -58,9 +58,9 @@ async def test_no_more_is_read_than_may_be(serve, cloud) -> None:
     for number in range(8):
         await stream.write(request(str(number), cloud))
     await stream.done_writing()
-    await running.until(lambda: len(running.server.service.admission.tickets) == 3)
+    await running.until(lambda: len(running.server.service.admission.calls) == 3)
     await asyncio.sleep(0.1)
-    assert len(running.server.service.admission.tickets) == 3
+    assert len(running.server.service.admission.calls) == 3
     running.stages.open("evaluate")
     assert [answer.request_id async for answer in stream] == [str(number) for number in range(8)]
 

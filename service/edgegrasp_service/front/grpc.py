@@ -195,11 +195,11 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
     async def _answer(self, method: Method, call: Call, context: Any) -> None:
         service, remaining = self._service, context.time_remaining()
         timeout = math.inf if remaining is None else remaining
-        async with service.admit(call, service.settings.max_body_bytes, timeout) as ticket:
+        async with service.admit(call, service.settings.max_body_bytes, timeout):
             body = await receive(service.settings, context.read())
             if body is EOF:
                 raise InvalidRequest("request", "nothing", "Send one message.")
-            answer = await service.answer(call, ticket, Job(method, "grpc", body))
+            answer = await service.answer(call, Job(method, "grpc", body))
             if answer.error is not None:
                 await _abort(call, context, answer.error)
             await send(service.settings, context.write(answer.body), call.bytes_out)
@@ -394,8 +394,8 @@ async def _answer(service: GraspService, stream: Call, request: dict[str, Any]) 
     detection = b""
     try:
         with service.observe(call):
-            async with service.admit(call, len(body), _timeout(request)) as ticket:
-                answer = await service.answer(call, ticket, Job("DetectGrasps", "grpc", body))
+            async with service.admit(call, len(body), _timeout(request)):
+                answer = await service.answer(call, Job("DetectGrasps", "grpc", body))
                 detection = answer.body
     except Exception as error:
         if not isinstance(error, EdgeGraspError):

@@ -266,7 +266,7 @@ class _Work:
         service, call, headers = self.service, scope["call"], Headers(scope=scope)
         timeout = requested_timeout(headers)
         size = int(headers.get("content-length", service.settings.max_body_bytes))
-        async with service.admit(call, size, timeout) as ticket:
+        async with service.admit(call, size, timeout):
             body, more = bytearray(), True
             start = asyncio.get_running_loop().time()
             while more:
@@ -281,7 +281,7 @@ class _Work:
             query = scope["query_string"].decode("latin-1")
             whole = cast(bytes, body)  # not copied
             job = Job(self.method, "http", whole, content_type=content_type, query=query)
-            answering = asyncio.create_task(service.answer(call, ticket, job))
+            answering = asyncio.create_task(service.answer(call, job))
             leaving = asyncio.create_task(_disconnected(receive))
             try:
                 await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)

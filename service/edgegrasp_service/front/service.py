@@ -13,7 +13,7 @@ import time
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from edgegrasp_model.errors import EdgeGraspError
@@ -112,10 +112,12 @@ class GraspService:
         admin = call.method == "ReloadModels"
         if admin or self.tokens.required:
             known = self.tokens.check(authorization, admin)
-            call.token, call.is_admin = known.name, known.is_admin
+            call.token = call.client = known.name
+            call.is_admin = known.is_admin
 
-    @asynccontextmanager
-    async def admit(self, call: Call, size: int, timeout: float) -> AsyncIterator["Ticket"]:
+    def admit(
+        self, call: Call, size: int, timeout: float
+    ) -> contextlib.AbstractAsyncContextManager[None]:
         """Hold a slot and `size` bytes until the answer is sent or the deadline passes.
 
         The deadline is `timeout` seconds after the call's start, or earlier by the settings.
@@ -129,12 +131,9 @@ class GraspService:
         self.loaded()
         self.check_size(size)
         call.deadline = call.start + min(timeout, self.settings.max_request_seconds)
-        async with self.admission.admit(call.client, call.deadline, size) as ticket:
-            call.end_stage("admission")
-            yield ticket
-            call.end_stage("write")
+        return self.admission.admit(call, size)
 
-    async def answer(self, call: Call, ticket: "Ticket", job: Job) -> Answer:
+    async def answer(self, call: Call, job: Job) -> Answer:
         """Let a worker answer an admitted request whose body has arrived.
 
         Raises:
@@ -145,8 +144,7 @@ class GraspService:
         call.end_stage("read")
         call.bytes_in = len(job.body)
         self.check_size(call.bytes_in)
-        self.admission.resize(ticket, call.bytes_in)
-        ticket.body_arrived = True
+        self.admission.resize(call, call.bytes_in)
         job = replace(job, request_id=call.request_id)
         if self._deaths:
             until, deaths = self._deaths.get(await asyncio.to_thread(_digest, job), (0.0, 0))
@@ -154,7 +152,7 @@ class GraspService:
                 raise HarmfulRequest("request", CRASHED, CRASH_FIX)
         worker = await self.pool.take()
         call.end_stage("wait")
-        ticket.at_work, began = True, time.monotonic()
+        call.at_work, began = True, time.monotonic()
         try:
             answer = await worker.run(job, call.deadline)
         except (HarmfulRequest, WorkerLost) as error:
@@ -162,7 +160,7 @@ class GraspService:
             raise
         finally:
             self.admission.service_seconds.append(time.monotonic() - began)
-            ticket.at_work = False
+            call.at_work = False
         if answer.error is not None and answer.error.kind == WORKER_LOST:
             await self._note_deaths(job, 1)
         elif answer.error is None and self._deaths:  # its worker had died for another reason
@@ -170,7 +168,7 @@ class GraspService:
         call.facts, call.problem = answer.facts, answer.error
         call.stages |= answer.facts.seconds
         call.bytes_out = len(answer.body)
-        self.admission.resize(ticket, call.bytes_out)
+        self.admission.resize(call, call.bytes_out)
         if self.recorder is not None:
             self.recorder.record(job, answer)
         return answer
@@ -192,8 +190,8 @@ class GraspService:
         except TimeoutError:
             logger.warning("grace is over: requests in flight are abandoned")
             gone = "The server stopped before there was an answer. Try another one."
-            for ticket in self.admission.tickets:
-                ticket.refuse(NotReady(gone))
+            for call in self.admission.calls:
+                call.refuse(NotReady(gone))
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(1.0):  # time for the errors to be sent
                     await self.admission.empty()
@@ -263,24 +261,6 @@ def _digest(job: Job) -> bytes:
 # Admission
 
 
-@dataclass(eq=False)
-class Ticket:
-    """The slot of one request in the server."""
-
-    client: str
-    timeout: asyncio.Timeout  # that ends it
-    body_arrived: bool = False
-    at_work: bool = False  # whether a worker has started it
-    bytes: int = 0
-    reason: EdgeGraspError | None = None  # why it was refused
-
-    def refuse(self, reason: EdgeGraspError) -> None:
-        """End the request with an error, at any stage."""
-        self.reason = reason
-        if not self.timeout.expired():
-            self.timeout.reschedule(asyncio.get_running_loop().time())
-
-
 class Admission:
     """Limits the requests and bytes in the server; used in the event loop only.
 
@@ -296,16 +276,16 @@ class Admission:
     def __init__(self, workers: int, max_waiting: int, max_bytes: int) -> None:
         self.held_bytes = 0
         self._workers = workers
-        self._max_tickets = workers + max_waiting
+        self._max_calls = workers + max_waiting
         self._max_bytes = max_bytes
-        self.tickets: list[Ticket] = []  # of the requests in the server, in the order they came
+        self.calls: list[Call] = []  # of the requests in the server, in the order they came
         self._client_bytes: Counter[str] = Counter()
         self._freed = asyncio.Event()  # set when a request frees bytes or its place
         self.service_seconds: deque[float] = deque(maxlen=LATEST)  # of workers' latest jobs
 
     @asynccontextmanager
-    async def admit(self, client: str, deadline: float, size: int) -> AsyncIterator[Ticket]:
-        """Hold a place in the server for a client: its token's name, or else its address.
+    async def admit(self, call: Call, size: int) -> AsyncIterator[None]:
+        """Hold a place in the server for a request until its deadline.
 
         The body of the context is cancelled at the deadline, on the event loop's clock. Waits until
         there is room for `size`, the most bytes of the body.
@@ -314,50 +294,52 @@ class Admission:
             Overloaded: There is no place, or its turn would come after its deadline.
             DeadlineExceeded: The deadline passed inside.
         """
-        remaining = deadline - asyncio.get_running_loop().time()
+        remaining = call.deadline - asyncio.get_running_loop().time()
         if remaining <= 0.0:
             raise DeadlineExceeded()
         wait = self._estimated_wait
-        if self.tickets and wait * MARGIN > remaining:
+        if self.calls and wait * MARGIN > remaining:
             raise self._overloaded(
-                f"{len(self.tickets)} requests come first, which take about {wait:.3g} s, and "
+                f"{len(self.calls)} requests come first, which take about {wait:.3g} s, and "
                 f"the deadline is {remaining:.3g} s away"
             )
-        if len(self.tickets) >= self._max_tickets:
-            counts = Counter(ticket.client for ticket in self.tickets)
+        if len(self.calls) >= self._max_calls:
+            counts = Counter(other.client for other in self.calls)
             holder, count = counts.most_common(1)[0]
-            if count <= counts[client] + 1 or not self._refuse_latest(holder):
-                raise self._overloaded(f"it holds {len(self.tickets)} requests")
-        ticket = Ticket(client, asyncio.timeout_at(deadline))
-        self.tickets.append(ticket)
+            if count <= counts[call.client] + 1 or not self._refuse_latest(holder):
+                raise self._overloaded(f"it holds {len(self.calls)} requests")
+        call.timeout = asyncio.timeout_at(call.deadline)
+        self.calls.append(call)
         try:
-            async with ticket.timeout:
-                await self._reserve(ticket, size)
-                yield ticket
+            async with call.timeout:
+                await self._reserve(call, size)
+                call.end_stage("admission")
+                yield
+                call.end_stage("write")
         except TimeoutError:
-            if not ticket.timeout.expired():
+            if not call.timeout.expired():
                 raise
-            raise ticket.reason or DeadlineExceeded() from None
+            raise call.refusal or DeadlineExceeded() from None
         finally:
-            self._release(ticket)
+            self._release(call)
 
     def _refuse_latest(self, holder: str) -> bool:
         """Refuse the latest request of a client that is not being worked on; false without one."""
-        for ticket in reversed(self.tickets):
-            if ticket.client == holder and not ticket.at_work:
-                held = sum(one.client == holder for one in self.tickets)
-                why = f"this client holds {held} of {self._max_tickets} places, and others wait"
-                ticket.refuse(self._overloaded(why))
-                self._release(ticket)
+        for call in reversed(self.calls):
+            if call.client == holder and not call.at_work:
+                held = sum(one.client == holder for one in self.calls)
+                why = f"this client holds {held} of {self._max_calls} places, and others wait"
+                call.refuse(self._overloaded(why))
+                self._release(call)
                 return True
         return False
 
-    def resize(self, ticket: Ticket, size: int) -> None:
+    def resize(self, call: Call, size: int) -> None:
         """Set the number of bytes that a request holds."""
-        if ticket in self.tickets:
-            self.held_bytes += size - ticket.bytes
-            self._client_bytes[ticket.client] += size - ticket.bytes
-            ticket.bytes = size
+        if call in self.calls:
+            self.held_bytes += size - call.held_bytes
+            self._client_bytes[call.client] += size - call.held_bytes
+            call.held_bytes = size
             self._freed.set()
 
     def hold(self, size: int) -> bool:
@@ -370,7 +352,7 @@ class Admission:
 
     async def empty(self) -> None:
         """Return once no request is in the server."""
-        while self.tickets:
+        while self.calls:
             self._freed.clear()
             await self._freed.wait()
 
@@ -378,29 +360,29 @@ class Admission:
     def _estimated_wait(self) -> float:
         """Estimated seconds until a worker begins a new request."""
         pace = statistics.median(self.service_seconds) if self.service_seconds else 0.0
-        ahead = sum(ticket.body_arrived for ticket in self.tickets)  # others' bodies may be late
+        ahead = sum("read" in call.stages for call in self.calls)  # others' bodies may be late
         return max(0, ahead + 1 - self._workers) * pace / self._workers
 
     def _overloaded(self, why: str) -> Overloaded:
         seconds = max(1, math.ceil(self._estimated_wait))  # as the header Retry-After has them
         return Overloaded(f"The server is busy: {why}. Try again in {seconds} s.", seconds)
 
-    async def _reserve(self, ticket: Ticket, size: int) -> None:
+    async def _reserve(self, call: Call, size: int) -> None:
         """Wait until the limits of all clients and of this client leave room for so many bytes."""
         while (self.held_bytes and self.held_bytes + size > self._max_bytes) or (
-            self._client_bytes[ticket.client]
-            and self._client_bytes[ticket.client] + size > self._max_bytes // 2
+            self._client_bytes[call.client]
+            and self._client_bytes[call.client] + size > self._max_bytes // 2
         ):
             holder, most = max(self._client_bytes.items(), key=lambda row: row[1], default=("", 0))
-            several = sum(held.client == holder and held.bytes > 0 for held in self.tickets) > 1
-            greedy = several and most > self._client_bytes[ticket.client] + size
+            several = sum(one.client == holder and one.held_bytes > 0 for one in self.calls) > 1
+            greedy = several and most > self._client_bytes[call.client] + size
             if not (greedy and self._refuse_latest(holder)):
                 self._freed.clear()
                 await self._freed.wait()
-        self.resize(ticket, size)
+        self.resize(call, size)
 
-    def _release(self, ticket: Ticket) -> None:
-        if ticket in self.tickets:
-            self.resize(ticket, 0)
-            self.tickets.remove(ticket)
+    def _release(self, call: Call) -> None:
+        if call in self.calls:
+            self.resize(call, 0)
+            self.calls.remove(call)
             self._client_bytes += Counter()  # forgets those without any
