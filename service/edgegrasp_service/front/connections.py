@@ -1,9 +1,8 @@
 """Limits on connections: their number, idle time and least speed.
 
-This module holds every defence against slow and silent clients. `Places` limits the number of
-connections, streams, pages and reads; `receive` and `send` limit the time of bodies and answers;
-`HttpProtocol` adds to uvicorn the limits that it lacks; `grpc_bounds` and `trim_grpc` do the same
-for gRPC.
+This module holds the defences against slow and silent clients. `Places` limits the number of
+connections, streams, pages and reads; `HttpProtocol` adds to uvicorn the limits that it lacks;
+`grpc_bounds` and `trim_grpc` do the same for gRPC.
 """
 
 import asyncio
@@ -13,17 +12,16 @@ import socket
 import struct
 import time
 from collections import Counter, defaultdict
-from collections.abc import AsyncIterator, Awaitable, Callable, Sized
+from collections.abc import AsyncIterator, Callable, Sized
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
 from edgegrasp_service.errors import (
-    Cancelled,
     HeadersTooLarge,
     Overloaded,
     RequestTimeout,
@@ -47,8 +45,6 @@ SPARE_CONNECTIONS = 4  # times max_connections are accepted before the oldest ar
 TRIM_SECONDS = 0.05  # seconds between two checks for too many connections
 DESCRIPTORS = Path("/proc/self/fd")
 LAST_RECEIVED = struct.Struct("52xI")  # of struct tcp_info: tcpi_last_data_recv, milliseconds
-
-T = TypeVar("T")
 
 
 @dataclass(eq=False)
@@ -127,37 +123,6 @@ class Places:
             if not eviction.expired():
                 raise
             raise Overloaded("Another client got this place. Try again in 1 s.") from None
-
-
-async def receive(
-    settings: Settings, part: Awaitable[T], received: int = 0, start: float = 0.0
-) -> T:
-    """The next part of a body; raises RequestTimeout if it arrives too slowly.
-
-    Args:
-        settings: How slow is too slow.
-        part: Reads it.
-        received: Bytes that came before.
-        start: When the body began, by the clock of the event loop; 0: now.
-    """
-    slowest = settings.min_bytes_per_second
-    seconds = settings.read_seconds + received / slowest
-    try:
-        async with asyncio.timeout_at((start or time.monotonic()) + seconds):
-            return await part
-    except TimeoutError:
-        fix = f"Send at least {slowest} bytes a second."
-        value = f"{received} bytes in {seconds:.0f} s"
-        raise RequestTimeout("body", value, fix) from None
-
-
-async def send(settings: Settings, sending: Awaitable[None], size: int) -> None:
-    """Send `size` bytes; raises Cancelled if the client does not take them in time."""
-    try:
-        async with asyncio.timeout(settings.write_seconds + size / settings.min_bytes_per_second):
-            await sending
-    except TimeoutError:
-        raise Cancelled(f"The client did not take {size} bytes.") from None
 
 
 # HTTP

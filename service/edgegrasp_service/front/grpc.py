@@ -42,7 +42,7 @@ from edgegrasp_service.errors import (
     RequestTimeout,
     report,
 )
-from edgegrasp_service.front.connections import MAX_HEADERS, Places, grpc_bounds, receive, send
+from edgegrasp_service.front.connections import MAX_HEADERS, Places, grpc_bounds
 from edgegrasp_service.front.service import GraspService
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call
 from edgegrasp_service.settings import UNIX
@@ -196,13 +196,13 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         service, remaining = self._service, context.time_remaining()
         timeout = math.inf if remaining is None else remaining
         async with service.admit(call, service.settings.max_body_bytes, timeout):
-            body = await receive(service.settings, context.read())
+            body = await service.receive(context.read())
             if body is EOF:
                 raise InvalidRequest("request", "nothing", "Send one message.")
             answer = await service.answer(call, Job(method, "grpc", body))
             if answer.error is not None:
                 await _abort(call, context, answer.error)
-            await send(service.settings, context.write(answer.body), call.bytes_out)
+            await service.send(context.write(answer.body), call.bytes_out)
 
     async def _stream(self, call: Call, context: Any) -> None:
         """Answer the requests of one stream in their order; several are processed in parallel.
@@ -236,7 +236,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                         raise RequestTimeout("request", value, "Open another stream.")
                     if ahead and ahead[0].done():
                         response = ahead.popleft().result()
-                        await send(service.settings, context.write(response), len(response))
+                        await service.send(context.write(response), len(response))
                     elif reading and reading.done():
                         if (request := reading.result()) is not None:
                             ahead.append(asyncio.create_task(_answer(service, call, request)))

@@ -37,7 +37,6 @@ from edgegrasp_service.errors import (
     problem_document,
     report,
 )
-from edgegrasp_service.front import connections
 from edgegrasp_service.front.connections import MAX_HEADERS, Places
 from edgegrasp_service.front.service import GraspService
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics
@@ -270,8 +269,7 @@ class _Work:
             body, more = bytearray(), True
             start = asyncio.get_running_loop().time()
             while more:
-                reading = connections.receive(service.settings, receive(), len(body), start)
-                message = await reading
+                message = await service.receive(receive(), len(body), start)
                 if message["type"] == "http.disconnect":
                     raise Cancelled("The client left before its request was whole.")
                 body += message.get("body", b"")
@@ -294,8 +292,7 @@ class _Work:
             response = Response(answer.body, media_type="application/json")
             if answer.error is not None:
                 response = _problem_response(call, answer.error)
-            sending = response(scope, receive, send)
-            await connections.send(service.settings, sending, call.bytes_out)
+            await service.send(response(scope, receive, send), call.bytes_out)
 
 
 async def _disconnected(receive: Receive) -> None:

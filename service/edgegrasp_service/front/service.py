@@ -11,10 +11,10 @@ import math
 import statistics
 import time
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import (
@@ -27,6 +27,7 @@ from edgegrasp_service.errors import (
     PayloadTooLarge,
     PermissionDenied,
     ReloadFailed,
+    RequestTimeout,
     WorkerLost,
     report,
 )
@@ -50,6 +51,8 @@ HARMFUL_SECONDS = 600.0  # seconds for which it is refused
 MOST_HARMFUL = 1000  # requests remembered
 LATEST = 15  # latest service times, whose median is the pace; one slow request does not change it
 MARGIN = 1.5  # the wait is estimated from a median, and half of the requests take longer
+
+T = TypeVar("T")
 
 
 class GraspService:
@@ -172,6 +175,33 @@ class GraspService:
         if self.recorder is not None:
             self.recorder.record(job, answer)
         return answer
+
+    async def receive(self, part: Awaitable[T], received: int = 0, start: float = 0.0) -> T:
+        """The next part of a body; raises RequestTimeout if it arrives too slowly.
+
+        Args:
+            part: Reads it.
+            received: Bytes that came before.
+            start: When the body began, by the clock of the event loop; 0: now.
+        """
+        slowest = self.settings.min_bytes_per_second
+        seconds = self.settings.read_seconds + received / slowest
+        try:
+            async with asyncio.timeout_at((start or time.monotonic()) + seconds):
+                return await part
+        except TimeoutError:
+            fix = f"Send at least {slowest} bytes a second."
+            value = f"{received} bytes in {seconds:.0f} s"
+            raise RequestTimeout("body", value, fix) from None
+
+    async def send(self, sending: Awaitable[None], size: int) -> None:
+        """Send `size` bytes; raises Cancelled if the client does not take them in time."""
+        seconds = self.settings.write_seconds + size / self.settings.min_bytes_per_second
+        try:
+            async with asyncio.timeout(seconds):
+                await sending
+        except TimeoutError:
+            raise Cancelled(f"The client did not take {size} bytes.") from None
 
     async def _note_deaths(self, job: Job, deaths: int) -> None:
         """Count workers killed by a request; a crash counts more than a kill."""
