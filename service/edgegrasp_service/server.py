@@ -17,10 +17,9 @@ from typing import Any
 import uvicorn
 
 from edgegrasp_service.errors import AddressInUse
-from edgegrasp_service.front.connections import HttpProtocol, Places, trim_grpc
-from edgegrasp_service.front.grpc import GrpcServer
-from edgegrasp_service.front.http import HttpMiddleware, create_router
-from edgegrasp_service.front.service import GraspService
+from edgegrasp_service.front.grpc import GrpcServer, trim_grpc
+from edgegrasp_service.front.http import HttpMiddleware, HttpProtocol, create_router
+from edgegrasp_service.front.service import GraspService, Places
 from edgegrasp_service.observability import LogQueue, Metrics, start_logging, write_line
 from edgegrasp_service.recording import check_outcomes
 from edgegrasp_service.security import Tokens

@@ -5,13 +5,17 @@ method can then read its message when there is room for it, and knows when its a
 """
 
 import asyncio
+import contextlib
 import logging
 import math
+import os
+import socket
 import struct
 import urllib.parse
-from collections import Counter, deque
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections import Counter, defaultdict, deque
+from collections.abc import AsyncIterator, Awaitable, Callable, Sized
 from functools import partial
+from pathlib import Path
 from typing import Any, NoReturn
 
 import grpc
@@ -42,10 +46,9 @@ from edgegrasp_service.errors import (
     RequestTimeout,
     report,
 )
-from edgegrasp_service.front.connections import MAX_HEADERS, Places, grpc_bounds
-from edgegrasp_service.front.service import GraspService
-from edgegrasp_service.observability import REQUEST_ID_HEADER, Call
-from edgegrasp_service.settings import UNIX
+from edgegrasp_service.front.service import MAX_HEADERS, GraspService, Places
+from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, network_of
+from edgegrasp_service.settings import UNIX, Settings
 from edgegrasp_service.worker.process import Job, Method
 
 logger = logging.getLogger(__name__)
@@ -64,6 +67,15 @@ STREAM_GRACE_SECONDS = 10.0  # seconds after which an idle stream yields its pla
 MOST_STREAM_FIELDS = 16  # in a message of a stream, which has three
 # Number and wire type, 2 of bytes and 1 of a double, of those of a DetectGraspsStreamRequest.
 STREAM_FIELDS = {(1, 2): "request_id", (2, 2): "request", (3, 1): "timeout"}
+
+# Connections
+CALLS = 100  # calls of one connection at a time; further ones wait in the client
+LOOKAHEAD_BYTES = 2**20  # buffered bytes of a message that is not being read yet; 87,000 points
+SPARE_BYTES = 2**20  # an excess up to this is refused with field, value and fix
+SPARE_CONNECTIONS = 4  # times max_connections are accepted before the oldest are closed
+TRIM_SECONDS = 0.05  # seconds between two checks for too many connections
+DESCRIPTORS = Path("/proc/self/fd")
+LAST_RECEIVED = struct.Struct("52xI")  # of struct tcp_info: tcpi_last_data_recv, milliseconds
 
 DOMAIN = "edgegrasp"  # of google.rpc.ErrorInfo
 ERROR_METADATA = "edgegrasp-error-bin"  # trailing: an ErrorDetail
@@ -421,3 +433,67 @@ def _timeout(request: dict[str, Any]) -> float:
     if not 0.0 < timeout < math.inf:
         raise InvalidRequest("timeout", str(timeout), "Send seconds, or leave it out.")
     return float(timeout)
+
+
+# Connections
+
+
+def grpc_bounds(settings: Settings) -> list[tuple[str, int]]:
+    """Options of a gRPC server."""
+    return [
+        ("grpc.max_receive_message_length", settings.max_body_bytes + SPARE_BYTES),
+        ("grpc.max_metadata_size", settings.max_header_bytes),
+        ("grpc.absolute_max_metadata_size", settings.max_header_bytes),
+        # Compressed messages are unpacked before their size is known: none are accepted.
+        ("grpc.compression_enabled_algorithms_bitset", 1),
+        ("grpc.so_reuseport", 0),
+        # One call is accepted per turn of the event loop: few may wait before a health check.
+        ("grpc.max_concurrent_streams", CALLS),
+        ("grpc.max_allowed_incoming_connections", SPARE_CONNECTIONS * settings.max_connections),
+        ("grpc.server_handshake_timeout_ms", int(settings.read_seconds * 1000)),
+        ("grpc.max_connection_idle_ms", 300_000),
+        # A cloud arrives without waiting for window updates.
+        ("grpc.http2.lookahead_bytes", LOOKAHEAD_BYTES),
+        ("grpc.http2.bdp_probe", 0),  # would buffer whole messages that nobody reads yet
+        # Clients that vanished are noticed, and their streams end.
+        ("grpc.keepalive_time_ms", 30_000),
+        ("grpc.keepalive_timeout_ms", 10_000),
+        # Clients resolve the name again from time to time, and find new servers.
+        ("grpc.max_connection_age_ms", 300_000),
+        ("grpc.http2.min_recv_ping_interval_without_data_ms", 20_000),
+    ]
+
+
+async def trim_grpc(port: int, most: int, others: Sized) -> None:
+    """Keep closing surplus connections to gRPC's port, which gRPC cannot limit by client.
+
+    Args:
+        port: Of gRPC.
+        most: Connections that may stay.
+        others: Connections to other ports, whose descriptors do not count.
+    """
+    while True:
+        await asyncio.sleep(TRIM_SECONDS)
+        if len([*DESCRIPTORS.iterdir()]) - len(others) > most:
+            with contextlib.ExitStack() as duplicates:
+                _trim(port, most, duplicates)
+
+
+def _trim(port: int, most: int, duplicates: contextlib.ExitStack) -> None:
+    """Shut down the longest silent connections to a port of the clients that have most."""
+    found: defaultdict[str, list[tuple[int, socket.socket]]] = defaultdict(list)
+    for link in DESCRIPTORS.iterdir():
+        with contextlib.suppress(OSError):
+            if not link.is_socket():
+                continue
+            one = duplicates.enter_context(socket.socket(fileno=os.dup(int(link.name))))
+            if one.family != socket.AF_UNIX and one.getsockname()[1] == port:
+                owner = network_of(one.getpeername()[0])  # an OSError for the one that listens
+                info = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, LAST_RECEIVED.size)
+                found[owner].append((*LAST_RECEIVED.unpack(info), one))
+    for rows in found.values():
+        rows.sort(key=lambda row: row[0])
+    for _ in range(sum(map(len, found.values())) - most):
+        _, longest = max(found.values(), key=len).pop()
+        with contextlib.suppress(OSError):
+            longest.shutdown(socket.SHUT_RDWR)

@@ -1,4 +1,4 @@
-"""The HTTP transport: routes, and the middleware around every request."""
+"""The HTTP transport: the middleware around every request, routes, and limits on connections."""
 
 import asyncio
 import ipaddress
@@ -7,12 +7,12 @@ import logging
 import math
 import mimetypes
 import re
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import fastapi_offline
 from fastapi.encoders import jsonable_encoder
@@ -24,6 +24,7 @@ from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Mount, Route, Router
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, brief
@@ -32,18 +33,25 @@ from edgegrasp_service.errors import (
     Cancelled,
     HeadersTooLarge,
     InvalidSettings,
+    Overloaded,
     Problem,
+    RequestTimeout,
     UnsupportedMediaType,
     problem_document,
     report,
 )
-from edgegrasp_service.front.connections import MAX_HEADERS, Places
-from edgegrasp_service.front.service import GraspService
-from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics
+from edgegrasp_service.front.service import MAX_HEADERS, GraspService, Place, Places
+from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics, network_of
+from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.process import PIECE, Job, Method
 
 logger = logging.getLogger(__name__)
 
+# Connections
+LINGER_SECONDS = 5.0  # seconds for a refused client to read its answer
+MANY_PIECES, SMALL_PIECE = 1024, 16  # more chunks than this, smaller than this, are refused
+
+# Pages
 PAGES = 16  # sent at a time
 PAGE_PAUSE_SECONDS = 0.001  # seconds between the beginnings of two pages
 PAGE_GRACE_SECONDS = 10.0  # seconds after which a page yields its place to another one
@@ -332,3 +340,174 @@ def _error_response(call: Call, scope: Scope, error: Exception) -> Response:
     response = _problem_response(call, problem)
     response.headers.update(error.headers or {})
     return response
+
+
+# Connections
+
+
+class HttpProtocol(HttpToolsProtocol):
+    """Closes connections whose headers or readers are too slow; refused clients can read why."""
+
+    def __init__(self, settings: Settings, places: Places, **arguments: Any) -> None:
+        super().__init__(**arguments)
+        self._settings = settings
+        self._places = places
+        self._write_timer: asyncio.TimerHandle | None = None
+        self._header_timer: asyncio.TimerHandle | None = None
+        self._header_bytes = 0
+        self._refusal: EdgeGraspError | None = None  # why the parser is ended
+        self._place = Place("", lambda: None)
+
+    def connection_made(self, transport: Any) -> None:
+        """Take a place, and wait for the first headers."""
+        super().connection_made(transport)
+        transport.max_size = PIECE  # read in one turn of the event loop
+        self.transport = _LingeringTransport(  # type: ignore[assignment]
+            transport, lambda: self._in_headers or self.cycle is None or self.cycle.more_body
+        )
+        self._await_headers()
+        try:
+            owner = network_of(self.client[0] if self.client else "")
+            self._place = self._places.take(owner, transport.abort)
+        except Overloaded as error:
+            self._refuse(error)
+
+    def data_received(self, data: bytes) -> None:
+        """Parse received bytes, unless the connection is closing."""
+        if self.transport.is_closing():
+            return
+        self._header_bytes += len(data)
+        self._places.use(self._place, self._place.idle)
+        super().data_received(data)
+        if not self._in_headers:
+            self._header_bytes = 0
+        elif self._header_bytes > self._settings.max_header_bytes:
+            most = f"Send at most {self._settings.max_header_bytes}."
+            self._refuse(HeadersTooLarge("headers", f"{self._header_bytes} bytes", most))
+
+    def on_message_begin(self) -> None:
+        """Prepare for a new request."""
+        super().on_message_begin()
+        self.scope["state"]["abort"] = self.transport.abort
+        self._pieces = self._body_bytes = 0
+        self._await_headers()
+
+    def on_headers_complete(self) -> None:
+        """Mark the connection as busy for requests to /v1/."""
+        try:
+            self._places.use(self._place, idle=not self.url.startswith(b"/v1/"))
+        except Overloaded as error:
+            self._refusal = error
+            raise  # ends the parser too
+        self._in_headers = False
+        if self._header_timer is not None:
+            self._header_timer.cancel()
+            self._header_timer = None
+        super().on_headers_complete()
+
+    def on_body(self, body: bytes) -> None:
+        """Refuse bodies in very small chunks."""
+        self._pieces += 1
+        self._body_bytes += len(body)
+        if self._pieces > MANY_PIECES and self._body_bytes < self._pieces * SMALL_PIECE:
+            value = f"{self._body_bytes} bytes in {self._pieces} pieces"
+            self._refusal = InvalidRequest("body", value, "Send larger pieces.")
+            raise self._refusal  # ends the parser too
+        super().on_body(body)
+
+    def on_response_complete(self) -> None:
+        """Mark the connection as idle."""
+        self._places.use(self._place)
+        super().on_response_complete()
+
+    def pause_writing(self) -> None:
+        """Close the connection unless the client reads its answer in time."""
+        super().pause_writing()
+        seconds = self._settings.write_seconds
+        seconds += self.transport.get_write_buffer_size() / self._settings.min_bytes_per_second
+        self._write_timer = self.loop.call_later(seconds, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        """Cancel the timer of `pause_writing`."""
+        if self._write_timer is not None:
+            self._write_timer.cancel()
+        super().resume_writing()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Stop timers and return the place."""
+        if self._header_timer is not None:
+            self._header_timer.cancel()
+        self.resume_writing()
+        self._places.release(self._place)
+        super().connection_lost(exc)
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer a malformed request."""
+        fix = "Send an HTTP/1.1 request."
+        self._refuse(self._refusal or InvalidRequest("request", "malformed HTTP", fix))
+
+    def _refuse(self, error: EdgeGraspError) -> None:
+        """Send an error without the application, and close; no more if it is closing."""
+        if self.transport.is_closing():
+            return
+        pending = self.cycle is not None and not self.cycle.response_complete
+        if pending and self.cycle.response_started:
+            self.transport.abort()  # it has half an answer
+            return
+        problem = report(error)
+        body = problem_document(problem)
+        head = (
+            f"HTTP/1.1 {problem.status} {problem.kind}\r\n"
+            "content-type: application/problem+json\r\n"
+            f"content-length: {len(body)}\r\nconnection: close\r\n\r\n"
+        )
+        if pending:
+            self.cycle.disconnected = True  # the application can send nothing more
+            self.cycle.message_event.set()
+        self.transport.write(head.encode() + body)
+        self.transport.close()
+
+    def _await_headers(self) -> None:
+        self._in_headers = True
+        if self._header_timer is None:
+            seconds = self._settings.read_seconds
+            late = "headers", f"not whole in {seconds:g} s", "Send them at once."
+            self._header_timer = self.loop.call_later(
+                seconds, lambda: self._refuse(RequestTimeout(*late))
+            )
+
+
+@dataclass
+class _LingeringTransport:
+    """A transport whose `close` leaves the client a few seconds to read its answer.
+
+    A socket that is closed while bytes arrive is reset, and the answer may be lost.
+    """
+
+    transport: asyncio.Transport
+    receiving: Callable[[], bool]  # whether more of a request is to come
+    closing: bool = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.transport, name)
+
+    def is_closing(self) -> bool:
+        """Whether it is closed or closing."""
+        return self.closing or self.transport.is_closing()
+
+    def write(self, data: bytes) -> None:
+        """Send, unless it is closing."""
+        if not self.closing:
+            self.transport.write(data)
+
+    def close(self) -> None:
+        """Send what is buffered, discard what is received, and close."""
+        if self.is_closing():
+            return
+        self.closing = True
+        if self.receiving() and self.transport.can_write_eof():
+            self.transport.write_eof()
+            self.transport.resume_reading()
+        else:
+            self.transport.close()
+        asyncio.get_running_loop().call_later(LINGER_SECONDS, self.transport.abort)

@@ -1,6 +1,7 @@
 """The core of both transports: check, admit, run, record and report a request.
 
-`Admission` limits how many requests and bytes the server holds, shared fairly between clients.
+`Admission` limits how many requests and bytes the server holds, shared fairly between clients;
+`Places` does the same for connections, streams, pages and reads.
 """
 
 import asyncio
@@ -13,7 +14,7 @@ import time
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 from edgegrasp_model.errors import EdgeGraspError
@@ -51,6 +52,8 @@ HARMFUL_SECONDS = 600.0  # seconds for which it is refused
 MOST_HARMFUL = 1000  # requests remembered
 LATEST = 15  # latest service times, whose median is the pace; one slow request does not change it
 MARGIN = 1.5  # the wait is estimated from a median, and half of the requests take longer
+
+MAX_HEADERS = 64  # or entries of gRPC's metadata
 
 T = TypeVar("T")
 
@@ -416,3 +419,84 @@ class Admission:
             self.resize(call, 0)
             self.calls.remove(call)
             self._client_bytes += Counter()  # forgets those without any
+
+
+# Places
+
+
+@dataclass(eq=False)
+class Place:
+    """A slot of `Places`."""
+
+    owner: str
+    on_eviction: Callable[[], None]
+    idle: bool = True  # can be evicted
+    used: float = field(default_factory=time.monotonic)
+
+
+class Places:
+    """A limited number of connections, streams, pages or reads.
+
+    When all places are taken, a newcomer evicts an idle one: the longest idle of the client that
+    has most idle places. A place used within the last `grace` seconds is evicted only for a client
+    that then still has fewer. `spare` places cannot be busy, so that one is always left.
+    """
+
+    def __init__(self, most: int, grace: float = 0.0, spare: int = 0) -> None:
+        self._most, self._grace, self._spare = most + spare, grace, spare
+        self.taken: dict[Place, None] = {}  # the latest used at the end
+
+    def take(self, owner: str, on_eviction: Callable[[], None]) -> Place:
+        """Take a place until `release`, or until it is evicted. Raises Overloaded."""
+        if len(self.taken) >= self._most:
+            since = time.monotonic() - self._grace
+            counts = Counter(one.owner for one in self.taken)
+            mine = counts[owner] + 1
+            idle = [
+                place
+                for place in self.taken
+                if place.idle and (place.used <= since or counts[place.owner] > mine)
+            ]
+            if not idle:
+                raise Overloaded(f"All {self._most} places are in use. Try again in 1 s.")
+            greedy = Counter(place.owner for place in idle).most_common(1)[0][0]
+            evicted = next(place for place in idle if place.owner == greedy)
+            self.release(evicted)
+            evicted.on_eviction()
+        place = Place(owner, on_eviction)
+        self.taken[place] = None
+        return place
+
+    def use(self, place: Place, idle: bool = True) -> None:
+        """Mark a place as used now, and as idle or busy. Raises Overloaded."""
+        if place.idle and not idle and self._spare:
+            busy = sum(not other.idle for other in self.taken)
+            if busy >= self._most - self._spare:
+                raise Overloaded(f"{busy} connections have requests. Try again in 1 s.")
+        place.idle, place.used = idle, time.monotonic()
+        if place in self.taken:
+            self.taken[place] = self.taken.pop(place)
+
+    def release(self, place: Place) -> None:
+        """Return a place."""
+        self.taken.pop(place, None)
+
+    @asynccontextmanager
+    async def hold(self, owner: str) -> AsyncIterator[Place]:
+        """Hold a place; the body of the context is cancelled on eviction.
+
+        Raises:
+            Overloaded: There is no place, or it was evicted.
+        """
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.timeout(None) as eviction:
+                place = self.take(owner, lambda: eviction.reschedule(loop.time()))
+                try:
+                    yield place
+                finally:
+                    self.release(place)
+        except TimeoutError:
+            if not eviction.expired():
+                raise
+            raise Overloaded("Another client got this place. Try again in 1 s.") from None
