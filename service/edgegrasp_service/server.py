@@ -17,7 +17,7 @@ from typing import Any
 import uvicorn
 
 from edgegrasp_service.errors import AddressInUse
-from edgegrasp_service.front.grpc import GrpcServer, trim_grpc
+from edgegrasp_service.front.grpc import GrpcServer
 from edgegrasp_service.front.http import HttpMiddleware, HttpProtocol, create_router
 from edgegrasp_service.front.service import GraspService, Places
 from edgegrasp_service.observability import LogQueue, Metrics, start_logging, write_line
@@ -92,9 +92,7 @@ class Server:
             self.grpc_address = grpc_server.address
             await grpc_server.set_serving(False)
             await grpc_server.server.start()
-            trimming = asyncio.create_task(
-                trim_grpc(grpc_server.port, settings.max_connections, http_connections.taken)
-            )
+            trimming = asyncio.create_task(grpc_server.trim(http_connections.taken))
             http_task = asyncio.create_task(http_server.serve(sockets=[http_socket]))
             load_task = asyncio.create_task(self._load(grpc_server, ready))
             opened()

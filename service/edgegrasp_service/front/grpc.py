@@ -120,7 +120,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                 for name in REFLECTION
             },
         }
-        self.server = aio.server(options=grpc_bounds(service.settings))
+        self.server = aio.server(options=_bounds(service.settings))
         self.server.add_generic_rpc_handlers((self,))
         # It has a queue of its own: no other calls come before it.
         checking = grpc.stream_stream_rpc_method_handler(
@@ -129,7 +129,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         self.server.add_registered_method_handlers(  # type: ignore[attr-defined]
             HEALTH, {"Check": checking}
         )
-        self.address, self.port = self._listen()
+        self.address, self._port = self._listen()
 
     def _listen(self) -> tuple[str, int]:
         """Open the port; returns its address and number, 0 for a socket."""
@@ -151,6 +151,18 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         status = STATES.SERVING if serving else STATES.NOT_SERVING
         for name in ("", SERVICE.full_name):
             await self._health.set(name, status)
+
+    async def trim(self, others: Sized) -> None:
+        """Keep closing surplus connections, which gRPC cannot limit by client.
+
+        Descriptors of `others`, connections to other ports, do not count.
+        """
+        most = self._service.settings.max_connections
+        while True:
+            await asyncio.sleep(TRIM_SECONDS)
+            if len([*DESCRIPTORS.iterdir()]) - len(others) > most:
+                with contextlib.ExitStack() as duplicates:
+                    _trim(self._port, most, duplicates)
 
     def service(self, handler_call_details: grpc.HandlerCallDetails) -> Any:
         """The handler of a path, known or not."""
@@ -438,8 +450,8 @@ def _timeout(request: dict[str, Any]) -> float:
 # Connections
 
 
-def grpc_bounds(settings: Settings) -> list[tuple[str, int]]:
-    """Options of a gRPC server."""
+def _bounds(settings: Settings) -> list[tuple[str, int]]:
+    """Options of the server: limits on connections and messages."""
     return [
         ("grpc.max_receive_message_length", settings.max_body_bytes + SPARE_BYTES),
         ("grpc.max_metadata_size", settings.max_header_bytes),
@@ -462,21 +474,6 @@ def grpc_bounds(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.max_connection_age_ms", 300_000),
         ("grpc.http2.min_recv_ping_interval_without_data_ms", 20_000),
     ]
-
-
-async def trim_grpc(port: int, most: int, others: Sized) -> None:
-    """Keep closing surplus connections to gRPC's port, which gRPC cannot limit by client.
-
-    Args:
-        port: Of gRPC.
-        most: Connections that may stay.
-        others: Connections to other ports, whose descriptors do not count.
-    """
-    while True:
-        await asyncio.sleep(TRIM_SECONDS)
-        if len([*DESCRIPTORS.iterdir()]) - len(others) > most:
-            with contextlib.ExitStack() as duplicates:
-                _trim(port, most, duplicates)
 
 
 def _trim(port: int, most: int, duplicates: contextlib.ExitStack) -> None:

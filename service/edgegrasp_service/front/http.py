@@ -105,10 +105,7 @@ class HttpMiddleware:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request, or refuse it."""
-        headers = {
-            name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]
-        }
-        path = scope["path"]
+        headers, path = Headers(scope=scope), scope["path"]
         page = path.startswith((f"{ASSETS}/", PLAYGROUND))
         method = METHODS.get(path, "Docs" if page else "other")
         peer = scope["client"][0] if scope["client"] else ""
@@ -160,7 +157,7 @@ class HttpMiddleware:
         async with self._pages.hold(client):
             yield
 
-    def _check(self, scope: Scope, call: Call, headers: dict[str, str]) -> None:
+    def _check(self, scope: Scope, call: Call, headers: Headers) -> None:
         """Refuse headers that are too large, a foreign host, a wrong token, a compressed body."""
         size = sum(len(name) + len(value) for name, value in scope["headers"])
         size += len(scope["raw_path"]) + len(scope["query_string"])
