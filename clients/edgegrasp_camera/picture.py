@@ -246,21 +246,6 @@ class Picture:
         self._figure.savefig(path)
 
 
-def draw_grasps(
-    # `.png` or `.jpg` file to write, whose folder must exist; or where to write a PNG.
-    path: Path | BinaryIO,
-    cloud: ArrayLike,  # (N, 3) metres
-    grasps: Sequence[Any],  # as for `Picture.grasps`, best first
-    *,
-    camera_position: ArrayLike,  # (3,) metres, cloud frame; the picture looks from there
-    title: str,  # a line below it
-) -> None:
-    """Write a picture of a cloud and of the Panda's grasps in it, as `Picture.save` does."""
-    picture = Picture(View.of(cloud, camera_position), cloud, title=title)
-    picture.grasps(grasps)
-    picture.save(path)
-
-
 def draw_detection(
     path: Path | BinaryIO,  # `.png` or `.jpg` file to write, or where to write a PNG
     detection: Any,  # the answer, of a client or of a detector

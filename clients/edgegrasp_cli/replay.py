@@ -38,7 +38,7 @@ def attempt(
     ] = None,
 ) -> None:
     """Repeat one recorded attempt, in its scene and view."""
-    from edgegrasp_camera.picture import draw_grasps
+    from edgegrasp_camera.picture import Picture, View
     from edgegrasp_sim.report import Replay, attempt_title
     from edgegrasp_sim.results import ResultFolder
 
@@ -50,9 +50,9 @@ def attempt(
         now, seen = repeated.repeat(done.seed, round, number)
     before, title = done.attempts[number], attempt_title(done, number)
     if picture is not None:
-        draw_grasps(
-            picture, seen.cloud, [before], camera_position=seen.camera_position, title=title
-        )
+        drawn = Picture(View.of(seen.cloud, seen.camera_position), seen.cloud, title=title)
+        drawn.grasps([before])
+        drawn.save(picture)
     print(title)
     if any(getattr(now, name) != getattr(before, name) for name in ("cause", "object", "opening")):
         sys.exit(f"edgegrasp replay: the result differs: {now.cause or 'success'}")

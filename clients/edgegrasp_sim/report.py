@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from edgegrasp_camera.picture import draw_grasps
+from edgegrasp_camera.picture import Picture, View
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import protocol_from
@@ -201,6 +201,8 @@ def _failure_pictures(replay: Replay, rounds: Sequence[Round]) -> Iterator[str]:
         _, seen = replay.repeat(done.seed, done.index, number)
         title = attempt_title(done, number)
         with tempfile.TemporaryDirectory() as folder:
-            file, grasps = Path(folder) / "failure.jpg", [done.attempts[number]]
-            draw_grasps(file, seen.cloud, grasps, camera_position=seen.camera_position, title=title)
+            file, view = Path(folder) / "failure.jpg", View.of(seen.cloud, seen.camera_position)
+            picture = Picture(view, seen.cloud, title=title)
+            picture.grasps([done.attempts[number]])
+            picture.save(file)
             yield image("jpeg", file.read_bytes(), title)

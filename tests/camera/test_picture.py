@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from edgegrasp_camera.clouds import CloudInput
-from edgegrasp_camera.picture import Picture, View, draw_detection, draw_grasps
+from edgegrasp_camera.picture import Picture, View, draw_detection
 
 
 def pixels(written: io.BytesIO) -> np.ndarray:
@@ -30,7 +30,9 @@ def test_what_the_cloud_hides_of_a_hand_is_faint(behind: bool) -> None:
     T[:3, :3] = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
     T[:3, 3] = (0.0, 0.2 if behind else -0.2, 0.1)
     stream, grasp = io.BytesIO(), SimpleNamespace(T_cloud_hand=T, score=1.0, width=0.08)
-    draw_grasps(stream, wall, [grasp], camera_position=(0.0, -1.0, 0.0), title="")
+    picture = Picture(View.of(wall, (0.0, -1.0, 0.0)), wall)
+    picture.grasps([grasp])
+    picture.save(stream)
     red, green, blue = np.moveaxis(pixels(stream), 2, 0)
     strong = ((red > 220) & (green > 200) & (blue < 80)).sum()
     assert (strong < 50) == behind
