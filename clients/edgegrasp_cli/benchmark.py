@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 from rich.console import Console
 from rich.progress import Progress, TimeElapsedColumn
 from rich.table import Table
@@ -32,51 +32,40 @@ DECIDED = (
 )
 
 
-class Cluster(BaseModel):
+class Cluster(BaseModel, use_attribute_docstrings=True):
     """The flags that choose the engine, the processes and the cluster."""
 
-    engine: str | None = Field(
-        None, description="pybullet or mujoco; else the protocol's, or the one that is installed"
-    )
-    workers: int | None = Field(None, description="Processes; else one for each core. Same results")
-    ray: str | None = Field(
-        None, description="Address of a Ray cluster to run on; local: this machine"
-    )
+    engine: str | None = None
+    """pybullet or mujoco; else the protocol's, or the one that is installed"""
+    workers: int | None = None
+    """Processes; else one for each core. Same results"""
+    ray: str | None = None
+    """Address of a Ray cluster to run on; local: this machine"""
 
 
 class BenchmarkFlags(Cluster, PlannerFlags):
     """The flags of `edgegrasp benchmark`."""
 
-    scene: str | None = Field(
-        None,
-        description="packed, pile, bin, bin-full, bin-deep, table or shelf; else the protocol's, "
-        "or pile",
-    )
-    protocol: str = Field(
-        "edgegrasp",
-        description="edgegrasp, giga, vgn, bin, table, shelf, ur5-pile, or a .toml file like them",
-    )
-    rounds: int | None = Field(None, description="Rounds for each seed; else the protocol's")
-    seed: tuple[int, ...] = Field(
-        (), description="Seed of scenes, views and noise; may be repeated"
-    )
-    objects: Path | None = Field(
-        None,
-        description="Folder of SCENE/SPLIT/*.urdf, *.obj or *.stl; else the built-in objects",
-    )
-    split: str = Field("test", description="Which of its objects: test or train")
-    gripper: str | None = Field(
-        None,
-        description="Hand to grasp with: a gripper's name or .toml file; else the Panda",
-    )
-    output: Path | None = Field(
-        None,
-        description="Folder for manifest, attempts, figures, report. The same again resumes",
-    )
-    report: bool = Field(True, description="Write report.html, which takes a while")
-    gate: Path | None = Field(
-        None, description="summary.json of a result that this one must not fall below"
-    )
+    scene: str | None = None
+    """packed, pile, bin, bin-full, bin-deep, table or shelf; else the protocol's, or pile"""
+    protocol: str = "edgegrasp"
+    """edgegrasp, giga, vgn, bin, table, shelf, ur5-pile, or a .toml file like them"""
+    rounds: int | None = None
+    """Rounds for each seed; else the protocol's"""
+    seed: tuple[int, ...] = ()
+    """Seed of scenes, views and noise; may be repeated"""
+    objects: Path | None = None
+    """Folder of SCENE/SPLIT/*.urdf, *.obj or *.stl; else the built-in objects"""
+    split: str = "test"
+    """Which of its objects: test or train"""
+    gripper: str | None = None
+    """Hand to grasp with: a gripper's name or .toml file; else the Panda"""
+    output: Path | None = None
+    """Folder for manifest, attempts, figures, report. The same again resumes"""
+    report: bool = True
+    """Write report.html, which takes a while"""
+    gate: Path | None = None
+    """summary.json of a result that this one must not fall below"""
 
 
 @takes_flags(options=option_flags(*DECIDED, defaults=False))

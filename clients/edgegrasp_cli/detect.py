@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import Field
 from rich import box
 from rich.console import Console
 from rich.table import Column, Table
@@ -35,58 +34,45 @@ PICTURES = (".png", ".jpg", ".jpeg")
 class DetectorFlags(Connection):
     """The flags that choose a server, or a detector in this process."""
 
-    server: str | None = Field(
-        default=None, description="host:port (gRPC) or http://host:port; else in this process"
-    )
-    weights: tuple[Path, ...] = Field(
-        default=(), description="Weights file or folder besides those that ship, without a server"
-    )
-    grippers: tuple[Path, ...] = Field(
-        default=(), description="Gripper file (.toml), without a server"
-    )
-    device: str = Field(default="cpu", description="auto, cpu, cuda or cuda:N, without a server")
+    server: str | None = None
+    """host:port (gRPC) or http://host:port; else in this process"""
+    weights: tuple[Path, ...] = ()
+    """Weights file or folder besides those that ship, without a server"""
+    grippers: tuple[Path, ...] = ()
+    """Gripper file (.toml), without a server"""
+    device: str = "cpu"
+    """auto, cpu, cuda or cuda:N, without a server"""
 
 
 class DetectFlags(DetectorFlags):
     """The flags of `edgegrasp detect` besides the options of the detection."""
 
-    depth: tuple[Path, ...] = Field(
-        (), description="Depth image in place of a cloud: .png of 16 bits, or .npy; repeatable"
-    )
-    intrinsics: tuple[str, ...] = Field(
-        (), description="Camera of --depth: fx,fy,cx,cy in pixels, or its 3 x 3 matrix as JSON"
-    )
-    pose: tuple[str, ...] = Field(
-        (), description="Camera of each --depth: 4 x 4 JSON, to the cloud's frame"
-    )
-    depth_scale: float | None = Field(
-        None, description="Metres for one unit of --depth (0.001; of floats 1)"
-    )
-    color: Path | None = Field(None, description="Colours of the same pixels: .png or .npy")
-    mask: Path | None = Field(
-        None, description="Grasp only where this is not 0: .png or .npy, same pixels"
-    )
-    picture: Path | None = Field(
-        None, description="Picture of the best grasps to write, .png or .jpg"
-    )
-    robot: str | None = Field(
-        None, description="The server's robot of that name; else one that ships, or a file"
-    )
-    joints: str | None = Field(None, description="The robot's joints now: j1,j2,… in radians")
-    base: str | None = Field(
-        None, description="T_base_cloud, its 16 numbers row by row, or the 4 x 4 matrix as JSON"
-    )
-    place: str | None = Field(
-        None,
-        description='Where to put the object: {"region": {"min": …, "max": …}} or T_base_object, '
-        "base frame",
-    )
-    avoid_unseen: bool = Field(
-        False, description="The robot's arm avoids what no camera saw behind a surface"
-    )
-    trajectory: Path | None = Field(
-        None, description="JSON file to write the arm's motion to the best pick to"
-    )
+    depth: tuple[Path, ...] = ()
+    """Depth image in place of a cloud: .png of 16 bits, or .npy; repeatable"""
+    intrinsics: tuple[str, ...] = ()
+    """Camera of --depth: fx,fy,cx,cy in pixels, or its 3 x 3 matrix as JSON"""
+    pose: tuple[str, ...] = ()
+    """Camera of each --depth: 4 x 4 JSON, to the cloud's frame"""
+    depth_scale: float | None = None
+    """Metres for one unit of --depth (0.001; of floats 1)"""
+    color: Path | None = None
+    """Colours of the same pixels: .png or .npy"""
+    mask: Path | None = None
+    """Grasp only where this is not 0: .png or .npy, same pixels"""
+    picture: Path | None = None
+    """Picture of the best grasps to write, .png or .jpg"""
+    robot: str | None = None
+    """The server's robot of that name; else one that ships, or a file"""
+    joints: str | None = None
+    """The robot's joints now: j1,j2,… in radians"""
+    base: str | None = None
+    """T_base_cloud, its 16 numbers row by row, or the 4 x 4 matrix as JSON"""
+    place: str | None = None
+    """Where to put the object: {"region": {"min": …, "max": …}} or T_base_object, base frame"""
+    avoid_unseen: bool = False
+    """The robot's arm avoids what no camera saw behind a surface"""
+    trajectory: Path | None = None
+    """JSON file to write the arm's motion to the best pick to"""
 
 
 @takes_flags(options=option_flags("robot", "previous"))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args, get_origin
 
 import typer
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, ValidationError
 
 if TYPE_CHECKING:
     from edgegrasp_client import GraspClient
@@ -20,21 +20,21 @@ PLAIN = (bool, int, float, str, Path)  # types that a flag takes directly
 TOKEN_VARIABLE = "EDGEGRASP_CLIENT_TOKEN"
 
 
-class Connection(BaseModel):
+class Connection(BaseModel, use_attribute_docstrings=True):
     """The flags that say how to connect to a server."""
 
-    timeout: float = Field(default=60.0, description="Seconds to wait for a server")
-    token_file: Path | None = Field(
-        default=None, description=f"File with the server's token; else {TOKEN_VARIABLE}"
-    )
-    tls: bool = Field(
-        default=False, description="TLS over gRPC, trusting this machine's authorities"
-    )
-    tls_ca: Path | None = Field(
-        default=None, description="TLS, trusting the authorities in a PEM file"
-    )
-    tls_certificate: Path | None = Field(default=None, description="Client certificate, PEM")
-    tls_key: Path | None = Field(default=None, description="Key of the client certificate, PEM")
+    timeout: float = 60.0
+    """Seconds to wait for a server"""
+    token_file: Path | None = None
+    """File with the server's token; else EDGEGRASP_CLIENT_TOKEN"""
+    tls: bool = False
+    """TLS over gRPC, trusting this machine's authorities"""
+    tls_ca: Path | None = None
+    """TLS, trusting the authorities in a PEM file"""
+    tls_certificate: Path | None = None
+    """Client certificate, PEM"""
+    tls_key: Path | None = None
+    """Key of the client certificate, PEM"""
 
     def connect(self, address: str) -> "GraspClient":
         """A client of a server; raises GraspClientError."""
@@ -58,30 +58,25 @@ class Connection(BaseModel):
 class PlannerFlags(Connection):
     """The flags that choose a planner of the benchmark."""
 
-    timeout: float = Field(default=300.0, description="Seconds to wait for a server")
-    planner: str = Field(
-        default="server", description="server, in-process, an installed one, or module:callable"
-    )
-    server: str | None = Field(
-        default=None, description="host:port (gRPC) or http://host:port; else one is started"
-    )
-    weights: tuple[Path, ...] = Field(default=(), description="Weights besides those that ship")
-    model: str = Field(
-        default="", description="Weights to use: a name or a .safetensors file; empty: the default"
-    )
-    robot: str | None = Field(
-        default=None,
-        description="Arm that executes the grasps with its own hand, in MuJoCo: name or .toml file",
-    )
+    timeout: float = 300.0
+    """Seconds to wait for a server"""
+    planner: str = "server"
+    """server, in-process, an installed one, or module:callable"""
+    server: str | None = None
+    """host:port (gRPC) or http://host:port; else one is started"""
+    weights: tuple[Path, ...] = ()
+    """Weights besides those that ship"""
+    model: str = ""
+    """Weights to use: a name or a .safetensors file; empty: the default"""
+    robot: str | None = None
+    """Arm that executes the grasps with its own hand, in MuJoCo: name or .toml file"""
 
 
 class Server(Connection):
     """The flags of the server that a command is a client of."""
 
-    server: str = Field(
-        default="127.0.0.1:50051",
-        description="The grasp server: host:port (gRPC) or http://host:port",
-    )
+    server: str = "127.0.0.1:50051"
+    """The grasp server: host:port (gRPC) or http://host:port"""
 
 
 def takes_flags(**groups: Flags) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field
 from rich.progress import Progress, track
 from typer import Argument, Option
 
@@ -20,9 +19,8 @@ from edgegrasp_training.options import GenerationOptions, TrainingOptions
 class DataFlags(GenerationOptions, Cluster):
     """The flags of `edgegrasp generate-data`."""
 
-    objects: Path | None = Field(
-        None, description="Folder packed/train, pile/train; else the built-in objects"
-    )
+    objects: Path | None = None
+    """Folder packed/train, pile/train; else the built-in objects"""
 
 
 @takes_flags()
@@ -52,27 +50,25 @@ def generate_data(
     print(f"{missing} scenes made, {kept} kept; {tried} grasps tried{share}.")
 
 
-class TrainFlags(TrainingOptions):
+class TrainFlags(TrainingOptions, use_attribute_docstrings=True):
     """The flags of `edgegrasp train`."""
 
-    model: str = Field(
-        "edgegrasp-plus", description="edgegrasp, edgegrasp-small, edgegrasp-plus or vn-edgegrasp"
-    )
-    run: Path = Field(
-        Path("runs/edgegrasp-plus"), description="Folder of this run: state, log, weights, card"
-    )
-    until: int | None = Field(None, description="Pause at this step; the same command continues")
-    teacher: Path | None = Field(
-        None, description="Weights of a hand network that also teaches a network of balls"
-    )
-    start_from: Path | None = Field(
-        None, description="Weights of the same model to start from; use a lower --learning-rate"
-    )
-    outcomes: Path | None = Field(
-        None, description="File of a server's /v1/outcomes: only recalibrate --start-from on it"
-    )
-    validation_share: float = Field(0.1, description="Share of the scenes kept apart")
-    device: str = Field("cpu", description="cpu or cuda")
+    model: str = "edgegrasp-plus"
+    """edgegrasp, edgegrasp-small, edgegrasp-plus or vn-edgegrasp"""
+    run: Path = Path("runs/edgegrasp-plus")
+    """Folder of this run: state, log, weights, card"""
+    until: int | None = None
+    """Pause at this step; the same command continues"""
+    teacher: Path | None = None
+    """Weights of a hand network that also teaches a network of balls"""
+    start_from: Path | None = None
+    """Weights of the same model to start from; use a lower --learning-rate"""
+    outcomes: Path | None = None
+    """File of a server's /v1/outcomes: only recalibrate --start-from on it"""
+    validation_share: float = 0.1
+    """Share of the scenes kept apart"""
+    device: str = "cpu"
+    """cpu or cuda"""
 
 
 @takes_flags()

@@ -27,99 +27,83 @@ Timeout = Annotated[float, Field(gt=0.0, le=3600.0)]  # seconds
 class Settings(BaseModel):
     """The server's settings; `EDGEGRASP_HTTP_PORT=8080` sets `http_port`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
-    host: str = Field(
-        "127.0.0.1",
-        description="address both transports bind to; unix:FOLDER: sockets http.sock and grpc.sock",
-    )
+    host: str = "127.0.0.1"
+    """address both transports bind to; unix:FOLDER: sockets http.sock and grpc.sock"""
     allowed_hosts: tuple[str, ...] = Field(
         (),
         description="names accepted in the Host header; *: any; empty: any if tokens are set, else "
         "addresses and names without a dot",
     )
-    http_port: Port = Field(8000, description="0: any free port")
-    grpc_port: Port = Field(50051, description="0: any free port")
-    weights: tuple[Path, ...] = Field(
-        (), description="weights files or folders of them, besides those that ship"
-    )
-    grippers: tuple[Path, ...] = Field((), description="gripper files (.toml), named by their stem")
-    robots: tuple[Path, ...] = Field(
-        (), description="robot files (.toml), or names of those that ship; needs the extra robot"
-    )
-    default_model: str = Field("", description="weights used when a request names none")
-    device: str = Field(
-        "cpu",
-        pattern=r"^(auto|cpu|cuda(:\d+)?)$",
-        description="where detectors compute: cpu, cuda, cuda:N, or auto: the first GPU, else cpu",
-    )
-    max_body_bytes: int = Field(
-        32 * MIB, ge=1024, le=1024 * MIB, description="largest request body accepted"
-    )
-    max_points: Count = Field(2_000_000, description="most points in a cloud, before downsampling")
-    max_voxels: Count = Field(200_000, description="most points in a cloud, after downsampling")
-    workers: int = Field(0, ge=0, le=1024, description="worker processes; 0: one per core")
-    max_worker_bytes: int = Field(
-        3 * 1024 * MIB, ge=64 * MIB, description="memory that a worker may use for a request"
-    )
-    max_queue_length: int = Field(
-        32, ge=0, le=65536, description="most requests waiting, beside those being processed"
-    )
-    max_held_bytes: Size = Field(
-        512 * MIB, description="most bytes of request bodies held in memory"
-    )
-    max_streams: Count = Field(16, le=1024, description="most gRPC streams open at a time")
-    max_stream_requests: Count = Field(
-        4, le=1024, description="most unanswered requests read from a stream"
-    )
-    max_connections: Count = Field(
-        512, le=65536, description="most connections open at a time, of HTTP and of gRPC each"
-    )
-    max_request_seconds: float = Field(
-        120.0,
-        gt=0.0,
-        le=86400.0,
-        description="longest processing time of a request, whatever its deadline",
-    )
-    read_seconds: Timeout = Field(
-        10.0, description="time for a body to arrive, plus its size at min_bytes_per_second"
-    )
-    write_seconds: Timeout = Field(
-        10.0,
-        description="time for a client to take an answer, plus its size at min_bytes_per_second",
-    )
-    min_bytes_per_second: Count = Field(50_000, description="least speed of bodies and answers")
-    record_folder: Path | None = Field(None, description="folder to record requests and answers in")
-    record_bytes: Size = Field(1024 * MIB, description="most recorded; the oldest are deleted")
-    outcomes_file: Path | None = Field(
-        None, description="file that /v1/outcomes appends to, up to 64 MiB; none: no such path"
-    )
-    max_header_bytes: int = Field(
-        32768, ge=4096, le=MIB, description="largest HTTP header or gRPC metadata accepted"
-    )
-    tls_certificate: Path | None = Field(
-        None, description="PEM file: the server's certificate chain"
-    )
-    tls_key: Path | None = Field(None, description="PEM file: key of the certificate")
-    tls_client_ca: Path | None = Field(
-        None, description="PEM file: CAs of clients, which must then show a certificate"
-    )
-    token_file: Path | None = Field(
-        None,
-        description="bearer tokens, one per line; requests must carry one; none: no need",
-    )
-    admin_token_file: Path | None = Field(
-        None,
-        description="tokens that also permit reloading weights, one per line; none: SIGHUP only",
-    )
-    grace_seconds: Wait = Field(10.0, description="seconds for requests in progress when stopping")
-    playground: bool = Field(True, description="whether / shows the playground instead of /docs")
-    samples: Path | None = Field(
-        None, description="folder with samples.json: scenes offered by the playground, public"
-    )
-    log_level: Literal["debug", "info", "warning", "error"] = Field(
-        "info", description="least severe records logged"
-    )
+    http_port: Port = 8000
+    """0: any free port"""
+    grpc_port: Port = 50051
+    """0: any free port"""
+    weights: tuple[Path, ...] = ()
+    """weights files or folders of them, besides those that ship"""
+    grippers: tuple[Path, ...] = ()
+    """gripper files (.toml), named by their stem"""
+    robots: tuple[Path, ...] = ()
+    """robot files (.toml), or names of those that ship; needs the extra robot"""
+    default_model: str = ""
+    """weights used when a request names none"""
+    device: str = Field("cpu", pattern=r"^(auto|cpu|cuda(:\d+)?)$")
+    """where detectors compute: cpu, cuda, cuda:N, or auto: the first GPU, else cpu"""
+    max_body_bytes: int = Field(32 * MIB, ge=1024, le=1024 * MIB)
+    """largest request body accepted"""
+    max_points: Count = 2_000_000
+    """most points in a cloud, before downsampling"""
+    max_voxels: Count = 200_000
+    """most points in a cloud, after downsampling"""
+    workers: int = Field(0, ge=0, le=1024)
+    """worker processes; 0: one per core"""
+    max_worker_bytes: int = Field(3 * 1024 * MIB, ge=64 * MIB)
+    """memory that a worker may use for a request"""
+    max_queue_length: int = Field(32, ge=0, le=65536)
+    """most requests waiting, beside those being processed"""
+    max_held_bytes: Size = 512 * MIB
+    """most bytes of request bodies held in memory"""
+    max_streams: Count = Field(16, le=1024)
+    """most gRPC streams open at a time"""
+    max_stream_requests: Count = Field(4, le=1024)
+    """most unanswered requests read from a stream"""
+    max_connections: Count = Field(512, le=65536)
+    """most connections open at a time, of HTTP and of gRPC each"""
+    max_request_seconds: float = Field(120.0, gt=0.0, le=86400.0)
+    """longest processing time of a request, whatever its deadline"""
+    read_seconds: Timeout = 10.0
+    """time for a body to arrive, plus its size at min_bytes_per_second"""
+    write_seconds: Timeout = 10.0
+    """time for a client to take an answer, plus its size at min_bytes_per_second"""
+    min_bytes_per_second: Count = 50_000
+    """least speed of bodies and answers"""
+    record_folder: Path | None = None
+    """folder to record requests and answers in"""
+    record_bytes: Size = 1024 * MIB
+    """most recorded; the oldest are deleted"""
+    outcomes_file: Path | None = None
+    """file that /v1/outcomes appends to, up to 64 MiB; none: no such path"""
+    max_header_bytes: int = Field(32768, ge=4096, le=MIB)
+    """largest HTTP header or gRPC metadata accepted"""
+    tls_certificate: Path | None = None
+    """PEM file: the server's certificate chain"""
+    tls_key: Path | None = None
+    """PEM file: key of the certificate"""
+    tls_client_ca: Path | None = None
+    """PEM file: CAs of clients, which must then show a certificate"""
+    token_file: Path | None = None
+    """bearer tokens, one per line; requests must carry one; none: no need"""
+    admin_token_file: Path | None = None
+    """tokens that also permit reloading weights, one per line; none: SIGHUP only"""
+    grace_seconds: Wait = 10.0
+    """seconds for requests in progress when stopping"""
+    playground: bool = True
+    """whether / shows the playground instead of /docs"""
+    samples: Path | None = None
+    """folder with samples.json: scenes offered by the playground, public"""
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """least severe records logged"""
 
     @model_validator(mode="after")
     def _check_tls(self) -> Self:
