@@ -62,6 +62,10 @@ class WorkerLost(EdgeGraspError):  # noqa: N818
 class HarmfulRequest(InvalidRequest):
     """A request that killed its worker process is refused for a while."""
 
+    def __init__(self) -> None:
+        fix = "Send another cloud or other options; this request is refused for 10 minutes."
+        super().__init__("request", "one that ended the process that worked on it", fix)
+
 
 class DiskFull(EdgeGraspError):  # noqa: N818
     """The data to store cannot be written."""

@@ -97,6 +97,8 @@ def example(kind: str) -> Exception:
     found = next(error for error in errors.STATUS if kind_of(error) == kind)
     if found is UnknownModel:
         return UnknownModel("wanted", ["a", "b"])
+    if found is errors.HarmfulRequest:
+        return errors.HarmfulRequest()
     if found is Overloaded:
         return Overloaded("What happened.", 7.0)
     if issubclass(found, InvalidRequest):

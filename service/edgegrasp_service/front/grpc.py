@@ -1,4 +1,4 @@
-"""The gRPC transport: methods on raw messages, health, reflection, and checks around each call.
+"""The gRPC transport: methods on raw messages, health, reflection, checks around each call, limits.
 
 Every method is served as a stream in both directions, which is the same on the wire: a unary
 method can then read its message when there is room for it, and knows when its answer was read.

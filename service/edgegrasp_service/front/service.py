@@ -13,7 +13,7 @@ import statistics
 import time
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
@@ -36,14 +36,7 @@ from edgegrasp_service.observability import CALL, Call, Metrics, log_call
 from edgegrasp_service.recording import Recorder
 from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.process import (
-    CRASH_FIX,
-    CRASHED,
-    WORKER_LOST,
-    Answer,
-    Job,
-    WorkerPool,
-)
+from edgegrasp_service.worker.process import WORKER_LOST, Answer, Job, WorkerPool
 
 logger = logging.getLogger(__name__)
 
@@ -121,9 +114,7 @@ class GraspService:
             call.token = call.client = known.name
             call.is_admin = known.is_admin
 
-    def admit(
-        self, call: Call, size: int, timeout: float
-    ) -> contextlib.AbstractAsyncContextManager[None]:
+    def admit(self, call: Call, size: int, timeout: float) -> AbstractAsyncContextManager[None]:
         """Hold a slot and `size` bytes until the answer is sent or the deadline passes.
 
         The deadline is `timeout` seconds after the call's start, or earlier by the settings.
@@ -155,7 +146,7 @@ class GraspService:
         if self._deaths:
             until, deaths = self._deaths.get(await asyncio.to_thread(_digest, job), (0.0, 0))
             if deaths >= MOST_DEATHS and time.monotonic() < until:
-                raise HarmfulRequest("request", CRASHED, CRASH_FIX)
+                raise HarmfulRequest()
         worker = await self.pool.take()
         call.end_stage("wait")
         call.at_work, began = True, time.monotonic()

@@ -49,8 +49,6 @@ KEPT_MEMORY = {"MALLOC_TRIM_THRESHOLD_": str(2**26), "MALLOC_MMAP_THRESHOLD_": s
 
 WORKER_LOST = kind_of(WorkerLost)
 CRASHES = {signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL}
-CRASHED = "one that ended the process that worked on it"
-CRASH_FIX = "Send another cloud or other options; this request is refused for 10 minutes."
 STATUS_SECONDS = 1.0  # seconds to learn how a worker ended
 START_SECONDS = 20.0  # seconds for a worker to fork, if it need not load
 BEAT_SECONDS = 3.0  # seconds between two checks that a worker is alive
@@ -282,7 +280,7 @@ class WorkerPool:
                     lost = worker in self._workers
                     self._workers.discard(worker)  # `take` skips it
                     if await worker.nursery.crashed(worker.pid):
-                        worker.finish(HarmfulRequest("request", CRASHED, CRASH_FIX))
+                        worker.finish(HarmfulRequest())
                     break
                 self._answered = time.monotonic()
                 worker.finish(answer)
