@@ -139,6 +139,12 @@ def report(error: Exception) -> Problem:
     return Problem(kind, detail, field, value, fix, code, status, retry_after)
 
 
+def no_message(data: bytes) -> InvalidRequest:
+    """The error for bytes that protobuf cannot read."""
+    value = f"{len(data)} bytes that are no message of this method"
+    return InvalidRequest("request", value, "Send a message as the .proto file has it.")
+
+
 def problem_document(problem: Problem) -> bytes:
     """An error as a problem document (RFC 9457)."""
     title = problem.kind.replace("-", " ").capitalize()

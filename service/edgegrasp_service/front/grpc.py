@@ -44,6 +44,7 @@ from edgegrasp_service.errors import (
     NotReady,
     Problem,
     RequestTimeout,
+    no_message,
     report,
 )
 from edgegrasp_service.front.service import MAX_HEADERS, GraspService, Places
@@ -320,7 +321,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
             value = f"nothing whole in {SMALL_READ_SECONDS:g} s"
             raise RequestTimeout("request", value, "Send it at once.") from None
         except DecodeError:
-            raise _no_message(data) from None
+            raise no_message(data) from None
 
 
 async def _unimplemented(call: Call, context: Any) -> None:
@@ -329,11 +330,6 @@ async def _unimplemented(call: Call, context: Any) -> None:
 
 def _not_found(code: grpc.StatusCode, detail: str) -> Problem:
     return Problem("grpc", detail, "", "", "", code.name, 404)
-
-
-def _no_message(data: bytes) -> InvalidRequest:
-    value = f"{len(data)} bytes that are no message of this method"
-    return InvalidRequest("request", value, "Send a message as the .proto file has it.")
 
 
 def _serialized(message: Any) -> bytes:
@@ -399,7 +395,7 @@ async def _next_request(context: Any) -> dict[str, Any] | None:
             place += size
     except (IndexError, UnicodeDecodeError):
         pass
-    raise _no_message(data)
+    raise no_message(data)
 
 
 def _varint(data: bytes, place: int) -> tuple[int, int]:

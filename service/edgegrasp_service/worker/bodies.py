@@ -35,7 +35,7 @@ from edgegrasp_model.request_cloud import (
     value_of_text,
 )
 from edgegrasp_results import Detection, Scoring, plain
-from edgegrasp_service.errors import UnsupportedMediaType
+from edgegrasp_service.errors import UnsupportedMediaType, no_message
 from edgegrasp_service.worker.process import Job, Transport
 
 JSON, FORM = "application/json", "multipart/form-data"
@@ -209,9 +209,7 @@ def _fields_of_message(job: Job) -> dict[str, Any]:
     try:
         message: Any = kind.FromString(job.body)
     except DecodeError:
-        value = f"{len(job.body)} bytes that are no message of this method"
-        fix = "Send a message as the .proto file has it."
-        raise InvalidRequest("request", value, fix) from None
+        raise no_message(job.body) from None
     _check(message, "request")
     fields: dict[str, Any] = {}
     if message.HasField("points"):
