@@ -192,8 +192,9 @@ def test_models_are_listed_from_a_server_or_from_here(dummy_server, run, refused
         assert "dummy" in run("models", "--server", address)
     assert "panda" in run("models")
     assert "edgegrasp models: " in refused("models", "--server", "127.0.0.1:1")
-    beside = refused("models", "--server", dummy_server.grpc_address, "--device", "cuda")
-    assert "--device: got --server beside it" in beside
+    for command in (("models", "--device", "cuda"), ("detect", "x.npy", "--grippers", "x.toml")):
+        beside = refused(*command, "--server", dummy_server.grpc_address)
+        assert f"{command[-2]}: got --server beside it" in beside
 
 
 def test_a_server_with_tls_and_tokens(file, pem, run, refused, tmp_path, start_dummy, monkeypatch):
