@@ -262,8 +262,9 @@ def _extend(container: Any, values: object, path: str, messages: bool) -> None:
         for row, value in enumerate(values):
             fill(container.add(), value, f"{path}.{row}")
         return
-    if path.rpartition(".")[2].startswith("T_") and all(isinstance(row, list) for row in values):
-        values = [number for row in values for number in row]  # a pose by its rows, like an array
+    by_rows = path.rpartition(".")[2].startswith(("T_", "surface"))  # as answers in JSON have them
+    if by_rows and all(isinstance(row, list) for row in values):
+        values = [number for row in values for number in row]
     try:
         container.extend(values)
     except (TypeError, ValueError) as error:

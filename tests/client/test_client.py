@@ -90,7 +90,7 @@ ALL_OPTIONS: dict[str, Any] = MANY | {
         "gripper": "panda",
         "next_id": 8,
         "grasps": [{"id": 7, "T_cloud_hand": np.eye(4).ravel(), "object": np.int64(3)}],
-        "objects": [{"number": 3, "surface": np.zeros(6, np.float32), "confidence": None}],
+        "objects": [{"number": 3, "surface": np.zeros((2, 3), np.float32), "confidence": None}],
         "search": True,
     },
 }
