@@ -192,7 +192,7 @@ def _valid_points(
     if cloud.dtype not in (np.float32, np.float64):
         raise InvalidRequest("cloud", f"dtype {cloud.dtype}", "Send float32 or float64 metres.")
     if len(cloud) == 0:
-        raise InvalidRequest("cloud", "no points", "Send at least num_approach_points points.")
+        raise InvalidRequest("cloud", "no points", "Send points in metres.")
     low, high = (np.array([end(axis) for axis in cloud.T]) for end in (np.min, np.max))
     if not np.isfinite([low, high]).all():
         finite = _finite(cloud)
