@@ -83,9 +83,10 @@ class AddressInUse(EdgeGraspError):  # noqa: N818
     """A port or socket cannot be bound."""
 
     def __init__(self, transport: str, place: str, why: str) -> None:
-        fix = "Stop what listens there, or name another"
-        flag = f"--{transport.lower()}-port" if ":" in place else "--host"
-        super().__init__(f"{transport}: cannot listen on {place} ({why}). {fix}: {flag}.")
+        port = f"another: --{transport.lower()}-port"
+        other = port if ":" in place else "a folder that exists: --host"
+        fix = f"Stop what listens there, or name {other}"
+        super().__init__(f"{transport}: cannot listen on {place} ({why}). {fix}.")
 
 
 # Names of gRPC codes, and HTTP statuses.

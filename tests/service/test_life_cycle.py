@@ -204,6 +204,8 @@ async def test_sockets_of_a_folder(serve, transport: str, cloud: np.ndarray) -> 
                 await serve(host=f"unix:{folder}")
             running.stop.set()
             await running.serving
+    with pytest.raises(AddressInUse, match="name a folder that exists: --host"):
+        await serve(host=f"unix:{folder}")  # gone
 
 
 async def test_a_name_with_several_addresses_has_all_of_them_asked(serve, cloud) -> None:
