@@ -271,7 +271,7 @@ def _schema_of_options() -> tuple[dict[str, Any], dict[str, Any]]:
             if name not in definitions:
                 definitions[name] = schemas[name]
                 todo.append(schemas[name])
-    del options["properties"]["robot"]  # an argument of its own
+    del options["properties"]["robot"], options["properties"]["top_k"]  # arguments of their own
     definitions["RobotArm"]["required"].remove("T_base_cloud")
     return options, definitions
 
@@ -283,6 +283,8 @@ def _asked(
     viewpoint: list[float] | None = None,
 ) -> dict[str, Any]:
     """The options of a request; a tool's own arguments take precedence."""
+    if "top_k" in (options or {}):
+        raise ValueError("options.top_k: got num_grasps beside it. Give num_grasps alone.")
     asked = {**(options or {}), "top_k": num_grasps}
     if viewpoint:
         asked["viewpoint"] = viewpoint

@@ -76,7 +76,8 @@ async def test_an_agent_gets_grasps_and_sees_them(dummy_server, folder: Path) ->
         jsonschema.Draft202012Validator.check_schema(schema)
         validator = jsonschema.Draft202012Validator(schema)
         validator.validate(IMAGE | {"options": {"workspace": {"min": [0, 0, 0], "max": [1, 1, 1]}}})
-        for wrong in ({"object": "bottle"}, {"options": {"workspace": 3}}, {"num_grasps": -3}):
+        wrong_options = ({"options": {"workspace": 3}}, {"options": {"top_k": 1}})
+        for wrong in ({"object": "bottle"}, *wrong_options, {"num_grasps": -3}):
             assert not validator.is_valid(IMAGE | wrong)
         assert client.server_info.version == importlib.metadata.version("edgegrasp")
         health = await client.call_tool("edgegrasp_health_check", {})
@@ -152,6 +153,7 @@ MASKED_CLOUD = {"point_cloud_file": "cloud.npy", "mask_file": "mask.png"}
         (CLOUD, {"robot": {"name": "r2d2", "joints": [0.0]}}, "options.robot.name"),
         (CLOUD, {"robot": {"name": "fr3"}}, "options.robot.joints"),
         (CLOUD, {"options": {"tok_k": 1}}, "options.tok_k"),
+        (CLOUD, {"options": {"top_k": 1}}, "options.top_k: got num_grasps beside it"),
         (DEPTH, {"depth_file": "depth.png", "intrinsics": [1]}, "fx, fy"),
         (DEPTH, IMAGE | {"robot": {"name": "fr3"}}, "give T_base_camera"),
         ("visualize_grasps", IMAGE | {"T_base_camera": [[1.0], [0.0, 1.0]]}, "T_cloud_camera"),
