@@ -131,13 +131,8 @@ def models(*, asked: DetectorFlags) -> None:
     with waiting, open_client(asked) as client:
         found = client.models()
     for row in found:
-        table.add_row(
-            f"{row.name} (default)" if row.default else row.name,
-            row.architecture,
-            f"{row.parameters:,}",
-            row.gripper,
-            row.device,
-        )
+        name = f"{row.name} (default)" if row.default else row.name
+        table.add_row(name, row.architecture, f"{row.parameters:,}", row.gripper, row.device)
     Console().print(table)
 
 
@@ -247,9 +242,8 @@ def _robot_option(asked: DetectFlags) -> dict[str, Any]:
 
 def _write_trajectory(file: Path, detection: Any) -> None:
     """Write the best pick and its trajectory; raises ValueError if there is none."""
-    moving = (one for one in detection.grasps if one.arm is not None and one.arm.trajectory)
-    best = next(moving, None)
-    if best is None:
+    best = detection.best_pick
+    if best is None or best.arm.trajectory is None:
         raise ValueError(f"--trajectory: the arm has no way to any grasp ({_counts(detection)}).")
     motion = {**vars(best.arm.trajectory), "T_cloud_hand": best.T_cloud_hand, "width": best.width}
     file.write_text(json.dumps(motion, default=np.ndarray.tolist))

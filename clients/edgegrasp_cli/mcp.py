@@ -209,9 +209,8 @@ class _Tools:
     def _image(
         self, name: str, intrinsics: list[float], scale: float | None, pose: Matrix | None
     ) -> "DepthImage":
-        image: DepthImage = {"depth": self._path(name), "intrinsics": intrinsics}
-        if scale is not None:
-            image["depth_scale"] = scale
+        file = self._path(name)
+        image: DepthImage = {"depth": file, "intrinsics": intrinsics, "depth_scale": scale}
         if pose is not None:
             image["T_cloud_camera"] = pose
         return image

@@ -57,9 +57,7 @@ def view(
     file: Annotated[
         Path | None, Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
     ] = None,
-    depth: Annotated[
-        Path | None, Option(help="Depth image in place of a cloud: .png of 16 bits, or .npy.")
-    ] = None,
+    depth: Annotated[Path | None, Option(help="Depth image: .png of 16 bits, or .npy.")] = None,
     intrinsics: Annotated[str | None, Option(help="Camera of --depth: fx,fy,cx,cy.")] = None,
     depth_scale: Annotated[
         float | None, Option(help="Metres for one unit of --depth (0.001; of floats 1).")
