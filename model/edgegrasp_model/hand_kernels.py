@@ -16,42 +16,27 @@ def points_in_hand_boxes(
 
     Hand (P,) ascending, row (P,) ascending within each, position (3, P) in its frame.
     """
-    columns, turn, shift = columns_of(points), *_to_hand(T_cloud_hand)
-    count = np.empty(len(turn), dtype=np.int64)
-    _count_within(columns, turn, shift, low, high, count)
-    hand = np.repeat(np.arange(len(turn)), count)
-    row = np.empty(len(hand), dtype=np.int64)
-    position = np.empty((3, len(hand)), dtype=np.float32)
-    _fill_within(columns, turn, shift, low, high, np.cumsum(count) - count, row, position)
-    return hand, row, position
+    return _within(*_to_hand(points, T_cloud_hand), low, high)
 
 
 def any_point_in_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Bools:
     """Which hands (E,) have a point (N, 3) in one of their boxes (B, 2, 3), hand frame."""
-    turn, shift = _to_hand(T_cloud_hand)
-    hit = np.zeros(len(turn), dtype=np.bool_)
     around = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)]).astype(np.float32)
-    _meet(columns_of(points), turn, shift, boxes.astype(np.float32), around, hit)
-    return hit
+    return _meet(*_to_hand(points, T_cloud_hand), boxes.astype(np.float32), around)
 
 
 def any_point_on_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, way: Float32) -> Bools:
     """As `any_point_in_boxes`, of hands that move straight along `way` (3,), cloud frame."""
-    turn, shift = _to_hand(T_cloud_hand)
-    hit = np.zeros(len(turn), dtype=np.bool_)
+    columns, turn, shift = _to_hand(points, T_cloud_hand)
     lift = np.ascontiguousarray(turn @ way.astype(np.float32))
-    _meet_on_way(columns_of(points), turn, shift, boxes.astype(np.float32), lift, hit)
-    return hit
+    return _meet_on_way(columns, turn, shift, boxes.astype(np.float32), lift)
 
 
 def signed_distance_to_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Float32:
     """Signed distance (E,) of points (N, 3) to the boxes (B, 2, 3) of each hand, the least."""
-    turn, shift = _to_hand(T_cloud_hand)
     middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2
-    nearest = np.full(len(turn), np.inf, dtype=np.float32)
     extents = np.stack((middle, half), axis=1).astype(np.float32)
-    _nearest_to_boxes(columns_of(points), turn, shift, extents, nearest)
-    return nearest
+    return _nearest_to_boxes(*_to_hand(points, T_cloud_hand), extents)
 
 
 def free_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, behind: float) -> Float32:
@@ -61,10 +46,8 @@ def free_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, behind: flo
     metres behind a box are in its way too. Negative where a hand would have to move back; infinity
     where nothing is ahead.
     """
-    turn, shift = _to_hand(T_cloud_hand)
-    way = np.full(len(turn), np.inf, dtype=np.float32)
-    _until_met(columns_of(points), turn, shift, boxes.astype(np.float32), np.float32(behind), way)
-    return way
+    hands = _to_hand(points, T_cloud_hand)
+    return _until_met(*hands, boxes.astype(np.float32), np.float32(behind))
 
 
 def extents_between(
@@ -74,67 +57,13 @@ def extents_between(
 
     Hand e looks at rows first[e] to last[e]; `pads` are least and greatest x and z, hand frame.
     """
-    turn, shift = _to_hand(T_cloud_hand)
-    extent = np.empty((len(turn), 2), dtype=np.float32)
-    _between_pads(columns_of(points[rows]), first, last, turn, shift, pads, extent)
-    return extent
+    return _between_pads(*_to_hand(points[rows], T_cloud_hand), first, last, pads)
 
 
-def distance_behind(
-    # (2 H + 1, 2 H + 1) metres from the camera in each cell, the middle cell straight ahead; inf
-    # where nothing was seen.
-    surface: Float32,
-    turn: Floats,  # (E, 3, 3) from each hand's frame to the camera's: across, down, ahead
-    shift: Floats,  # (E, 3) of each hand in the camera's frame
-    places: Float32,  # (S, 3) hand frame
-    cell: float,  # tangent of the angle of a cell
-) -> Float32:
-    """Metres (E, S) that places of hands lie behind the first surface a camera saw, or 0."""
-    behind = np.zeros((len(turn), len(places)), dtype=np.float32)
-    turn = np.ascontiguousarray(turn, dtype=np.float32)
-    _behind(surface, turn, shift.astype(np.float32), places, np.float32(1.0 / cell), behind)
-    return behind
-
-
-def non_max_suppression(
-    T_cloud_tcp: Float32, order: Int64, near: float, angle: float, most: int
-) -> tuple[Int64, Int64]:
-    """Keep the first of each group of near duplicates in `order` (M,), `most` at most.
-
-    Those are within `near` metres of each other, T_cloud_tcp (E, 4, 4), and `angle` radians; half a
-    turn about the approach counts as none. Returns the rows kept, in order, and the duplicates
-    dropped.
-    """
-    kept, dropped = np.zeros((2, len(order)), dtype=np.bool_)
-    _suppress(order, *_compared(T_cloud_tcp, near, angle), most, kept, dropped)
-    return order[kept], order[dropped]
-
-
-def mean_of_alike(
-    values: Float32, T_cloud_tcp: Float32, number: Int64, near: float, angle: float
-) -> Float32:
-    """The mean value (E,) of the other hands on the same object that are like each one.
-
-    Those are within `near` metres of it, T_cloud_tcp (E, 4, 4), and `angle` radians; half a turn
-    about the approach counts as none. `number` (E,) are the objects. NaN where there is none.
-    """
-    mean = np.empty_like(values)
-    _average_alike(values, number, *_compared(T_cloud_tcp, near, angle), mean)
-    return mean
-
-
-def _compared(T_cloud_tcp: Float32, near: float, angle: float) -> tuple[Float32, Float32, Float32]:
-    """Places (E, 3), rotations (E, 3, 3), and limits (2,): squared distance, `_likeness`."""
-    turn = np.ascontiguousarray(T_cloud_tcp[:, :3, :3])
-    place = np.ascontiguousarray(T_cloud_tcp[:, :3, 3])
-    least_trace = 1.0 + 2.0 * np.cos(angle) if angle < np.pi else -np.inf
-    return place, turn, np.array([near**2, least_trace], dtype=np.float32)
-
-
-def _to_hand(T_cloud_hand: Float32) -> tuple[Float32, Float32]:
-    """Rotations (E, 3, 3) and translations (E, 3) from the cloud's frame to hand frames."""
+def _to_hand(points: Float32, T_cloud_hand: Float32) -> tuple[Float32, Float32, Float32]:
+    """Points as rows x, y, z (3, N); rotations (E, 3, 3) and shifts (E, 3) to hand frames."""
     turn = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
-    return turn, -(turn @ T_cloud_hand[:, :3, 3:])[:, :, 0]
+    return columns_of(points), turn, -(turn @ T_cloud_hand[:, :3, 3:])[:, :, 0]
 
 
 @compiled("contract")
@@ -231,48 +160,35 @@ def _may_reach(sphere: Float32, turn: Float32, shift: Float32, low: Float32, hig
 
 
 @compiled("contract")
-def _count_within(
-    columns: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32, count: Int64
-) -> None:
-    sphere = _blocks(columns)
-    for e in range(len(turn)):
-        found = 0
-        for k in range(len(sphere)):
-            if _may_reach(sphere[k], turn[e], shift[e], low, high):
-                found += _count_between(columns, k, turn[e], shift[e], low, high)
-        count[e] = found
-
-
-@compiled("contract")
-def _fill_within(
-    columns: Float32,
-    turn: Float32,
-    shift: Float32,
-    low: Float32,
-    high: Float32,
-    first: Int64,
-    row: Int64,
-    position: Float32,
-) -> None:
+def _within(
+    columns: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32
+) -> tuple[Int64, Int64, Float32]:
     sphere = _blocks(columns)
     xs, ys, zs = columns[0], columns[1], columns[2]
+    count = 0
     for e in range(len(turn)):
-        place = first[e]
+        for k in range(len(sphere)):
+            if _may_reach(sphere[k], turn[e], shift[e], low, high):
+                count += _count_between(columns, k, turn[e], shift[e], low, high)
+    hand, row = np.empty(count, np.int64), np.empty(count, np.int64)
+    position, place = np.empty((3, count), np.float32), 0
+    for e in range(len(turn)):
         for k in range(len(sphere)):
             if _may_reach(sphere[k], turn[e], shift[e], low, high):
                 for i in range(k * BLOCK, min((k + 1) * BLOCK, len(xs))):
                     x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
                     if _between(x, y, z, low, high):
-                        row[place] = i
+                        hand[place], row[place] = e, i
                         position[0, place], position[1, place], position[2, place] = x, y, z
                         place += 1
+    return hand, row, position
 
 
 @compiled("contract")
 def _meet(
-    columns: Float32, turn: Float32, shift: Float32, boxes: Float32, around: Float32, hit: Bools
-) -> None:
-    sphere = _blocks(columns)
+    columns: Float32, turn: Float32, shift: Float32, boxes: Float32, around: Float32
+) -> Bools:
+    sphere, hit = _blocks(columns), np.zeros(len(turn), np.bool_)
     least, most = around
     for e in range(len(turn)):
         for k in range(len(sphere)):
@@ -286,6 +202,7 @@ def _meet(
             if inside:
                 hit[e] = True
                 break
+    return hit
 
 
 @compiled("contract")
@@ -296,7 +213,7 @@ def _count_on_way(
     shift: Float32,
     low: Float32,
     high: Float32,
-    per_way: Float32,
+    per_way: Floats,
 ) -> int:
     """How many points of block k a box passes over; `per_way` (3,): 1 / its way, hand frame."""
     start, stop = k * BLOCK, (k + 1) * BLOCK
@@ -316,9 +233,9 @@ def _count_on_way(
 
 @compiled("contract")
 def _meet_on_way(
-    columns: Float32, turn: Float32, shift: Float32, boxes: Float32, lift: Float32, hit: Bools
-) -> None:
-    sphere = _blocks(columns)
+    columns: Float32, turn: Float32, shift: Float32, boxes: Float32, lift: Float32
+) -> Bools:
+    sphere, hit = _blocks(columns), np.zeros(len(turn), np.bool_)
     none = np.float32(0.0)
     for e in range(len(turn)):
         below, above = np.minimum(lift[e], none), np.maximum(lift[e], none)
@@ -332,13 +249,12 @@ def _meet_on_way(
                     break
             if hit[e]:
                 break
+    return hit
 
 
 @compiled("contract", "nnan", "nsz", "reassoc")
-def _nearest_to_boxes(
-    columns: Float32, turn: Float32, shift: Float32, extents: Float32, nearest: Float32
-) -> None:
-    sphere = _blocks(columns)
+def _nearest_to_boxes(columns: Float32, turn: Float32, shift: Float32, extents: Float32) -> Float32:
+    sphere, nearest = _blocks(columns), np.full(len(turn), np.inf, np.float32)
     for e in range(len(turn)):
         for k in range(len(sphere)):
             block = columns[:, k * BLOCK : (k + 1) * BLOCK]
@@ -350,6 +266,7 @@ def _nearest_to_boxes(
                 ):
                     here = _nearest_to_box(block, turn[e], shift[e], extents[b])
                     nearest[e] = min(nearest[e], here)
+    return nearest
 
 
 @compiled("contract", "nnan", "nsz", "reassoc")
@@ -377,9 +294,8 @@ def _until_met(
     shift: Float32,
     boxes: Float32,
     behind: np.float32,
-    way: Float32,
-) -> None:
-    sphere = _blocks(columns)
+) -> Float32:
+    sphere, way = _blocks(columns), np.empty(len(turn), np.float32)
     ahead = np.empty(BLOCK, np.float32)
     for e in range(len(turn)):
         nearest = np.float32(np.inf)
@@ -393,19 +309,14 @@ def _until_met(
                     least = _least_between(columns, k, turn[e], shift[e], low, high, ahead)
                     nearest = min(nearest, least - front)
         way[e] = nearest
+    return way
 
 
 @compiled("contract")
 def _between_pads(
-    columns: Float32,
-    first: Int64,
-    last: Int64,
-    turn: Float32,
-    shift: Float32,
-    pads: Float32,
-    extent: Float32,
-) -> None:
-    low, high = pads
+    columns: Float32, turn: Float32, shift: Float32, first: Int64, last: Int64, pads: Float32
+) -> Float32:
+    (low, high), extent = pads, np.empty((len(turn), 2), np.float32)
     for e in range(len(turn)):
         xs, ys, zs = columns[:, first[e] : last[e]]
         least, most = np.float32(np.inf), np.float32(-np.inf)
@@ -415,11 +326,75 @@ def _between_pads(
             least = min(least, y if between else np.float32(np.inf))
             most = max(most, y if between else np.float32(-np.inf))
         extent[e, 0], extent[e, 1] = least, most
+    return extent
+
+
+@compiled("contract")
+def non_max_suppression(
+    T_cloud_tcp: Float32, order: Int64, near: float, angle: float, most: int
+) -> tuple[Int64, Int64]:
+    """Keep the first of each group of near duplicates in `order` (M,), `most` at most.
+
+    Those are within `near` metres of each other, T_cloud_tcp (E, 4, 4), and `angle` radians; half a
+    turn about the approach counts as none. Returns the rows kept, in order, and the duplicates
+    dropped.
+    """
+    kept, dropped = np.zeros((2, len(order)), np.bool_)
+    rows, found = np.empty(len(order), np.int64), 0
+    xs, ys, zs = np.empty((3, len(order)), np.float32)
+    squared, least = np.float32(near**2), _least_likeness(angle)
+    for m in range(len(order)):
+        row = order[m]
+        px, py, pz = T_cloud_tcp[row, :3, 3]
+        for k in range(found):
+            x, y, z = xs[k] - px, ys[k] - py, zs[k] - pz
+            close = x * x + y * y + z * z < squared
+            if close and _likeness(T_cloud_tcp[row], T_cloud_tcp[rows[k]]) > least:
+                dropped[m] = True
+                break
+        if found < most and not dropped[m]:
+            kept[m] = True
+            xs[found], ys[found], zs[found], rows[found] = px, py, pz, row
+            found += 1
+    return order[kept], order[dropped]
+
+
+@compiled("contract")
+def mean_of_alike(
+    values: Float32, T_cloud_tcp: Float32, number: Int64, near: float, angle: float
+) -> Float32:
+    """The mean value (E,) of the other hands on the same object that are like each one.
+
+    Those are within `near` metres of it, T_cloud_tcp (E, 4, 4), and `angle` radians; half a turn
+    about the approach counts as none. `number` (E,) are the objects. NaN where there is none.
+    """
+    total, count = np.zeros(len(values)), np.zeros(len(values), np.int64)
+    place, mean = T_cloud_tcp[:, :3, 3].copy(), np.empty_like(values)
+    squared, least = np.float32(near**2), _least_likeness(angle)
+    for i in range(len(values)):
+        px, py, pz = place[i]
+        for j in range(i):
+            x, y, z = place[j, 0] - px, place[j, 1] - py, place[j, 2] - pz
+            close = number[i] == number[j] and x * x + y * y + z * z < squared
+            if close and _likeness(T_cloud_tcp[i], T_cloud_tcp[j]) > least:
+                total[i] += values[j]
+                total[j] += values[i]
+                count[i] += 1
+                count[j] += 1
+    for i in range(len(values)):
+        mean[i] = total[i] / count[i] if count[i] else np.nan
+    return mean
+
+
+@compiled("contract")
+def _least_likeness(angle: float) -> np.float32:
+    """The trace of a rotation by an angle; all hands are alike from half a turn on."""
+    return np.float32(1.0 + 2.0 * np.cos(angle) if angle < np.pi else -np.inf)
 
 
 @compiled("contract")
 def _likeness(one: Float32, other: Float32) -> np.float32:
-    """Trace of the rotation between two (3, 3); half a turn about z counts as none."""
+    """Trace of the rotation between two poses; half a turn about z counts as none."""
     x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)  # cosines of matching axes
     for d in range(3):
         x += one[d, 0] * other[d, 0]
@@ -430,61 +405,17 @@ def _likeness(one: Float32, other: Float32) -> np.float32:
 
 
 @compiled("contract")
-def _suppress(
-    order: Int64,
-    place: Float32,
-    turn: Float32,
-    limits: Float32,
-    most: int,
-    kept: Bools,
-    dropped: Bools,
-) -> None:
-    rows, found = np.empty(len(order), np.int64), 0
-    xs, ys, zs = np.empty((3, len(order)), np.float32)
-    for m in range(len(order)):
-        row = order[m]
-        px, py, pz = place[row]
-        for k in range(found):
-            x, y, z = xs[k] - px, ys[k] - py, zs[k] - pz
-            near = x * x + y * y + z * z < limits[0]
-            if near and _likeness(turn[row], turn[rows[k]]) > limits[1]:
-                dropped[m] = True
-                break
-        if found < most and not dropped[m]:
-            kept[m] = True
-            xs[found], ys[found], zs[found], rows[found] = px, py, pz, row
-            found += 1
-
-
-@compiled("contract")
-def _average_alike(
-    values: Float32, number: Int64, place: Float32, turn: Float32, limits: Float32, mean: Float32
-) -> None:
-    total, count = np.zeros(len(values)), np.zeros(len(values), np.int64)
-    for i in range(len(values)):
-        px, py, pz = place[i]
-        for j in range(i):
-            x, y, z = place[j, 0] - px, place[j, 1] - py, place[j, 2] - pz
-            near = number[i] == number[j] and x * x + y * y + z * z < limits[0]
-            if near and _likeness(turn[i], turn[j]) > limits[1]:
-                total[i] += values[j]
-                total[j] += values[i]
-                count[i] += 1
-                count[j] += 1
-    for i in range(len(values)):
-        mean[i] = total[i] / count[i] if count[i] else np.nan
-
-
-@compiled("contract")
-def _behind(
+def distance_behind(
+    # (2 H + 1, 2 H + 1) metres from the camera in each cell, the middle cell straight ahead; inf
+    # where nothing was seen.
     surface: Float32,
-    turn: Float32,
-    shift: Float32,
-    places: Float32,
-    cells: np.float32,
-    behind: Float32,
-) -> None:
-    half = len(surface) // 2
+    turn: Float32,  # (E, 3, 3) from each hand's frame to the camera's: across, down, ahead
+    shift: Float32,  # (E, 3) of each hand in the camera's frame
+    places: Float32,  # (S, 3) hand frame
+    cells: np.float32,  # in a tangent of 1
+) -> Float32:
+    """Metres (E, S) that places of hands lie behind the first surface a camera saw, or 0."""
+    behind, half = np.zeros((len(turn), len(places)), np.float32), len(surface) // 2
     for e in range(len(turn)):
         for s in range(len(places)):
             x, y, z = _position(places[s, 0], places[s, 1], places[s, 2], turn[e], shift[e])
@@ -493,3 +424,4 @@ def _behind(
             if (abs(i) <= half) & (abs(j) <= half):
                 first = surface[int(i) + half, int(j) + half]
                 behind[e, s] = max(np.sqrt(x * x + y * y + z * z) - first, np.float32(0.0))
+    return behind

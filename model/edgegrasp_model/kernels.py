@@ -5,12 +5,14 @@ processor's cache.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
+
+Loop = TypeVar("Loop", bound=Callable[..., Any])
 
 ROUNDING = 1e-4  # share of a squared distance; a generous bound of float32 errors
 STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it
@@ -87,17 +89,16 @@ def columns_of(points: Float32) -> Float32:
     return np.ascontiguousarray(points.T, dtype=np.float32)
 
 
-def compiled(*freedom: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def compiled(*freedom: str) -> Callable[[Loop], Loop]:
     """Compile on the first call, cached on disk; `freedom` is LLVM's fast-math flags."""
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": set(freedom)}
 
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+    def decorate(function: Loop) -> Loop:
         try:
-            kept: Callable[..., Any] = numba.njit(cache=True, **options)(function)
-            return kept
+            loop: Loop = numba.njit(cache=True, **options)(function)
         except RuntimeError:  # no folder is writable, neither beside the file nor the user's own
-            fresh: Callable[..., Any] = numba.njit(**options)(function)
-            return fresh
+            loop = numba.njit(**options)(function)
+        return loop
 
     return decorate
 

@@ -299,9 +299,9 @@ class DepthMap:
 
     def behind(self, T_cloud_hand: Float32, places: Float32) -> Float32:
         """Metres (E, S) that places (S, 3) of hands (E, 4, 4) lie behind a surface, or 0."""
-        turn = self.axes @ T_cloud_hand[:, :3, :3]
-        shift = (T_cloud_hand[:, :3, 3] - self.viewpoint) @ self.axes.T
-        return distance_behind(self.distance, turn, shift, places, self.cell)
+        turn = np.ascontiguousarray(self.axes @ T_cloud_hand[:, :3, :3], dtype=np.float32)
+        shift = ((T_cloud_hand[:, :3, 3] - self.viewpoint) @ self.axes.T).astype(np.float32)
+        return distance_behind(self.distance, turn, shift, places, np.float32(1.0 / self.cell))
 
 
 @compiled()

@@ -126,7 +126,7 @@ def _segment_view(
     of_pixel = new[of_pixel]
     number = np.full(len(points), UNKNOWN)
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
-    T_camera_cloud = np.linalg.inv(image.T_cloud_camera)
+    T_camera_cloud = np.linalg.inv(image.T_cloud_camera).astype(np.float64)
     arrays = pixels.points, of_pixel, pixels.classes, number, objects, support
     _look_up(points, T_camera_cloud, image.corner, 2 * image.footprint, *arrays)
     return Segmentation(number, objects, support, confidence[likely], turn @ seen_up)
