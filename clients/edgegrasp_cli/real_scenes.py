@@ -253,7 +253,7 @@ def judge(
 
 def _meet_points(scene: RealScene, grasps: Sequence[Any], gripper: Gripper) -> Bools:
     """Which open hands (E,) contain a measured point, before any cleaning, deeper than NOISE."""
-    from edgegrasp_model.hand_kernels import any_point_in_boxes  # loads Numba
+    from edgegrasp_model.kernels import any_point_in_boxes  # loads Numba
 
     seen = scene.points[np.isfinite(scene.points).all(axis=1)]
     hands = np.reshape([grasp.T_cloud_hand for grasp in grasps], (-1, 4, 4)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Loops over the points of a cloud, compiled to machine code by Numba.
+"""Loops over the points that each hand may meet or see, compiled to machine code by Numba.
 
 NumPy would need many passes over large arrays; these loops take one point at a time and stay in the
 processor's cache.
@@ -10,83 +10,12 @@ from typing import Any, TypeVar
 import numba
 import numpy as np
 
-from edgegrasp_camera.arrays import Float32, Float64, Int64
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
 
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 
-ROUNDING = 1e-4  # share of a squared distance; a generous bound of float32 errors
-STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it
-JACOBI_SWEEPS = 6  # rounds of Jacobi's method for a symmetric 3 x 3 matrix; more change nothing
-DIAGONAL = 1e-12  # off-diagonal sum, as a share of the trace, at which Jacobi's method stops
-
-
-def nearest_in_groups(points: Float32, bounds: Int64, k: int) -> Int64:
-    """Rows (P, k) of the k nearest points of the same group, the point itself first.
-
-    Points are (P, 3), group after group, from bounds[g] to bounds[g + 1]; the own row fills up
-    small groups.
-    """
-    nearest = np.empty((len(points), k), dtype=np.int64)
-    if len(points):
-        _nearest(columns_of(points), bounds, nearest)
-    return nearest
-
-
-def extents_across(
-    points: Float32,  # (N, 3) of the cloud
-    rows: Int64,  # (P,) of points to look at, group after group
-    first: Int64,  # (M,) places in `rows` where the group of each edge begins
-    last: Int64,  # (M,) and where they end
-    # (M, 4, 3) of each edge the point it is at; across the strip, out of the object along it, and
-    # ahead of the hand, unit vectors
-    frame: Float32,
-    # (4,) its half width and its length, how far ahead of the edge its points may be, and the gap
-    # length that ends it, metres
-    strip: Float32,
-) -> Float32:
-    """Least and greatest metres (M, 2) that the surface extends into the object, across an edge."""
-    extent = np.zeros((len(frame), 2), dtype=np.float32)
-    _along_strips(columns_of(points[rows]), first, last, frame, strip, extent)
-    return extent
-
-
-def level_spread(
-    points: Float32,  # (N, 3) of the cloud
-    rows: Int64,  # (M,) of the points to look at
-    toward: Float32,  # (T, M, 3) unit, toward each viewpoint
-    radius: float,  # metres around each point in which others count,
-    drop: float,  # and how much lower they may lie, metres
-) -> tuple[Float32, Float32, Float32]:
-    """How the neighbourhood of each point is distributed, from each viewpoint.
-
-    Returns the direction orthogonal to `toward` in which they spread least, (T, M, 3) unit; how far
-    (T, M) the point lies from their mean along it, not negative; their standard deviation (T, M)
-    along it, metres.
-    """
-    cells = np.floor((points - points.min(axis=0)) / np.float32(radius)).astype(np.int64) + 1
-    sizes = cells.max(axis=0) + 2
-    key = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
-    order = np.argsort(key, kind="stable")
-    least = np.empty(toward.shape, dtype=np.float32)
-    offset, deviation = np.empty((2, *toward.shape[:2]), dtype=np.float32)
-    _level_spread(
-        columns_of(points[order]),
-        key[order],
-        points[rows],
-        key[rows],
-        sizes,
-        toward,
-        np.array([radius, drop], dtype=np.float32),
-        least,
-        offset,
-        deviation,
-    )
-    return least, offset, deviation
-
-
-def columns_of(points: Float32) -> Float32:
-    """Points (N, 3) as rows x, y, z (3, N)."""
-    return np.ascontiguousarray(points.T, dtype=np.float32)
+BLOCK = 64  # points per block; blocks out of reach are skipped
+SLACK = 1e-5  # metres; a generous bound of float32 errors
 
 
 def compiled(*freedom: str) -> Callable[[Loop], Loop]:
@@ -103,225 +32,424 @@ def compiled(*freedom: str) -> Callable[[Loop], Loop]:
     return decorate
 
 
-@compiled("contract")
-def least_spread(points: Float32, rows: Int64) -> Float32:
-    """Unit direction (M, 3), either sign, in which points (N, 3) of rows (M, K) spread least."""
-    count, direction = rows.shape[1], np.empty((len(rows), 3), np.float32)
-    around, spread, axes = np.empty((count, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for m in range(len(rows)):
-        for d in range(3):
-            mean = 0.0
-            for k in range(count):
-                around[k, d] = points[rows[m, k], d]
-                mean += around[k, d]
-            for k in range(count):
-                around[k, d] -= mean / count
-        for i in range(3):
-            for j in range(3):
-                axes[i, j] = 1.0 if i == j else 0.0
-                spread[i, j] = 0.0
-                for k in range(count):
-                    spread[i, j] += around[k, i] * around[k, j]
-        for _ in range(JACOBI_SWEEPS):
-            for turn in range(3):
-                _rotate_away(spread, axes, turn % 2, 1 if turn == 0 else 2)
-            off = abs(spread[0, 1]) + abs(spread[0, 2]) + abs(spread[1, 2])
-            if off <= DIAGONAL * (spread[0, 0] + spread[1, 1] + spread[2, 2]):
-                break
-        least = 0
-        for d in range(1, 3):
-            least = d if spread[d, d] < spread[least, least] else least
-        for d in range(3):
-            direction[m, d] = axes[d, least]
-    return direction
+def points_in_hand_boxes(
+    points: Float32, T_cloud_hand: Float32, low: Float32, high: Float32
+) -> tuple[Int64, Int64, Float32]:
+    """Points (N, 3) between two corners (3,) of hands' frames T_cloud_hand (E, 4, 4), metres.
+
+    Hand (P,) ascending, row (P,) ascending within each, position (3, P) in its frame.
+    """
+    return _within(*_to_hand(points, T_cloud_hand), low, high)
+
+
+def any_point_in_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Bools:
+    """Which hands (E,) have a point (N, 3) in one of their boxes (B, 2, 3), hand frame."""
+    around = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)]).astype(np.float32)
+    return _meet(*_to_hand(points, T_cloud_hand), boxes.astype(np.float32), around)
+
+
+def any_point_on_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, way: Float32) -> Bools:
+    """As `any_point_in_boxes`, of hands that move straight along `way` (3,), cloud frame."""
+    columns, turn, shift = _to_hand(points, T_cloud_hand)
+    lift = np.ascontiguousarray(turn @ way.astype(np.float32))
+    return _meet_on_way(columns, turn, shift, boxes.astype(np.float32), lift)
+
+
+def signed_distance_to_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Float32:
+    """Signed distance (E,) of points (N, 3) to the boxes (B, 2, 3) of each hand, the least."""
+    middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2
+    extents = np.stack((middle, half), axis=1).astype(np.float32)
+    return _nearest_to_boxes(*_to_hand(points, T_cloud_hand), extents)
+
+
+def free_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, behind: float) -> Float32:
+    """How far (E,) hands can move along their z until a box has a point right ahead, metres.
+
+    Points are (N, 3), T_cloud_hand (E, 4, 4), the hand's boxes (B, 2, 3); points up to `behind`
+    metres behind a box are in its way too. Negative where a hand would have to move back; infinity
+    where nothing is ahead.
+    """
+    hands = _to_hand(points, T_cloud_hand)
+    return _until_met(*hands, boxes.astype(np.float32), np.float32(behind))
+
+
+def extents_between(
+    points: Float32, rows: Int64, first: Int64, last: Int64, T_cloud_hand: Float32, pads: Float32
+) -> Float32:
+    """Least and greatest y (E, 2) of the points between the pads of hands; (inf, -inf) without one.
+
+    Hand e looks at rows first[e] to last[e]; `pads` are least and greatest x and z, hand frame.
+    """
+    return _between_pads(*_to_hand(points[rows], T_cloud_hand), first, last, pads)
+
+
+def _to_hand(points: Float32, T_cloud_hand: Float32) -> tuple[Float32, Float32, Float32]:
+    """Points as rows x, y, z (3, N); rotations (E, 3, 3) and shifts (E, 3) to hand frames."""
+    turn = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
+    return columns_of(points), turn, -(turn @ T_cloud_hand[:, :3, 3:])[:, :, 0]
+
+
+def columns_of(points: Float32) -> Float32:
+    """Points (N, 3) as rows x, y, z (3, N)."""
+    return np.ascontiguousarray(points.T, dtype=np.float32)
 
 
 @compiled("contract")
-def _rotate_away(matrix: Float64, axes: Float64, p: int, q: int) -> None:
-    """One rotation of Jacobi's method: makes element (p, q) of a symmetric matrix 0."""
-    if matrix[p, q] == 0.0:
-        return
-    ratio = (matrix[q, q] - matrix[p, p]) / (2.0 * matrix[p, q])
-    tangent = 1.0 / (abs(ratio) + np.sqrt(ratio * ratio + 1.0))
-    tangent = tangent if ratio >= 0.0 else -tangent
-    cosine = 1.0 / np.sqrt(tangent * tangent + 1.0)
-    sine = tangent * cosine
-    for k in range(3):
-        a, b = matrix[k, p], matrix[k, q]
-        matrix[k, p], matrix[k, q] = cosine * a - sine * b, sine * a + cosine * b
-    for k in range(3):
-        a, b = matrix[p, k], matrix[q, k]
-        matrix[p, k], matrix[q, k] = cosine * a - sine * b, sine * a + cosine * b
-        a, b = axes[k, p], axes[k, q]
-        axes[k, p], axes[k, q] = cosine * a - sine * b, sine * a + cosine * b
+def _position(
+    px: np.float32, py: np.float32, pz: np.float32, turn: Float32, shift: Float32
+) -> tuple[np.float32, np.float32, np.float32]:
+    return (
+        turn[0, 0] * px + turn[0, 1] * py + turn[0, 2] * pz + shift[0],
+        turn[1, 0] * px + turn[1, 1] * py + turn[1, 2] * pz + shift[1],
+        turn[2, 0] * px + turn[2, 1] * py + turn[2, 2] * pz + shift[2],
+    )
 
 
 @compiled("contract")
-def _nearest(columns: Float32, bounds: Int64, nearest: Int64) -> None:
-    k = nearest.shape[1]
-    largest = np.max(bounds[1:] - bounds[:-1])
-    squared = np.empty(largest, np.float32)
-    near = np.empty(largest, np.int64)
-    best = np.empty(k, np.float64)
-    for group in range(len(bounds) - 1):
-        start, stop = bounds[group], bounds[group + 1]
-        xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
-        best[:] = np.inf
-        for i in range(len(xs)):
-            px, py, pz = xs[i], ys[i], zs[i]
-            # The k nearest of the previous row bound the distance to this row's k nearest.
-            step = 0.0
-            if i > 0:
-                step = np.float64(px - xs[i - 1]) ** 2
-                step += np.float64(py - ys[i - 1]) ** 2 + np.float64(pz - zs[i - 1]) ** 2
-            limit = np.float32((np.sqrt(best[k - 1]) + np.sqrt(step)) ** 2 * (1.0 + ROUNDING))
-            for j in range(len(xs)):
-                x, y, z = xs[j] - px, ys[j] - py, zs[j] - pz
-                squared[j] = x * x + y * y + z * z
-            found = 0
-            for j in range(len(xs)):
-                near[found] = j
-                found += squared[j] <= limit
-            mine = nearest[start + i]
-            mine[:] = start + i
-            best[:] = np.inf
-            for c in range(found):
-                j = near[c]
-                x = np.float64(xs[j]) - np.float64(px)
-                y = np.float64(ys[j]) - np.float64(py)
-                z = np.float64(zs[j]) - np.float64(pz)
-                here = x * x + y * y + z * z
-                if here < best[k - 1]:
-                    place = k - 1
-                    while place > 0 and best[place - 1] > here:
-                        best[place], mine[place] = best[place - 1], mine[place - 1]
-                        place -= 1
-                    best[place], mine[place] = here, start + j
+def _between(x: np.float32, y: np.float32, z: np.float32, low: Float32, high: Float32) -> bool:
+    inside: bool = (
+        (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1]) & (z > low[2]) & (z < high[2])
+    )
+    return inside
 
 
 @compiled("contract")
-def _along_strips(
-    columns: Float32,
-    first: Int64,
-    last: Int64,
-    frame: Float32,
-    strip: Float32,
-    extent: Float32,
-) -> None:
-    length, gap = strip[1], strip[3]
-    cell = gap / STRIP_CELLS
-    cells = int(np.ceil((length + gap) / cell)) + 1
-    reached = np.empty(cells, np.float32)
-    depth = np.empty(np.max(last - first) if len(first) else 0, np.float32)
-    for m in range(len(frame)):
-        _into_strip(columns, first[m], last[m], frame[m], strip, depth)
-        reached[:] = -np.inf
-        least, found = np.float32(0.0), 0
-        for i in range(last[m] - first[m]):
-            depth[found] = depth[i]
-            found += depth[i] < length
-        for inward in depth[:found]:
-            least = min(least, inward)
-            place = int((inward + gap) / cell)
-            reached[place] = max(reached[place], inward)
-        furthest = np.float32(0.0)
-        for place in range(int(gap / cell), cells):
-            if reached[place] > furthest:
-                if reached[place] - furthest > gap:
-                    break
-                furthest = reached[place]
-        extent[m, 0], extent[m, 1] = least, furthest
-
-
-@compiled("contract")
-def _into_strip(
-    columns: Float32, first: int, last: int, frame: Float32, strip: Float32, depth: Float32
-) -> None:
-    """Distance of a group's points into the object; the strip's length for points outside of it."""
+def _count_between(
+    columns: Float32, k: int, turn: Float32, shift: Float32, low: Float32, high: Float32
+) -> int:
+    """How many points of block k lie between two corners of a hand's frame."""
     # As separate functions on contiguous arrays, such loops are vectorised to 16 points at a time.
-    xs, ys, zs = columns[0, first:last], columns[1, first:last], columns[2, first:last]
-    origin, across, out, ahead = frame[0], frame[1], frame[2], frame[3]
-    half, length, drop, gap = strip[0], strip[1], strip[2], strip[3]
+    start, stop = k * BLOCK, (k + 1) * BLOCK
+    xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
+    found = 0
     for i in range(len(xs)):
-        x, y, z = xs[i] - origin[0], ys[i] - origin[1], zs[i] - origin[2]
-        sideways = x * across[0] + y * across[1] + z * across[2]
-        inward = -(x * out[0] + y * out[1] + z * out[2])
-        below = x * ahead[0] + y * ahead[1] + z * ahead[2]
-        inside = (abs(sideways) < half) & (below < drop) & (inward > -gap)
-        depth[i] = inward if inside else length
+        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        found += _between(x, y, z, low, high)
+    return found
 
 
 @compiled("contract")
-def _level_spread(
+def _least_between(
     columns: Float32,
-    key: Int64,
-    middle: Float32,
-    middle_key: Int64,
-    sizes: Int64,
-    toward: Float32,
-    reach: Float32,
-    least: Float32,
-    offset: Float32,
-    deviation: Float32,
-) -> None:
-    around, axes = np.empty(columns.shape, np.float32), np.zeros((3, 3), np.float32)
-    for m in range(len(middle)):
-        found = 0
-        for dx in range(-1, 2):
-            for dy in range(-1, 2):
-                start = middle_key[m] + (dx * sizes[1] + dy) * sizes[2] - 1
-                for j in range(np.searchsorted(key, start), np.searchsorted(key, start + 3)):
-                    around[0, found] = columns[0, j]
-                    around[1, found] = columns[1, j]
-                    around[2, found] = columns[2, j]
-                    found += 1
-        near = around[0, :found], around[1, :found], around[2, :found]
-        for way in range(len(toward)):
-            _set_level_axes(toward[way, m], axes)
-            count, a, b, aa, ab, bb = _moments(near, middle[m], axes, reach)
-            a, b = a / count, b / count
-            aa, ab, bb = aa / count - a * a, ab / count - a * b, bb / count - b * b
-            turn = 0.5 * np.arctan2(-2.0 * ab, bb - aa)
-            s, t = np.cos(turn), np.sin(turn)  # the direction of least variance
-            outward = -(a * s + b * t)
-            if outward < 0.0:
-                s, t, outward = -s, -t, -outward
-            for d in range(3):
-                least[way, m, d] = s * axes[1, d] + t * axes[2, d]
-            offset[way, m] = outward
-            deviation[way, m] = np.sqrt(max(0.0, s * s * aa + 2.0 * s * t * ab + t * t * bb))
+    k: int,
+    turn: Float32,
+    shift: Float32,
+    low: Float32,
+    high: Float32,
+    ahead: Float32,
+) -> np.float32:
+    """Least z of the points of block k between two corners; `ahead` (BLOCK,) is written over."""
+    start, stop = k * BLOCK, (k + 1) * BLOCK
+    xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
+    for i in range(len(xs)):
+        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        ahead[i] = z if _between(x, y, z, low, high) else np.float32(np.inf)
+    least = np.float32(np.inf)
+    for i in range(len(xs)):
+        least = min(least, ahead[i])
+    return least
 
 
 @compiled("contract")
-def _set_level_axes(up: Float32, axes: Float32) -> None:
-    """Up and two level directions, from the axis that is farthest from up."""
-    first = 0
-    for d in range(1, 3):
-        first = d if abs(up[d]) < abs(up[first]) else first
-    after, last = (first + 1) % 3, (first + 2) % 3
-    length = np.sqrt(up[after] * up[after] + up[last] * up[last])
-    for d in range(3):
-        axes[0, d] = up[d]
-    axes[1, first], axes[1, after], axes[1, last] = 0.0, -up[last] / length, up[after] / length
-    for d in range(3):
-        one, other = (d + 1) % 3, (d + 2) % 3
-        axes[2, d] = up[one] * axes[1, other] - up[other] * axes[1, one]
+def _blocks(columns: Float32) -> Float32:
+    """Bounding spheres (K, 4) of BLOCK points at a time: middle and radius."""
+    count = columns.shape[1]
+    sphere = np.zeros(((count + BLOCK - 1) // BLOCK, 4), np.float32)
+    for k in range(len(sphere)):
+        block = columns[:, k * BLOCK : (k + 1) * BLOCK]
+        furthest = np.float32(0.0)
+        for d in range(3):
+            sphere[k, d] = (block[d].min() + block[d].max()) / np.float32(2.0)
+        for i in range(block.shape[1]):
+            x, y, z = (
+                block[0, i] - sphere[k, 0],
+                block[1, i] - sphere[k, 1],
+                block[2, i] - sphere[k, 2],
+            )
+            furthest = max(furthest, x * x + y * y + z * z)
+        sphere[k, 3] = np.sqrt(furthest) + np.float32(SLACK)
+    return sphere
 
 
-@compiled("contract", "reassoc", "nsz")
-def _moments(
-    points: tuple[Float32, Float32, Float32], middle: Float32, axes: Float32, reach: Float32
-) -> tuple[np.float32, ...]:
-    """How many points are near, and the sums of their level coordinates s, t, s s, s t and t t."""
-    count, a, b, aa, ab, bb = np.zeros(6, np.float32)
-    xs, ys, zs = points
+@compiled("contract")
+def _may_reach(sphere: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32) -> bool:
+    """Whether a point of a block may lie in a box of the hand frame, given by two corners."""
+    x, y, z = _position(sphere[0], sphere[1], sphere[2], turn, shift)
+    r = sphere[3]
+    inside: bool = (
+        (x + r > low[0])
+        & (x - r < high[0])
+        & (y + r > low[1])
+        & (y - r < high[1])
+        & (z + r > low[2])
+        & (z - r < high[2])
+    )
+    return inside
+
+
+@compiled("contract")
+def _within(
+    columns: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32
+) -> tuple[Int64, Int64, Float32]:
+    sphere = _blocks(columns)
+    xs, ys, zs = columns[0], columns[1], columns[2]
+    count = 0
+    for e in range(len(turn)):
+        for k in range(len(sphere)):
+            if _may_reach(sphere[k], turn[e], shift[e], low, high):
+                count += _count_between(columns, k, turn[e], shift[e], low, high)
+    hand, row = np.empty(count, np.int64), np.empty(count, np.int64)
+    position, place = np.empty((3, count), np.float32), 0
+    for e in range(len(turn)):
+        for k in range(len(sphere)):
+            if _may_reach(sphere[k], turn[e], shift[e], low, high):
+                for i in range(k * BLOCK, min((k + 1) * BLOCK, len(xs))):
+                    x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
+                    if _between(x, y, z, low, high):
+                        hand[place], row[place] = e, i
+                        position[0, place], position[1, place], position[2, place] = x, y, z
+                        place += 1
+    return hand, row, position
+
+
+@compiled("contract")
+def _meet(
+    columns: Float32, turn: Float32, shift: Float32, boxes: Float32, around: Float32
+) -> Bools:
+    sphere, hit = _blocks(columns), np.zeros(len(turn), np.bool_)
+    least, most = around
+    for e in range(len(turn)):
+        for k in range(len(sphere)):
+            if not _may_reach(sphere[k], turn[e], shift[e], least, most):
+                continue
+            inside = 0
+            for b in range(len(boxes)):
+                low, high = boxes[b, 0], boxes[b, 1]
+                if _may_reach(sphere[k], turn[e], shift[e], low, high):
+                    inside += _count_between(columns, k, turn[e], shift[e], low, high)
+            if inside:
+                hit[e] = True
+                break
+    return hit
+
+
+@compiled("contract")
+def _count_on_way(
+    columns: Float32,
+    k: int,
+    turn: Float32,
+    shift: Float32,
+    low: Float32,
+    high: Float32,
+    per_way: Floats,
+) -> int:
+    """How many points of block k a box passes over; `per_way` (3,): 1 / its way, hand frame."""
+    start, stop = k * BLOCK, (k + 1) * BLOCK
+    xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
+    found = 0
     for i in range(len(xs)):
-        x, y, z = xs[i] - middle[0], ys[i] - middle[1], zs[i] - middle[2]
-        above = x * axes[0, 0] + y * axes[0, 1] + z * axes[0, 2] > -reach[1]
-        near = above & (x * x + y * y + z * z < reach[0] * reach[0])
-        one = np.float32(near)
-        s = one * (x * axes[1, 0] + y * axes[1, 1] + z * axes[1, 2])
-        t = one * (x * axes[2, 0] + y * axes[2, 1] + z * axes[2, 2])
-        a, b, aa, ab, bb = a + s, b + t, aa + s * s, ab + s * t, bb + t * t
-        count += one
-    return count, a, b, aa, ab, bb
+        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        # Shares of the way at which the point enters and leaves the box along each axis.
+        x0, x1 = (x - high[0]) * per_way[0], (x - low[0]) * per_way[0]
+        y0, y1 = (y - high[1]) * per_way[1], (y - low[1]) * per_way[1]
+        z0, z1 = (z - high[2]) * per_way[2], (z - low[2]) * per_way[2]
+        enter = max(min(x0, x1), min(y0, y1), min(z0, z1), np.float32(0.0))
+        leave = min(max(x0, x1), max(y0, y1), max(z0, z1), np.float32(1.0))
+        found += enter < leave
+    return found
+
+
+@compiled("contract")
+def _meet_on_way(
+    columns: Float32, turn: Float32, shift: Float32, boxes: Float32, lift: Float32
+) -> Bools:
+    sphere, hit = _blocks(columns), np.zeros(len(turn), np.bool_)
+    none = np.float32(0.0)
+    for e in range(len(turn)):
+        below, above = np.minimum(lift[e], none), np.maximum(lift[e], none)
+        per_way = np.float32(1.0) / np.where(np.abs(lift[e]) < SLACK, np.float32(SLACK), lift[e])
+        for b in range(len(boxes)):
+            low, high = boxes[b]
+            for k in range(len(sphere)):
+                near = _may_reach(sphere[k], turn[e], shift[e], low + below, high + above)
+                if near and _count_on_way(columns, k, turn[e], shift[e], low, high, per_way):
+                    hit[e] = True
+                    break
+            if hit[e]:
+                break
+    return hit
+
+
+@compiled("contract", "nnan", "nsz", "reassoc")
+def _nearest_to_boxes(columns: Float32, turn: Float32, shift: Float32, extents: Float32) -> Float32:
+    sphere, nearest = _blocks(columns), np.full(len(turn), np.inf, np.float32)
+    for e in range(len(turn)):
+        for k in range(len(sphere)):
+            block = columns[:, k * BLOCK : (k + 1) * BLOCK]
+            for b in range(len(extents)):
+                middle = sphere[k : k + 1, :3].T
+                if (
+                    _nearest_to_box(middle, turn[e], shift[e], extents[b]) - sphere[k, 3]
+                    < nearest[e]
+                ):
+                    here = _nearest_to_box(block, turn[e], shift[e], extents[b])
+                    nearest[e] = min(nearest[e], here)
+    return nearest
+
+
+@compiled("contract", "nnan", "nsz", "reassoc")
+def _nearest_to_box(columns: Float32, turn: Float32, shift: Float32, extent: Float32) -> np.float32:
+    xs, ys, zs = columns[0], columns[1], columns[2]
+    zero = np.float32(0.0)
+    middle, half = extent[0], extent[1]
+    apart, deepest = np.float32(np.inf), zero  # squared distance outside, depth inside
+    for i in range(len(xs)):
+        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        x = abs(x - middle[0]) - half[0]
+        y = abs(y - middle[1]) - half[1]
+        z = abs(z - middle[2]) - half[2]
+        deepest = min(deepest, max(x, y, z))
+        x, y, z = max(x, zero), max(y, zero), max(z, zero)
+        apart = min(apart, x * x + y * y + z * z)
+    nearest: np.float32 = deepest if deepest < zero else np.sqrt(apart)
+    return nearest
+
+
+@compiled("contract")
+def _until_met(
+    columns: Float32,
+    turn: Float32,
+    shift: Float32,
+    boxes: Float32,
+    behind: np.float32,
+) -> Float32:
+    sphere, way = _blocks(columns), np.empty(len(turn), np.float32)
+    ahead = np.empty(BLOCK, np.float32)
+    for e in range(len(turn)):
+        nearest = np.float32(np.inf)
+        for b in range(len(boxes)):
+            low, high = boxes[b, 0].copy(), boxes[b, 1].copy()
+            front = high[2]
+            low[2] -= behind
+            for k in range(len(sphere)):
+                high[2] = front + nearest  # farther boxes change nothing
+                if _may_reach(sphere[k], turn[e], shift[e], low, high):
+                    least = _least_between(columns, k, turn[e], shift[e], low, high, ahead)
+                    nearest = min(nearest, least - front)
+        way[e] = nearest
+    return way
+
+
+@compiled("contract")
+def _between_pads(
+    columns: Float32, turn: Float32, shift: Float32, first: Int64, last: Int64, pads: Float32
+) -> Float32:
+    (low, high), extent = pads, np.empty((len(turn), 2), np.float32)
+    for e in range(len(turn)):
+        xs, ys, zs = columns[:, first[e] : last[e]]
+        least, most = np.float32(np.inf), np.float32(-np.inf)
+        for i in range(len(xs)):
+            x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
+            between = (x > low[0]) & (x < high[0]) & (z > low[1]) & (z < high[1])
+            least = min(least, y if between else np.float32(np.inf))
+            most = max(most, y if between else np.float32(-np.inf))
+        extent[e, 0], extent[e, 1] = least, most
+    return extent
+
+
+@compiled("contract")
+def non_max_suppression(
+    T_cloud_tcp: Float32, order: Int64, near: float, angle: float, most: int
+) -> tuple[Int64, Int64]:
+    """Keep the first of each group of near duplicates in `order` (M,), `most` at most.
+
+    Those are within `near` metres of each other, T_cloud_tcp (E, 4, 4), and `angle` radians; half a
+    turn about the approach counts as none. Returns the rows kept, in order, and the duplicates
+    dropped.
+    """
+    kept, dropped = np.zeros((2, len(order)), np.bool_)
+    rows, found = np.empty(len(order), np.int64), 0
+    xs, ys, zs = np.empty((3, len(order)), np.float32)
+    squared, least = np.float32(near**2), _least_likeness(angle)
+    for m in range(len(order)):
+        row = order[m]
+        px, py, pz = T_cloud_tcp[row, :3, 3]
+        for k in range(found):
+            x, y, z = xs[k] - px, ys[k] - py, zs[k] - pz
+            close = x * x + y * y + z * z < squared
+            if close and _likeness(T_cloud_tcp[row], T_cloud_tcp[rows[k]]) > least:
+                dropped[m] = True
+                break
+        if found < most and not dropped[m]:
+            kept[m] = True
+            xs[found], ys[found], zs[found], rows[found] = px, py, pz, row
+            found += 1
+    return order[kept], order[dropped]
+
+
+@compiled("contract")
+def mean_of_alike(
+    values: Float32, T_cloud_tcp: Float32, number: Int64, near: float, angle: float
+) -> Float32:
+    """The mean value (E,) of the other hands on the same object that are like each one.
+
+    Those are within `near` metres of it, T_cloud_tcp (E, 4, 4), and `angle` radians; half a turn
+    about the approach counts as none. `number` (E,) are the objects. NaN where there is none.
+    """
+    total, count = np.zeros(len(values)), np.zeros(len(values), np.int64)
+    place, mean = T_cloud_tcp[:, :3, 3].copy(), np.empty_like(values)
+    squared, least = np.float32(near**2), _least_likeness(angle)
+    for i in range(len(values)):
+        px, py, pz = place[i]
+        for j in range(i):
+            x, y, z = place[j, 0] - px, place[j, 1] - py, place[j, 2] - pz
+            close = number[i] == number[j] and x * x + y * y + z * z < squared
+            if close and _likeness(T_cloud_tcp[i], T_cloud_tcp[j]) > least:
+                total[i] += values[j]
+                total[j] += values[i]
+                count[i] += 1
+                count[j] += 1
+    for i in range(len(values)):
+        mean[i] = total[i] / count[i] if count[i] else np.nan
+    return mean
+
+
+@compiled("contract")
+def _least_likeness(angle: float) -> np.float32:
+    """The trace of a rotation by an angle; all hands are alike from half a turn on."""
+    return np.float32(1.0 + 2.0 * np.cos(angle) if angle < np.pi else -np.inf)
+
+
+@compiled("contract")
+def _likeness(one: Float32, other: Float32) -> np.float32:
+    """Trace of the rotation between two poses; half a turn about z counts as none."""
+    x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)  # cosines of matching axes
+    for d in range(3):
+        x += one[d, 0] * other[d, 0]
+        y += one[d, 1] * other[d, 1]
+        z += one[d, 2] * other[d, 2]
+    likeness: np.float32 = z + abs(x + y)
+    return likeness
+
+
+@compiled("contract")
+def distance_behind(
+    # (2 H + 1, 2 H + 1) metres from the camera in each cell, the middle cell straight ahead; inf
+    # where nothing was seen.
+    surface: Float32,
+    turn: Float32,  # (E, 3, 3) from each hand's frame to the camera's: across, down, ahead
+    shift: Float32,  # (E, 3) of each hand in the camera's frame
+    places: Float32,  # (S, 3) hand frame
+    cells: np.float32,  # in a tangent of 1
+) -> Float32:
+    """Metres (E, S) that places of hands lie behind the first surface a camera saw, or 0."""
+    behind, half = np.zeros((len(turn), len(places)), np.float32), len(surface) // 2
+    for e in range(len(turn)):
+        for s in range(len(places)):
+            x, y, z = _position(places[s, 0], places[s, 1], places[s, 2], turn[e], shift[e])
+            ahead = max(z, np.float32(1e-6))
+            i, j = np.floor(x / ahead * cells), np.floor(y / ahead * cells)
+            if (abs(i) <= half) & (abs(j) <= half):
+                first = surface[int(i) + half, int(j) + half]
+                behind[e, s] = max(np.sqrt(x * x + y * y + z * z) - first, np.float32(0.0))
+    return behind

@@ -14,7 +14,7 @@ from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_description import seen_part
-from edgegrasp_model.hand_kernels import mean_of_alike, non_max_suppression
+from edgegrasp_model.kernels import mean_of_alike, non_max_suppression
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Outcome, Ungraspable
 from edgegrasp_model.scene.scene import Scene

@@ -16,7 +16,7 @@ from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_model.candidates.sample import allowed_directions
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_kernels import mean_of_alike, non_max_suppression
+from edgegrasp_model.kernels import mean_of_alike, non_max_suppression
 from edgegrasp_model.options import (
     MAX_SURFACE,
     Collision,

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_kernels import distance_behind
-from edgegrasp_model.kernels import compiled
+from edgegrasp_model.kernels import compiled, distance_behind
 
 CELL = 0.0022  # metres across a cell of the depth map, at the middle of the cloud
 SPLAT = 2  # cells around its own that a point covers, up to the next point of the cloud

@@ -13,7 +13,7 @@ from edgegrasp_camera.depth import DepthView, Intrinsics, fuse_depth_images
 from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue, choose_device
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, UnknownModel
-from edgegrasp_model.hand_kernels import mean_of_alike
+from edgegrasp_model.kernels import mean_of_alike
 from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, parse_options

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.candidates.edge_grasps import crop_balls, edge_grasps
 from edgegrasp_model.hand_description import Surroundings
-from edgegrasp_model.kernels import nearest_in_groups
-from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.balls import BallBatch, nearest_in_groups
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import EDGEGRASP_SMALL, HAND, NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch

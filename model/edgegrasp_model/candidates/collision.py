@@ -7,7 +7,7 @@ import numpy as np
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
 from edgegrasp_model.candidates.edge_grasps import support_clearance
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_kernels import (
+from edgegrasp_model.kernels import (
     any_point_in_boxes,
     any_point_on_way,
     points_in_hand_boxes,

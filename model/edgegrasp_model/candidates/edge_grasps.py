@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from edgegrasp_camera.arrays import Bools, Float32, Int64
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_kernels import extents_between
+from edgegrasp_model.kernels import extents_between
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 

@@ -20,8 +20,7 @@ from edgegrasp_model.candidates.edge_grasps import (
     support_clearance,
 )
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_kernels import free_way
-from edgegrasp_model.kernels import extents_across, level_spread
+from edgegrasp_model.kernels import columns_of, compiled, free_way
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import UP, unit
 
@@ -34,6 +33,7 @@ GAP = 0.007  # metres without a point in which a surface ends
 ONE_VIEW = np.cos(np.radians(15.0))  # radians; directions closer than this show the same outline
 CLEARANCE = 0.002  # metres kept free ahead of the hand as it goes in
 MAX_INSERTION = 0.020  # metres deeper than an edge grasp; more does not hold better
+STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it
 LEVEL = 1e-6  # cosine below which a hand moves along the support
 
 
@@ -143,3 +143,183 @@ def _inserted(
     hands = candidates.take(row)
     hands.T_cloud_hand[:, :3, 3] -= np.minimum(way[row], MAX_INSERTION)[:, None] * hands.approach
     return hands
+
+
+def extents_across(
+    points: Float32,  # (N, 3) of the cloud
+    rows: Int64,  # (P,) of points to look at, group after group
+    first: Int64,  # (M,) places in `rows` where the group of each edge begins
+    last: Int64,  # (M,) and where they end
+    # (M, 4, 3) of each edge the point it is at; across the strip, out of the object along it, and
+    # ahead of the hand, unit vectors
+    frame: Float32,
+    # (4,) its half width and its length, how far ahead of the edge its points may be, and the gap
+    # length that ends it, metres
+    strip: Float32,
+) -> Float32:
+    """Least and greatest metres (M, 2) that the surface extends into the object, across an edge."""
+    extent = np.zeros((len(frame), 2), dtype=np.float32)
+    _along_strips(columns_of(points[rows]), first, last, frame, strip, extent)
+    return extent
+
+
+@compiled("contract")
+def _along_strips(
+    columns: Float32,
+    first: Int64,
+    last: Int64,
+    frame: Float32,
+    strip: Float32,
+    extent: Float32,
+) -> None:
+    length, gap = strip[1], strip[3]
+    cell = gap / STRIP_CELLS
+    cells = int(np.ceil((length + gap) / cell)) + 1
+    reached = np.empty(cells, np.float32)
+    depth = np.empty(np.max(last - first) if len(first) else 0, np.float32)
+    for m in range(len(frame)):
+        _into_strip(columns, first[m], last[m], frame[m], strip, depth)
+        reached[:] = -np.inf
+        least, found = np.float32(0.0), 0
+        for i in range(last[m] - first[m]):
+            depth[found] = depth[i]
+            found += depth[i] < length
+        for inward in depth[:found]:
+            least = min(least, inward)
+            place = int((inward + gap) / cell)
+            reached[place] = max(reached[place], inward)
+        furthest = np.float32(0.0)
+        for place in range(int(gap / cell), cells):
+            if reached[place] > furthest:
+                if reached[place] - furthest > gap:
+                    break
+                furthest = reached[place]
+        extent[m, 0], extent[m, 1] = least, furthest
+
+
+@compiled("contract")
+def _into_strip(
+    columns: Float32, first: int, last: int, frame: Float32, strip: Float32, depth: Float32
+) -> None:
+    """Distance of a group's points into the object; the strip's length for points outside of it."""
+    # As separate functions on contiguous arrays, such loops are vectorised to 16 points at a time.
+    xs, ys, zs = columns[0, first:last], columns[1, first:last], columns[2, first:last]
+    origin, across, out, ahead = frame[0], frame[1], frame[2], frame[3]
+    half, length, drop, gap = strip[0], strip[1], strip[2], strip[3]
+    for i in range(len(xs)):
+        x, y, z = xs[i] - origin[0], ys[i] - origin[1], zs[i] - origin[2]
+        sideways = x * across[0] + y * across[1] + z * across[2]
+        inward = -(x * out[0] + y * out[1] + z * out[2])
+        below = x * ahead[0] + y * ahead[1] + z * ahead[2]
+        inside = (abs(sideways) < half) & (below < drop) & (inward > -gap)
+        depth[i] = inward if inside else length
+
+
+def level_spread(
+    points: Float32,  # (N, 3) of the cloud
+    rows: Int64,  # (M,) of the points to look at
+    toward: Float32,  # (T, M, 3) unit, toward each viewpoint
+    radius: float,  # metres around each point in which others count,
+    drop: float,  # and how much lower they may lie, metres
+) -> tuple[Float32, Float32, Float32]:
+    """How the neighbourhood of each point is distributed, from each viewpoint.
+
+    Returns the direction orthogonal to `toward` in which they spread least, (T, M, 3) unit; how far
+    (T, M) the point lies from their mean along it, not negative; their standard deviation (T, M)
+    along it, metres.
+    """
+    cells = np.floor((points - points.min(axis=0)) / np.float32(radius)).astype(np.int64) + 1
+    sizes = cells.max(axis=0) + 2
+    key = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
+    order = np.argsort(key, kind="stable")
+    least = np.empty(toward.shape, dtype=np.float32)
+    offset, deviation = np.empty((2, *toward.shape[:2]), dtype=np.float32)
+    _level_spread(
+        columns_of(points[order]),
+        key[order],
+        points[rows],
+        key[rows],
+        sizes,
+        toward,
+        np.array([radius, drop], dtype=np.float32),
+        least,
+        offset,
+        deviation,
+    )
+    return least, offset, deviation
+
+
+@compiled("contract")
+def _level_spread(
+    columns: Float32,
+    key: Int64,
+    middle: Float32,
+    middle_key: Int64,
+    sizes: Int64,
+    toward: Float32,
+    reach: Float32,
+    least: Float32,
+    offset: Float32,
+    deviation: Float32,
+) -> None:
+    around, axes = np.empty(columns.shape, np.float32), np.zeros((3, 3), np.float32)
+    for m in range(len(middle)):
+        found = 0
+        for dx in range(-1, 2):
+            for dy in range(-1, 2):
+                start = middle_key[m] + (dx * sizes[1] + dy) * sizes[2] - 1
+                for j in range(np.searchsorted(key, start), np.searchsorted(key, start + 3)):
+                    around[0, found] = columns[0, j]
+                    around[1, found] = columns[1, j]
+                    around[2, found] = columns[2, j]
+                    found += 1
+        near = around[0, :found], around[1, :found], around[2, :found]
+        for way in range(len(toward)):
+            _set_level_axes(toward[way, m], axes)
+            count, a, b, aa, ab, bb = _moments(near, middle[m], axes, reach)
+            a, b = a / count, b / count
+            aa, ab, bb = aa / count - a * a, ab / count - a * b, bb / count - b * b
+            turn = 0.5 * np.arctan2(-2.0 * ab, bb - aa)
+            s, t = np.cos(turn), np.sin(turn)  # the direction of least variance
+            outward = -(a * s + b * t)
+            if outward < 0.0:
+                s, t, outward = -s, -t, -outward
+            for d in range(3):
+                least[way, m, d] = s * axes[1, d] + t * axes[2, d]
+            offset[way, m] = outward
+            deviation[way, m] = np.sqrt(max(0.0, s * s * aa + 2.0 * s * t * ab + t * t * bb))
+
+
+@compiled("contract")
+def _set_level_axes(up: Float32, axes: Float32) -> None:
+    """Up and two level directions, from the axis that is farthest from up."""
+    first = 0
+    for d in range(1, 3):
+        first = d if abs(up[d]) < abs(up[first]) else first
+    after, last = (first + 1) % 3, (first + 2) % 3
+    length = np.sqrt(up[after] * up[after] + up[last] * up[last])
+    for d in range(3):
+        axes[0, d] = up[d]
+    axes[1, first], axes[1, after], axes[1, last] = 0.0, -up[last] / length, up[after] / length
+    for d in range(3):
+        one, other = (d + 1) % 3, (d + 2) % 3
+        axes[2, d] = up[one] * axes[1, other] - up[other] * axes[1, one]
+
+
+@compiled("contract", "reassoc", "nsz")
+def _moments(
+    points: tuple[Float32, Float32, Float32], middle: Float32, axes: Float32, reach: Float32
+) -> tuple[np.float32, ...]:
+    """How many points are near, and the sums of their level coordinates s, t, s s, s t and t t."""
+    count, a, b, aa, ab, bb = np.zeros(6, np.float32)
+    xs, ys, zs = points
+    for i in range(len(xs)):
+        x, y, z = xs[i] - middle[0], ys[i] - middle[1], zs[i] - middle[2]
+        above = x * axes[0, 0] + y * axes[0, 1] + z * axes[0, 2] > -reach[1]
+        near = above & (x * x + y * y + z * z < reach[0] * reach[0])
+        one = np.float32(near)
+        s = one * (x * axes[1, 0] + y * axes[1, 1] + z * axes[1, 2])
+        t = one * (x * axes[2, 0] + y * axes[2, 1] + z * axes[2, 2])
+        a, b, aa, ab, bb = a + s, b + t, aa + s * s, ab + s * t, bb + t * t
+        count += one
+    return count, a, b, aa, ab, bb

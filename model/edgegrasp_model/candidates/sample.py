@@ -21,7 +21,7 @@ from edgegrasp_model.candidates.edge_grasps import (
 )
 from edgegrasp_model.candidates.outline import outline_grasps, outlines
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_kernels import non_max_suppression
+from edgegrasp_model.kernels import non_max_suppression
 from edgegrasp_model.options import ApproachDirection, DetectOptions
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene.cloud import UP

@@ -11,12 +11,15 @@ from scipy.spatial import cKDTree
 from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Floats, Int64
 from edgegrasp_camera.clouds import CloudInput as CloudInput
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.kernels import compiled
 
 MAX_EXTENT = 20.0  # metres; if most of a cloud is wider, it is probably in millimetres
 MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
 OUTLIER_NEIGHBORS = 8
 OUTLIER_DEVIATIONS = 2.5
 NORMAL_NEIGHBORS = 20
+JACOBI_SWEEPS = 6  # rounds of Jacobi's method for a symmetric 3 x 3 matrix; more change nothing
+DIAGONAL = 1e-12  # off-diagonal sum, as a share of the trace, at which Jacobi's method stops
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 CUBE = 8  # voxels along the edge of a cube; points are stored cube by cube
 WIDEST_VIEW = 1.2  # tangent of half the angle that a depth camera sees
@@ -299,6 +302,59 @@ def statistical_outlier_removal(distance: Float64) -> Bools:
     mean = distance[:, 1 : OUTLIER_NEIGHBORS + 1].mean(axis=1)
     kept: Bools = mean <= mean.mean() + OUTLIER_DEVIATIONS * mean.std()
     return kept
+
+
+@compiled("contract")
+def least_spread(points: Float32, rows: Int64) -> Float32:
+    """Unit direction (M, 3), either sign, in which points (N, 3) of rows (M, K) spread least."""
+    count, direction = rows.shape[1], np.empty((len(rows), 3), np.float32)
+    around, spread, axes = np.empty((count, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for m in range(len(rows)):
+        for d in range(3):
+            mean = 0.0
+            for k in range(count):
+                around[k, d] = points[rows[m, k], d]
+                mean += around[k, d]
+            for k in range(count):
+                around[k, d] -= mean / count
+        for i in range(3):
+            for j in range(3):
+                axes[i, j] = 1.0 if i == j else 0.0
+                spread[i, j] = 0.0
+                for k in range(count):
+                    spread[i, j] += around[k, i] * around[k, j]
+        for _ in range(JACOBI_SWEEPS):
+            for turn in range(3):
+                _rotate_away(spread, axes, turn % 2, 1 if turn == 0 else 2)
+            off = abs(spread[0, 1]) + abs(spread[0, 2]) + abs(spread[1, 2])
+            if off <= DIAGONAL * (spread[0, 0] + spread[1, 1] + spread[2, 2]):
+                break
+        least = 0
+        for d in range(1, 3):
+            least = d if spread[d, d] < spread[least, least] else least
+        for d in range(3):
+            direction[m, d] = axes[d, least]
+    return direction
+
+
+@compiled("contract")
+def _rotate_away(matrix: Float64, axes: Float64, p: int, q: int) -> None:
+    """One rotation of Jacobi's method: makes element (p, q) of a symmetric matrix 0."""
+    if matrix[p, q] == 0.0:
+        return
+    ratio = (matrix[q, q] - matrix[p, p]) / (2.0 * matrix[p, q])
+    tangent = 1.0 / (abs(ratio) + np.sqrt(ratio * ratio + 1.0))
+    tangent = tangent if ratio >= 0.0 else -tangent
+    cosine = 1.0 / np.sqrt(tangent * tangent + 1.0)
+    sine = tangent * cosine
+    for k in range(3):
+        a, b = matrix[k, p], matrix[k, q]
+        matrix[k, p], matrix[k, q] = cosine * a - sine * b, sine * a + cosine * b
+    for k in range(3):
+        a, b = matrix[p, k], matrix[q, k]
+        matrix[p, k], matrix[q, k] = cosine * a - sine * b, sine * a + cosine * b
+        a, b = axes[k, p], axes[k, q]
+        axes[k, p], axes[k, q] = cosine * a - sine * b, sine * a + cosine * b
 
 
 def orient_normals(points: Float32, normals: Float32, viewpoint: Float32) -> Float32:

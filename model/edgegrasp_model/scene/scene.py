@@ -10,7 +10,6 @@ from scipy import ndimage
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.kernels import least_spread
 from edgegrasp_model.options import AutoPlane, DetectOptions, Region, SupportPlane, Workspace
 from edgegrasp_model.results import OBSTACLE, SUPPORT, UNLABELLED
 from edgegrasp_model.scene.cloud import (
@@ -20,6 +19,7 @@ from edgegrasp_model.scene.cloud import (
     Cloud,
     Voxels,
     assumed_viewpoint,
+    least_spread,
     nearest_points,
     orient_normals,
     statistical_outlier_removal,
