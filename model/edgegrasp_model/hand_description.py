@@ -122,20 +122,9 @@ def points_around_fingers(
     x, y = gripper.pad_half_width + BESIDE, gripper.max_opening / 2 + OUTSIDE
     palm_z = seen_part(gripper).palm_z
     low, high = (-x, -y, palm_z - BEHIND), (x, y, gripper.tip_z + BEYOND_TIPS)
-    points = np.zeros((len(T_cloud_hand), limit, 6), dtype=np.float32)
-    count = np.zeros(len(T_cloud_hand), dtype=np.int64)
-    _around_fingers(
-        view.bounds,
-        view.row,
-        view.position,
-        around.cloud.normals,
-        T_cloud_hand,
-        around.mirror_sides(T_cloud_hand),
-        np.array([low, high, (0.0, 0.0, gripper.tip_z)], dtype=np.float32),
-        points,
-        count,
-    )
-    return points, count
+    box = np.array([low, high, (0.0, 0.0, gripper.tip_z)], dtype=np.float32)
+    seen, side = (view.bounds, view.row, view.position), around.mirror_sides(T_cloud_hand)
+    return _around_fingers(*seen, around.cloud.normals, T_cloud_hand, side, box, limit)
 
 
 def seen_part(gripper: Gripper) -> Gripper:
@@ -356,10 +345,9 @@ def _around_fingers(
     T_cloud_hand: Float32,
     side: Float32,
     box: Float32,
-    points: Float32,
-    count: Int64,
-) -> None:
-    limit = points.shape[1]
+    limit: int,
+) -> tuple[Float32, Int64]:
+    points, count = np.zeros((len(side), limit, 6), np.float32), np.zeros(len(side), np.int64)
     low, high, origin = box
     for e in range(len(side)):
         x, y, z = columns[:, bounds[e] : bounds[e + 1]]
@@ -375,3 +363,4 @@ def _around_fingers(
                     points[e, slot, 3 + d] += normals[row[p], k] * T_cloud_hand[e, k, d]
             points[e, slot, 0] *= side[e]
             points[e, slot, 3] *= side[e]
+    return points, count

@@ -85,13 +85,9 @@ def extents_between(
 
 def _to_hand(points: Float32, T_cloud_hand: Float32) -> tuple[Float32, Float32, Float32]:
     """Points as rows x, y, z (3, N); rotations (E, 3, 3) and shifts (E, 3) to hand frames."""
+    columns = np.ascontiguousarray(points.T, dtype=np.float32)
     turn = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
-    return columns_of(points), turn, -(turn @ T_cloud_hand[:, :3, 3:])[:, :, 0]
-
-
-def columns_of(points: Float32) -> Float32:
-    """Points (N, 3) as rows x, y, z (3, N)."""
-    return np.ascontiguousarray(points.T, dtype=np.float32)
+    return columns, turn, -(turn @ T_cloud_hand[:, :3, 3:])[:, :, 0]
 
 
 @compiled("contract")

@@ -20,7 +20,7 @@ from edgegrasp_model.candidates.edge_grasps import (
     support_clearance,
 )
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.kernels import columns_of, compiled, free_way
+from edgegrasp_model.kernels import compiled, free_way
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import UP, unit
 
@@ -145,6 +145,7 @@ def _inserted(
     return hands
 
 
+@compiled("contract")
 def extents_across(
     points: Float32,  # (N, 3) of the cloud
     rows: Int64,  # (P,) of points to look at, group after group
@@ -158,20 +159,7 @@ def extents_across(
     strip: Float32,
 ) -> Float32:
     """Least and greatest metres (M, 2) that the surface extends into the object, across an edge."""
-    extent = np.zeros((len(frame), 2), dtype=np.float32)
-    _along_strips(columns_of(points[rows]), first, last, frame, strip, extent)
-    return extent
-
-
-@compiled("contract")
-def _along_strips(
-    columns: Float32,
-    first: Int64,
-    last: Int64,
-    frame: Float32,
-    strip: Float32,
-    extent: Float32,
-) -> None:
+    columns, extent = np.ascontiguousarray(points[rows].T), np.zeros((len(frame), 2), np.float32)
     length, gap = strip[1], strip[3]
     cell = gap / STRIP_CELLS
     cells = int(np.ceil((length + gap) / cell)) + 1
@@ -195,6 +183,7 @@ def _along_strips(
                     break
                 furthest = reached[place]
         extent[m, 0], extent[m, 1] = least, furthest
+    return extent
 
 
 @compiled("contract")
@@ -232,21 +221,8 @@ def level_spread(
     sizes = cells.max(axis=0) + 2
     key = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
     order = np.argsort(key, kind="stable")
-    least = np.empty(toward.shape, dtype=np.float32)
-    offset, deviation = np.empty((2, *toward.shape[:2]), dtype=np.float32)
-    _level_spread(
-        columns_of(points[order]),
-        key[order],
-        points[rows],
-        key[rows],
-        sizes,
-        toward,
-        np.array([radius, drop], dtype=np.float32),
-        least,
-        offset,
-        deviation,
-    )
-    return least, offset, deviation
+    reach, columns = np.array([radius, drop], np.float32), np.ascontiguousarray(points[order].T)
+    return _level_spread(columns, key[order], points[rows], key[rows], sizes, toward, reach)
 
 
 @compiled("contract")
@@ -258,10 +234,10 @@ def _level_spread(
     sizes: Int64,
     toward: Float32,
     reach: Float32,
-    least: Float32,
-    offset: Float32,
-    deviation: Float32,
-) -> None:
+) -> tuple[Float32, Float32, Float32]:
+    ways = toward.shape[:2]
+    offset, deviation = np.empty(ways, np.float32), np.empty(ways, np.float32)
+    least = np.empty(toward.shape, np.float32)
     around, axes = np.empty(columns.shape, np.float32), np.zeros((3, 3), np.float32)
     for m in range(len(middle)):
         found = 0
@@ -288,6 +264,7 @@ def _level_spread(
                 least[way, m, d] = s * axes[1, d] + t * axes[2, d]
             offset[way, m] = outward
             deviation[way, m] = np.sqrt(max(0.0, s * s * aa + 2.0 * s * t * ab + t * t * bb))
+    return least, offset, deviation
 
 
 @compiled("contract")

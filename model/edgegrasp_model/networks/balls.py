@@ -11,7 +11,7 @@ from torch import Tensor
 
 from edgegrasp_camera.arrays import Float32, Floats, Int64
 from edgegrasp_model.candidates.edge_grasps import BallCrop, crop_balls
-from edgegrasp_model.kernels import columns_of, compiled
+from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks.config import NetworkConfig
 
 ROUNDING = 1e-4  # share of a squared distance; a generous bound of float32 errors
@@ -119,7 +119,7 @@ def nearest_in_groups(points: Float32, bounds: Int64, k: int) -> Int64:
     """
     nearest = np.empty((len(points), k), dtype=np.int64)
     if len(points):
-        _nearest(columns_of(points), bounds, nearest)
+        _nearest(np.ascontiguousarray(points.T, dtype=np.float32), bounds, nearest)
     return nearest
 
 
