@@ -357,18 +357,6 @@ def _rotate_away(matrix: Float64, axes: Float64, p: int, q: int) -> None:
         axes[k, p], axes[k, q] = cosine * a - sine * b, sine * a + cosine * b
 
 
-def orient_normals(points: Float32, normals: Float32, viewpoint: Float32) -> Float32:
-    """Flip normals so that they point toward the viewpoint, (3,) or (N, 3)."""
-    away = np.einsum("nd,nd->n", normals, viewpoint - points) < 0
-    return np.where(away[:, None], -normals, normals).astype(np.float32)
-
-
-def assumed_viewpoint(points: Float32, up: Float32) -> Float32:
-    """A substitute for an unknown camera: one metre above the cloud's middle."""
-    middle: Float32 = (points.min(axis=0) + points.max(axis=0)) / 2
-    return middle + up / np.linalg.norm(up)
-
-
 @dataclass(frozen=True)
 class CanonicalFrame:
     """z is up, x points horizontally toward the camera, the origin is the points' mean."""
@@ -388,10 +376,13 @@ class CanonicalFrame:
         origin = points.mean(axis=0, dtype=np.float64)
         z = np.asarray(up, dtype=np.float64)
         z = z / np.linalg.norm(z)
-        x = None if viewpoint is None else _furthest_out(np.asarray([viewpoint]) - origin, z)
-        x = _furthest_out(points - origin, z) if x is None else x
-        x = _furthest_out(np.eye(3), z) if x is None else x
-        assert x is not None
+        eyes = np.empty((0, 3)) if viewpoint is None else np.asarray([viewpoint])
+        for offsets in (eyes - origin, points - origin, np.eye(3)):
+            level = offsets - (offsets @ z)[:, None] * z  # as seen from above
+            length = np.linalg.norm(level, axis=1)
+            if length.max(initial=0.0) >= MIN_HORIZONTAL:
+                x = level[length.argmax()] / length.max()
+                break
         T_canonical_cloud = np.eye(4)
         T_canonical_cloud[:3, :3] = np.stack([x, np.cross(z, x), z])
         T_canonical_cloud[:3, 3] = -T_canonical_cloud[:3, :3] @ origin
@@ -399,12 +390,13 @@ class CanonicalFrame:
 
     def points(self, points: ArrayLike) -> Float64:
         """Points (..., 3) of the cloud's frame in this one."""
-        turned: Float64 = np.asarray(points, dtype=np.float64) @ self._turn.T
-        return turned + self.T_canonical_cloud[:3, 3]
+        return self.directions(points) + self.T_canonical_cloud[:3, 3]
 
     def directions(self, directions: ArrayLike) -> Float64:
         """Directions (..., 3) of the cloud's frame in this one."""
-        turned: Float64 = np.asarray(directions, dtype=np.float64) @ self._turn.T
+        turned: Float64 = (
+            np.asarray(directions, dtype=np.float64) @ self.T_canonical_cloud[:3, :3].T
+        )
         return turned
 
     def poses(self, T_cloud_hand: ArrayLike) -> Float32:
@@ -414,28 +406,15 @@ class CanonicalFrame:
     def points_in_cloud(self, points: ArrayLike) -> Float32:
         """Points (..., 3) of this frame in the cloud's."""
         shifted = np.asarray(points, dtype=np.float64) - self.T_canonical_cloud[:3, 3]
-        return (shifted @ self._turn).astype(np.float32)
+        return (shifted @ self.T_canonical_cloud[:3, :3]).astype(np.float32)
 
     def directions_in_cloud(self, directions: ArrayLike) -> Float32:
         """Directions (..., 3) of this frame in the cloud's."""
-        return (np.asarray(directions, dtype=np.float64) @ self._turn).astype(np.float32)
+        return (np.asarray(directions, dtype=np.float64) @ self.T_canonical_cloud[:3, :3]).astype(
+            np.float32
+        )
 
     def poses_in_cloud(self, T_canonical_hand: ArrayLike) -> Float32:
         """Poses (..., 4, 4) in this frame, in the cloud's."""
         T_cloud_canonical = np.linalg.inv(self.T_canonical_cloud)
         return (T_cloud_canonical @ np.asarray(T_canonical_hand, np.float64)).astype(np.float32)
-
-    @property
-    def _turn(self) -> Float64:
-        return self.T_canonical_cloud[:3, :3]
-
-
-def _furthest_out(offsets: Float64, z: Float64) -> Float64 | None:
-    """Horizontal direction (3,) of the offset that is longest when seen from above, if any."""
-    horizontal = offsets - (offsets @ z)[:, None] * z
-    length = np.linalg.norm(horizontal, axis=1)
-    longest = int(length.argmax())
-    if length[longest] < MIN_HORIZONTAL:
-        return None
-    direction: Float64 = horizontal[longest] / length[longest]
-    return direction

@@ -30,7 +30,14 @@ NEAR_PIXEL = 0.02  # the same from a pixel, as a share of the image's width
 
 def check_regions(cloud: CheckedCloud, options: DetectOptions) -> None:
     """Raise InvalidRequest if `at` or a region refers to something that the cloud does not have."""
-    check_pixel(cloud, options)
+    if options.at is not None:
+        if cloud.image_size is None:
+            fix = "Send near: x, y, z; or one depth image, or an organised cloud."
+            raise InvalidRequest("options.at", "a pixel of a cloud that is no image", fix)
+        (column, row), (height, width) = options.at, cloud.image_size
+        if column > width - 0.5 or row > height - 0.5:
+            value = f"{column:g}, {row:g} of an image of {width} x {height} pixels"
+            raise InvalidRequest("options.at", value, "Send column, row, counted from 0.")
     for name in ("approach_region", "contact_region"):
         if (region := getattr(options, name)) is not None:
             check_region(region, cloud, name)
@@ -50,19 +57,6 @@ def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
             if isinstance(shape, Segments) and cloud.segment_ids is None:
                 fix = f"Send one id for each point with the cloud: {here} asks for segments."
                 raise InvalidRequest("segment_ids", "nothing", fix)
-
-
-def check_pixel(cloud: CheckedCloud, options: DetectOptions) -> None:
-    """Raise InvalidRequest unless `at` is a pixel of the cloud."""
-    if options.at is None:
-        return
-    if cloud.image_size is None:
-        fix = "Send near: x, y, z; or one depth image, or an organised cloud."
-        raise InvalidRequest("options.at", "a pixel of a cloud that is no image", fix)
-    height, width = cloud.image_size
-    if options.at[0] > width - 0.5 or options.at[1] > height - 0.5:
-        value = f"{options.at[0]:g}, {options.at[1]:g} of an image of {width} x {height} pixels"
-        raise InvalidRequest("options.at", value, "Send column, row, counted from 0.")
 
 
 def chosen_objects(
@@ -106,11 +100,6 @@ def numbers_chosen(found: Int64, choice: ObjectChoice | str, warnings: list[str]
         warnings.append(f"objects: no object is numbered {unknown[0]}; there are: {here}.")
     wanted = found[np.isin(found, choice.include)] if choice.include else found
     return wanted[~np.isin(wanted, choice.exclude)]
-
-
-def has_rows(region: Region | None) -> bool:
-    """Whether a region names rows of the cloud."""
-    return region is not None and any(isinstance(shape, Rows) for shape in region.include)
 
 
 def inside_region(

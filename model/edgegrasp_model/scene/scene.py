@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import AutoPlane, DetectOptions, Region, SupportPlane, Workspace
+from edgegrasp_model.options import AutoPlane, DetectOptions, Region, Rows, SupportPlane, Workspace
 from edgegrasp_model.results import OBSTACLE, SUPPORT, UNLABELLED
 from edgegrasp_model.scene.cloud import (
     UP,
@@ -18,10 +18,8 @@ from edgegrasp_model.scene.cloud import (
     CheckedCloud,
     Cloud,
     Voxels,
-    assumed_viewpoint,
     least_spread,
     nearest_points,
-    orient_normals,
     statistical_outlier_removal,
     thinned,
     unit,
@@ -31,7 +29,6 @@ from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.regions import (
     check_regions,
     chosen_objects,
-    has_rows,
     inside_region,
     inside_workspace,
 )
@@ -161,7 +158,8 @@ def select_points(
 
 def _objects_given(sent: CheckedCloud, options: DetectOptions) -> bool:
     """Whether the caller defines the objects: by segments, by rows, or as one object."""
-    by_rows = has_rows(options.approach_region) or has_rows(options.contact_region)
+    regions = options.approach_region, options.contact_region
+    by_rows = any(isinstance(shape, Rows) for one in regions if one for shape in one.include)
     return sent.segment_ids is not None or by_rows or options.objects == "off"
 
 
@@ -172,7 +170,17 @@ def _segmentation(
     needed = isinstance(options.support, AutoPlane) or not _objects_given(sent, options)
     if len(sent.points) == 0 or options.support is None or not needed:
         return None
-    views = _views(sent, viewpoints, options)
+    views: list[tuple[Float64, Int64 | None]]  # position of each camera, and the rows it saw
+    if viewpoints is None:  # one above the points
+        up = np.array([0.0, 0.0, 1.0]) if options.known_up is None else options.known_up
+        low, high = np.percentile(sent.points, (1, 99), axis=0)
+        away = max(1.0, 1.5 * float((high - low).max()))
+        views = [((low + high) / 2 + away * up, None)]
+    elif len(viewpoints) == 1:
+        views = [(viewpoints[0], None)]
+    else:
+        assert sent.view_ids is not None
+        views = [(eye, np.flatnonzero(sent.view_ids == k)) for k, eye in enumerate(viewpoints)]
     return segment(sent.points, views, options.known_up, _down_in_image(sent, viewpoints))
 
 
@@ -200,22 +208,6 @@ def _recognised(
             confidence |= enumerate(certain.tolist(), first)
             number[new[certain[which] <= LIKELY]] = FIXED
     return number, confidence
-
-
-def _views(
-    sent: CheckedCloud, viewpoints: Float64 | None, options: DetectOptions
-) -> list[tuple[Float64, Int64 | None]]:
-    """The position of each camera and the rows that it saw; if unknown, one above the points."""
-    if viewpoints is None:
-        up = options.known_up
-        up = np.array([0.0, 0.0, 1.0]) if up is None else up
-        low, high = np.percentile(sent.points, (1, 99), axis=0)
-        away = max(1.0, 1.5 * float((high - low).max()))
-        return [((low + high) / 2 + away * up, None)]
-    if len(viewpoints) == 1:
-        return [(viewpoints[0], None)]
-    assert sent.view_ids is not None
-    return [(eye, np.flatnonzero(sent.view_ids == k)) for k, eye in enumerate(viewpoints)]
 
 
 def _down_in_image(sent: CheckedCloud, viewpoints: Float64 | None) -> Float64 | None:
@@ -325,14 +317,29 @@ def _clean_cloud(
     frame: CanonicalFrame,
     viewpoints: Float64 | None,  # (W, 3) cloud frame
 ) -> tuple[Cloud | None, Bools]:
-    """The voxels without outliers, and a mask (V,) of them; no cloud if too few are left."""
+    """The voxels without outliers, and a mask (V,) of them; no cloud if too few are left.
+
+    Normals are as given, else estimated and turned to the camera: without one, to a place one metre
+    above the middle.
+    """
     distance, near = nearest_points(middles)
     kept = statistical_outlier_removal(distance)
     if kept.sum() < MIN_POINTS:
         return None, kept
-    normals = least_spread(middles, near)[kept]  # of either sign
-    normals = _turned_normals(sent, middles[kept], normals, kept, voxels, frame, viewpoints)
-    return Cloud(middles[kept], normals), kept
+    points, normals = middles[kept], least_spread(middles, near)[kept]
+    seen_from = (points.min(axis=0) + points.max(axis=0)) / 2 + UP
+    if viewpoints is not None:
+        seen_from = frame.points(viewpoints).astype(np.float32)
+        if len(viewpoints) > 1 and sent.view_ids is not None:
+            seen_from = seen_from[voxels.commonest(sent.view_ids)[kept]]
+    away = np.einsum("nd,nd->n", normals, seen_from - points) < 0
+    normals = np.where(away[:, None], -normals, normals)
+    if sent.normals is not None:
+        given = frame.directions(voxels.mean(unit(sent.normals))[kept])
+        length = np.linalg.norm(given, axis=1, keepdims=True)
+        given = given / np.maximum(length, MIN_NORMAL)
+        normals = np.where(length >= MIN_NORMAL, given, normals).astype(np.float32)
+    return Cloud(points, normals), kept
 
 
 def _check_voxels(
@@ -424,30 +431,6 @@ def camera_positions(sent: CheckedCloud, options: DetectOptions) -> Float64 | No
         fix = f"Send numbers from 0 to {len(viewpoints) - 1}, rows of options.viewpoint."
         raise InvalidRequest("view_ids", f"values from {low} to {high}", fix)
     return viewpoints
-
-
-def _turned_normals(
-    sent: CheckedCloud,
-    points: Float32,
-    normals: Float32,
-    kept: Bools,
-    voxels: Voxels,
-    frame: CanonicalFrame,
-    viewpoints: Float64 | None,
-) -> Float32:
-    """Unit normals of the kept voxels: as given, else estimated and oriented to the camera."""
-    seen_from = assumed_viewpoint(points, UP)
-    if viewpoints is not None:
-        seen_from = frame.points(viewpoints).astype(np.float32)
-        if len(viewpoints) > 1 and sent.view_ids is not None:
-            seen_from = seen_from[voxels.commonest(sent.view_ids)[kept]]
-    normals = orient_normals(points, normals, seen_from)
-    if sent.normals is None:
-        return normals
-    given = frame.directions(voxels.mean(unit(sent.normals))[kept])
-    length = np.linalg.norm(given, axis=1, keepdims=True)
-    given = given / np.maximum(length, MIN_NORMAL)
-    return np.where(length >= MIN_NORMAL, given, normals).astype(np.float32)
 
 
 def plane_in_frame(plane: SupportPlane, frame: CanonicalFrame) -> SupportPlane:
