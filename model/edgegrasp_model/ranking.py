@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Floats, Int64
+from edgegrasp_camera.arrays import Array, Bools, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import FINGER_CLEARANCE, clearances, met_first
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
@@ -261,30 +262,25 @@ def _why(
 def _upright_box(scene: Scene, held: Bools) -> tuple[Float32, Float32]:
     """Pose T_cloud_box (4, 4) and half extents (3,) of the smallest upright box around points."""
     points = scene.cloud.points[held].astype(np.float64)
-    axes, low, size = _smallest_rectangle(points[:, :2])
-    T_canonical_box = np.eye(4)
-    T_canonical_box[:2, :2] = axes.T
-    bottom, top = points[:, 2].min(), points[:, 2].max()
-    T_canonical_box[:3, 3] = [*(axes.T @ (low + size / 2)), (bottom + top) / 2]
-    half: Float32 = np.array([*size, top - bottom], dtype=np.float32) / np.float32(2)
-    return scene.frame.poses_in_cloud(T_canonical_box), half
-
-
-def _smallest_rectangle(plan: Float64) -> tuple[Float64, ...]:
-    """The smallest rectangle around points (M, 2): unit axes (2, 2), lowest corner, size (2,)."""
-    try:
+    corners = plan = points[:, :2]
+    with suppress(QhullError, ValueError):  # too few points, or all on a line
         corners = plan[ConvexHull(plan).vertices]
-    except (QhullError, ValueError):  # too few points, or all on a line
-        corners = plan
     edges = np.roll(corners, -1, axis=0) - corners
     edges = edges[np.linalg.norm(edges, axis=1) > 0] if len(corners) > 1 else edges[:0]
     edges = np.concatenate([edges, [[1.0, 0.0]]])
     edges /= np.linalg.norm(edges, axis=1, keepdims=True)
+    # The smallest rectangle around them has a side along an edge of their hull.
     axes = np.stack([edges, np.stack([-edges[:, 1], edges[:, 0]], axis=1)], axis=1)  # (K, 2, 2)
     turned = np.einsum("kad,cd->kca", axes, corners)
     size = np.ptp(turned, axis=1)
     best = int(size.prod(axis=1).argmin())
-    return axes[best], turned[best].min(axis=0), size[best]
+    bottom, top = points[:, 2].min(), points[:, 2].max()
+    T_canonical_box = np.eye(4)
+    T_canonical_box[:2, :2] = axes[best].T
+    middle = axes[best].T @ (turned[best].min(axis=0) + size[best] / 2)
+    T_canonical_box[:3, 3] = [*middle, (bottom + top) / 2]
+    half: Float32 = np.array([*size[best], top - bottom], dtype=np.float32) / np.float32(2)
+    return scene.frame.poses_in_cloud(T_canonical_box), half
 
 
 def debug_info(

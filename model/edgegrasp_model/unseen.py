@@ -56,7 +56,8 @@ def unseen_space(
     parts, ways, (y, line) = probes(gripper), _ways(gripper), _closing_line(gripper)
     places = [*parts, *ways, line]
     ends = np.cumsum([len(place) for place in places])[:-1]
-    behind = np.split(_behind_all(depths, T_cloud_hand, np.concatenate(places)), ends, axis=1)
+    nearest = [depth.behind(T_cloud_hand, np.concatenate(places)) for depth in depths]
+    behind: list[Float32] = np.split(np.min(nearest, axis=0), ends, axis=1)
     shares = [unseen(part).mean(axis=1) for part in behind[:-1]]
     tips = [np.minimum(part, FAR).mean(axis=1) for part in behind[:2]]
     along = behind[-1].reshape(len(T_cloud_hand), LINE, len(line) // LINE)  # (E, Y, P)
@@ -77,7 +78,7 @@ def enters_unseen(depths: Sequence["DepthMap"], T_cloud_hand: Float32, gripper: 
     entered = np.zeros(len(T_cloud_hand), dtype=np.bool_)
     for places in (*_palm_ways(gripper), *_ways(gripper)) if depths else ():
         left = np.flatnonzero(~entered)
-        behind = _behind_all(depths, T_cloud_hand[left], places)
+        behind = np.min([depth.behind(T_cloud_hand[left], places) for depth in depths], axis=0)
         entered[left] = unseen(behind).mean(axis=1) > UNKNOWN_SHARE
     return entered
 
@@ -102,12 +103,6 @@ def leaves_image(
     share = outside(P_image_hand[leaves, None], places).mean(axis=2).max(axis=1)  # of a slice
     leaves[leaves] = share > OUTSIDE_SHARE
     return leaves
-
-
-def _behind_all(depths: Sequence["DepthMap"], T_cloud_hand: Float32, places: Float32) -> Float32:
-    """Metres (E, S) that places (S, 3) of hands lie behind the first surface of every camera."""
-    behind: Float32 = np.min([depth.behind(T_cloud_hand, places) for depth in depths], axis=0)
-    return behind
 
 
 def unseen(behind: Float32) -> Float32:

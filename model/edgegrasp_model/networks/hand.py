@@ -35,8 +35,6 @@ from edgegrasp_model.networks.layers import (
     maximum,
     mlp,
 )
-from edgegrasp_model.scene.cloud import UP
-from edgegrasp_model.scene.scene import Scene
 
 POINT_UNIT = 0.05  # metres; scale of the positions around the fingers
 DROPOUT = 0.1  # dropout of the classifier's inputs
@@ -90,15 +88,6 @@ class HandBatch:
     def to(self, device: torch.device | str) -> "HandBatch":
         """Moves every tensor to a device."""
         return HandBatch(*(tensor.to(device) for tensor in vars(self).values()))
-
-
-def hand_batch(
-    scene: Scene, candidates: Candidates, gripper: Gripper, network: NetworkConfig
-) -> HandBatch:
-    """The input of the hand network for some candidates of a scene."""
-    known = scene.support, scene.viewpoints, scene.at_side, scene.object_of_point, scene.depths
-    sizes = network.hand_points, network.description_size
-    return HandBatch.of_hands(Surroundings(scene.cloud, UP, *known), candidates, gripper, *sizes)
 
 
 class HandNet(nn.Module):

@@ -77,7 +77,18 @@ class PackedLinear:
     ) -> None:
         """Prepare a weight (outputs, C), any part of a matrix; `rectified`: a ReLU follows."""
         self._weight, self._bias, self._rectified = weight, bias, rectified
-        self._packed = _packed(weight)
+        self._packed: Tensor | None = None  # for oneDNN; None: the plain product is used
+        avx = torch.backends.cpu.get_cpu_capability().startswith(
+            "AVX"
+        )  # on others it is unmeasured
+        there = avx and torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
+        if len(weight) > 1 and there and float32_inference(weight):
+            # Changes of an inference tensor are not counted.
+            version = -1 if weight.is_inference() else weight._version
+            if version < 0 or _PACKED.get(weight, (-1, weight))[0] != version:
+                packed = torch.ops.mkldnn._reorder_linear_weight(weight.detach().contiguous())
+                _PACKED[weight] = version, packed
+            self._packed = _PACKED[weight][1]
 
     def __call__(self, values: Tensor) -> Tensor:
         """Map (M, ..., C) to (M, ..., outputs); oneDNN sets up again for each number of rows M."""
@@ -116,19 +127,6 @@ def float32_inference(values: Tensor) -> bool:
         and not torch.is_grad_enabled()
         and not torch.is_autocast_enabled("cpu")
     )
-
-
-def _packed(weight: Tensor) -> Tensor | None:
-    """A weight packed for oneDNN; None if the plain product is used."""
-    avx = torch.backends.cpu.get_cpu_capability().startswith("AVX")  # on others it is unmeasured
-    there = avx and torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
-    if len(weight) == 1 or not (there and float32_inference(weight)):
-        return None
-    version = -1 if weight.is_inference() else weight._version  # their changes are not counted
-    if version < 0 or _PACKED.get(weight, (-1, weight))[0] != version:
-        packed = torch.ops.mkldnn._reorder_linear_weight(weight.detach().contiguous())
-        _PACKED[weight] = version, packed
-    return _PACKED[weight][1]
 
 
 class BallChunk(NamedTuple):
