@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from edgegrasp_camera.arrays import Bools, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.candidates.edge_grasps import (
-    BallCrop,
     Candidates,
     centred_grasps,
     crop_balls,
@@ -104,20 +103,13 @@ class Sampler:
         more = self._spread(counts)
         self._round += 1
         self._used = np.concatenate([self._used, more])
-        return self._around(more, last_resort=last_resort) if len(more) else None
-
-    def all(self) -> Sample:
-        """Two rounds, whatever their scores."""
-        samples = self.sample(), self.sample(last_resort=True)
-        return reduce(Sample.and_further, [one for one in samples if one is not None])
-
-    def _around(self, approach_index: Int64, *, last_resort: bool) -> Sample:
-        options, gripper = self.options, self.gripper
-        crop = crop_balls(self.scene.cloud.points, approach_index, self.crop_radius)
-        drawn, outcome = self._constrained(approach_index, crop, last_resort=last_resort)
+        if len(more) == 0:
+            return None
+        options = self.options
+        drawn, outcome = self._constrained(more, last_resort=last_resort)
         row, free = self._checked(drawn, outcome)
         new = free | (options.collision.mode != "avoid")
-        new[new] = different(drawn.T_cloud_hand[row[new]], free[new], gripper, options)
+        new[new] = different(drawn.T_cloud_hand[row[new]], free[new], self.gripper, options)
         most = options.num_candidates - self.counts.get("scored", 0)
         scored = rows_to_score(free, new, options, most, self._rng)
         row, free = row[scored], free[scored]
@@ -125,16 +117,22 @@ class Sampler:
         self._count("scored", len(row))
         return Sample(drawn.take(row), free, drawn, outcome, row)
 
+    def all(self) -> Sample:
+        """Two rounds, whatever their scores."""
+        samples = self.sample(), self.sample(last_resort=True)
+        return reduce(Sample.and_further, [one for one in samples if one is not None])
+
     def _constrained(
-        self, approach_index: Int64, crop: BallCrop, *, last_resort: bool
+        self, approach_index: Int64, *, last_resort: bool
     ) -> tuple[Candidates, NDArray[np.int8]]:
-        """The candidates of some balls; RETURNED: all constraints hold except collision.
+        """Candidates around approach points; RETURNED: all constraints hold except collision.
 
         A network that sees hands gets centred hands, and hands across outlines: as a last resort
         tilted ones too. To one that sees edges a hand across an outline is a last resort.
         """
         scene, options, gripper = self.scene, self.options, self.gripper
         points, margin = scene.cloud.points, options.collision.margin
+        crop = crop_balls(points, approach_index, self.crop_radius)
         self._count("approach_points", len(approach_index))
         self._count("pairs", len(crop.ball_rows))
         pair = np.flatnonzero(scene.contact_allowed[crop.ball_rows])
