@@ -1,5 +1,7 @@
 """The `scene` network: classifies pixels of a range image and says which belong together.
 
+The range image is rendered from points, as seen from a viewpoint.
+
 A U-Net on depth alone, as networks that segment unseen objects from simulated depth (UOIS-Net, Xie
 et al., T-RO 2021): its input has twice the resolution of its output.
 """
@@ -8,12 +10,14 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.kernels import compiled
+from edgegrasp_model.scene.cloud import WIDEST_VIEW, thinned, unit
 
 HEIGHT, WIDTH = 352, 480  # pixels of the input
 MULTIPLE = 32  # its sides are multiples of
@@ -23,6 +27,15 @@ WIDTHS = (16, 32, 48, 64, 96, 128)  # channels at each resolution, the output's 
 STRIDE = 2  # pixels of the input between neighbours whose difference gives the normal
 VOTE_UNIT = 0.05  # metres
 OUTPUTS = len(CLASSES) + 3 + 2 + 3
+# Of range images:
+NEAREST = 0.05  # metres from the viewpoint
+COVERED = 0.5  # percent of the points that may lie beyond each side of the image
+COARSE = 40  # cells across the view in which the density of points is measured
+SPACING = 1.25  # side of a pixel, in distances of sparser points, so that few stay empty
+FILLED = 1.6  # pixels between neighbouring points up to which holes are filled from around them
+COARSEST = 0.003  # metres, of a pixel at the median depth; those of sparser clouds are divided
+DENSE = 2  # points per pixel; more add nothing
+SURFACE = 0.02  # metres; a point nearer by this much hides another of the same pixel
 
 
 class SceneOutput(NamedTuple):
@@ -155,3 +168,167 @@ def _fill_features(points: Float32, up: Float64, known: bool, offset: float, out
                 out[i, j, 5], out[i, j, 6], out[i, j, 7] = nx / length, ny / length, nz / length
                 if known:
                     out[i, j, 9] = (up[0] * nx + up[1] * ny + up[2] * nz) / length
+
+
+class RangeImage(NamedTuple):
+    """An image of points in the frame of a camera (x right, y down, z forward) at a viewpoint."""
+
+    points: Float32  # (H, W, 3) metres; NaN where nothing was seen
+    footprint: float  # metres, width of a pixel at a depth of one metre
+    T_cloud_camera: Float64  # (4, 4)
+    corner: Float64  # (2,) x / z and y / z of the upper left corner
+
+
+def range_image(
+    points: Float32,  # (N, 3) cloud frame, metres; at least one
+    viewpoint: Float64,  # (3,) of the camera
+    up: Float64 | None,  # (3,) away from gravity, drawn upward; None: unknown
+    # (3,) downward in the image if `up` is unknown or along the sight; None: by the usual frames
+    down: Float64 | None = None,
+) -> RangeImage:
+    """Render points as seen from a viewpoint."""
+    downward = [way for way in (None if up is None else -up, down) if way is not None]
+    apart = points[thinned(len(points))].astype(np.float64) - viewpoint
+    sight = unit(apart)
+    # Rounded, so that the image is independent of the order of the points.
+    turn = _camera_axes(sight.mean(axis=0).round(9), downward)
+    for _ in range(2):
+        low, high = _view(apart @ turn.T)
+        turn = _camera_axes(np.array([*(low + high) / 2, 1.0]) @ turn, downward)
+    in_view = apart @ turn.T
+    low, high = _view(in_view)
+    finest = float(np.sqrt((high - low).prod() / (WIDTH * HEIGHT)))
+    spacing = _spacing(in_view, low, high, len(points))
+    pixel_size = finest if spacing < FILLED * finest else SPACING * spacing
+    width, height = (int(np.ceil(side / MULTIPLE)) * MULTIPLE for side in (high - low) / pixel_size)
+    middle = (low + high) / 2
+    image = np.full((height, width, 3), np.nan, dtype=np.float32)
+    corner = middle - pixel_size * np.array([width, height]) / 2
+    some = points[thinned(len(points), DENSE * width * height)]
+    _render(some, viewpoint, turn, corner, pixel_size, image)
+    filled = image.copy()
+    _fill_holes(image, filled)
+    coarse = float(np.median(in_view[:, 2])) * pixel_size / COARSEST
+    if (times := min(round(pixel_size / finest), int(np.ceil(coarse)))) > 1:
+        pixel_size /= times
+        filled = _enlarged(filled[..., 2], times, corner, pixel_size)
+    T_cloud_camera = np.eye(4)
+    T_cloud_camera[:3, :3], T_cloud_camera[:3, 3] = turn.T, viewpoint
+    return RangeImage(filled, pixel_size, T_cloud_camera, corner)
+
+
+def _camera_axes(sight: Float64, downward: list[Float64]) -> Float64:
+    """Axes (3, 3), rows x right, y down, z forward along `sight`; cloud frame.
+
+    Uses the first of `downward` that is not along the line of sight.
+    """
+    length = float(np.linalg.norm(sight))
+    z = sight / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
+    # Clouds are usually in a camera's frame (y down) or in a frame whose z points up.
+    usual = np.array([0.0, 1.0, 0.0]) if abs(z[2]) > 0.7 else np.array([0.0, 0.0, -1.0])
+    choices = [*downward, usual, np.array([1.0, 0.0, 0.0])]
+    x = next(x for x in (np.cross(way, z) for way in choices) if np.linalg.norm(x) > 0.1)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _view(points: Float64) -> tuple[Float64, Float64]:
+    """Lowest and highest x / z and y / z (2,) that an image of points (N, 3) covers."""
+    ahead = points[points[:, 2] > NEAREST]
+    if len(ahead) == 0:
+        return np.full(2, -0.1), np.full(2, 0.1)
+    low, high = np.percentile(ahead[:, :2] / ahead[:, 2:], (COVERED, 100 - COVERED), axis=0)
+    edge = 0.02 * (high - low) + 1e-3
+    return np.maximum(low - edge, -WIDEST_VIEW).round(9), np.minimum(
+        high + edge, WIDEST_VIEW
+    ).round(9)
+
+
+def _spacing(points: Float64, low: Float64, high: Float64, count: int) -> float:
+    """Distance at z = 1 between neighbours of `count` points like (N, 3)."""
+    ahead = points[points[:, 2] > NEAREST]
+    cell = max(float((high - low).max()) / COARSE, 1e-6)
+    place = ((ahead[:, :2] / ahead[:, 2:] - low) / cell).astype(np.int64)
+    occupied = len(np.unique(place[:, 0] * 4096 + place[:, 1])) * cell * cell
+    return float(np.sqrt(occupied / max(count, 1)))
+
+
+def _enlarged(depth: Float32, times: int, corner: Float64, pixel_size: float) -> Float32:
+    """The image of a sparse cloud with pixels as fine as the network knows.
+
+    Depths are interpolated on a surface, and repeated beside its edges.
+    """
+    nearest = depth.repeat(times, axis=0).repeat(times, axis=1)
+    between = ndimage.zoom(depth, times, order=1, mode="nearest", grid_mode=True)
+    smooth = np.abs(between - nearest) < SURFACE  # false for NaN
+    z = np.where(smooth, between, nearest)
+    y, x = (np.indices(z.shape) + 0.5) * pixel_size + corner[::-1, None, None]
+    return np.stack([x * z, y * z, z], axis=-1).astype(np.float32)
+
+
+@compiled("contract")
+def _render(
+    points: Float32,
+    viewpoint: Float64,
+    turn: Float64,
+    corner: Float64,
+    pixel_size: float,
+    image: Float32,
+) -> None:
+    """For each pixel, take the nearest surface's point that is closest to the pixel's centre."""
+    height, width, _ = image.shape
+    pixels = image.reshape(-1, 3)
+    nearest, best = np.full((2, len(pixels)), np.inf, dtype=np.float32)
+    pixel = np.full(len(points), -1, dtype=np.int32)
+    depth, off = np.empty((2, len(points)), dtype=np.float32)
+    for n in range(len(points)):
+        x, y, z = _in_view(points[n], viewpoint, turn)
+        if z < NEAREST:
+            continue
+        u = (x / z - corner[0]) / pixel_size
+        v = (y / z - corner[1]) / pixel_size
+        if u < 0 or v < 0 or u >= width or v >= height:
+            continue
+        i, j = int(v), int(u)
+        pixel[n] = p = i * width + j
+        depth[n], off[n] = z, (u - j - 0.5) ** 2 + (v - i - 0.5) ** 2
+        nearest[p] = min(nearest[p], depth[n])
+    for n in range(len(points)):
+        p = pixel[n]
+        if p >= 0 and depth[n] < nearest[p] + SURFACE and off[n] < best[p]:
+            best[p] = off[n]
+            pixels[p, 0], pixels[p, 1], pixels[p, 2] = _in_view(points[n], viewpoint, turn)
+
+
+@compiled("contract")
+def _in_view(point: Float32, viewpoint: Float64, turn: Float64) -> tuple[float, float, float]:
+    """A point (3,) in the camera's frame."""
+    a, b, c = point[0] - viewpoint[0], point[1] - viewpoint[1], point[2] - viewpoint[2]
+    return (
+        turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c,
+        turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c,
+        turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c,
+    )
+
+
+@compiled("contract")
+def _fill_holes(image: Float32, out: Float32) -> None:
+    """Fill an empty pixel with the mean of its neighbours if most of them exist and agree."""
+    height, width, _ = image.shape
+    for i in range(1, height - 1):
+        for j in range(1, width - 1):
+            if not np.isnan(image[i, j, 2]):
+                continue
+            count, low, high = 0, np.inf, 0.0
+            x = y = z = 0.0
+            for k in range(-1, 2):
+                for m in range(-1, 2):
+                    depth = image[i + k, j + m, 2]
+                    if not np.isnan(depth):
+                        count += 1
+                        low, high = min(low, depth), max(high, depth)
+                        x += image[i + k, j + m, 0]
+                        y += image[i + k, j + m, 1]
+                        z += depth
+            if count >= 4 and high - low < SURFACE + 0.01 * high:
+                out[i, j, 0], out[i, j, 1], out[i, j, 2] = x / count, y / count, z / count

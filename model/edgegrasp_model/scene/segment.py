@@ -20,8 +20,7 @@ from torch.nn import functional
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.scene.cloud import thinned, unit
-from edgegrasp_model.scene.network import SceneNet, scene_features
-from edgegrasp_model.scene.range_image import NEAREST, range_image
+from edgegrasp_model.scene.network import NEAREST, SceneNet, range_image, scene_features
 
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 
