@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgegrasp_camera.arrays import Float32, Floats, Int64
+from edgegrasp_camera.arrays import Array, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import HandView, hand_views
 from edgegrasp_model.candidates.edge_grasps import (
     EDGE_MARGIN,
@@ -37,37 +37,35 @@ class Given:
 def check_edges(edges: object, rows: int) -> Int64:
     """Check (M, 2) rows of the cloud as sent; raises InvalidRequest for type, shape and range."""
     fix = "Send integers of shape (M, 2): rows of the cloud, approach and contact point each."
-    if not isinstance(edges, np.ndarray):
-        raise InvalidRequest("edges", f"a {type(edges).__name__}", fix)
-    if edges.dtype.kind not in "iu" or edges.shape[1:] != (2,):
-        raise InvalidRequest("edges", f"dtype {edges.dtype}, shape {edges.shape}", fix)
-    _check_number("edges", len(edges))
-    low, high = int(edges.min(initial=0)), int(edges.max(initial=0))
+    checked = _checked("edges", edges, "iu", (2,), fix)
+    low, high = int(checked.min(initial=0)), int(checked.max(initial=0))
     if low < 0 or high >= rows:
         value = f"row {low if low < 0 else high} of a cloud of {rows} rows"
         raise InvalidRequest("edges", value, f"Send rows from 0 to {rows - 1}.")
-    return edges.astype(np.int64)
+    return checked.astype(np.int64)
 
 
 def check_hand_poses(poses: object) -> Float32:
     """Check (M, 4, 4) poses T_cloud_hand; raises InvalidRequest unless they are rigid."""
     fix = "Send numbers of shape (M, 4, 4): T_cloud_hand."
-    if not isinstance(poses, np.ndarray):
-        raise InvalidRequest("hand_poses", f"a {type(poses).__name__}", fix)
-    if poses.dtype.kind not in "fiu" or poses.shape[1:] != (4, 4):
-        raise InvalidRequest("hand_poses", f"dtype {poses.dtype}, shape {poses.shape}", fix)
-    _check_number("hand_poses", len(poses))
-    rigid = are_rigid(poses)
+    checked = _checked("hand_poses", poses, "fiu", (4, 4), fix)
+    rigid = are_rigid(checked)
     if not rigid.all():
         fix = "Send 4 x 4 matrices of a rotation and a translation in metres, last row 0 0 0 1."
         value = f"pose {int(np.argmin(rigid))}, which is no rigid transform"
         raise InvalidRequest("hand_poses", value, fix)
-    return poses.astype(np.float32)
+    return checked.astype(np.float32)
 
 
-def _check_number(field: str, number: int) -> None:
-    if not 1 <= number <= MAX_CANDIDATES:
-        raise InvalidRequest(field, f"{number} of them", f"Send 1 to {MAX_CANDIDATES}.")
+def _checked(field: str, array: object, kinds: str, shape: tuple[int, ...], fix: str) -> Array:
+    """An array of 1 to MAX_CANDIDATES rows of a shape, and of one of the kinds of dtype."""
+    if not isinstance(array, np.ndarray):
+        raise InvalidRequest(field, f"a {type(array).__name__}", fix)
+    if array.dtype.kind not in kinds or array.shape[1:] != shape:
+        raise InvalidRequest(field, f"dtype {array.dtype}, shape {array.shape}", fix)
+    if not 1 <= len(array) <= MAX_CANDIDATES:
+        raise InvalidRequest(field, f"{len(array)} of them", f"Send 1 to {MAX_CANDIDATES}.")
+    return array
 
 
 def from_edges(
