@@ -202,12 +202,9 @@ def range_image(
     pixel_size = finest if spacing < FILLED * finest else SPACING * spacing
     width, height = (int(np.ceil(side / MULTIPLE)) * MULTIPLE for side in (high - low) / pixel_size)
     middle = (low + high) / 2
-    image = np.full((height, width, 3), np.nan, dtype=np.float32)
     corner = middle - pixel_size * np.array([width, height]) / 2
     some = points[thinned(len(points), DENSE * width * height)]
-    _render(some, viewpoint, turn, corner, pixel_size, image)
-    filled = image.copy()
-    _fill_holes(image, filled)
+    filled = _fill_holes(_render(some, viewpoint, turn, corner, pixel_size, (height, width)))
     coarse = float(np.median(in_view[:, 2])) * pixel_size / COARSEST
     if (times := min(round(pixel_size / finest), int(np.ceil(coarse)))) > 1:
         pixel_size /= times
@@ -239,9 +236,8 @@ def _view(points: Float64) -> tuple[Float64, Float64]:
         return np.full(2, -0.1), np.full(2, 0.1)
     low, high = np.percentile(ahead[:, :2] / ahead[:, 2:], (COVERED, 100 - COVERED), axis=0)
     edge = 0.02 * (high - low) + 1e-3
-    return np.maximum(low - edge, -WIDEST_VIEW).round(9), np.minimum(
-        high + edge, WIDEST_VIEW
-    ).round(9)
+    low, high = np.maximum(low - edge, -WIDEST_VIEW), np.minimum(high + edge, WIDEST_VIEW)
+    return low.round(9), high.round(9)
 
 
 def _spacing(points: Float64, low: Float64, high: Float64, count: int) -> float:
@@ -273,11 +269,11 @@ def _render(
     turn: Float64,
     corner: Float64,
     pixel_size: float,
-    image: Float32,
-) -> None:
-    """For each pixel, take the nearest surface's point that is closest to the pixel's centre."""
-    height, width, _ = image.shape
-    pixels = image.reshape(-1, 3)
+    size: tuple[int, int],
+) -> Float32:
+    """Of each pixel (H, W, 3) the nearest surface's point that is closest to its centre, or NaN."""
+    height, width = size
+    pixels = np.full((height * width, 3), np.nan, np.float32)
     nearest, best = np.full((2, len(pixels)), np.inf, dtype=np.float32)
     pixel = np.full(len(points), -1, dtype=np.int32)
     depth, off = np.empty((2, len(points)), dtype=np.float32)
@@ -298,6 +294,7 @@ def _render(
         if p >= 0 and depth[n] < nearest[p] + SURFACE and off[n] < best[p]:
             best[p] = off[n]
             pixels[p, 0], pixels[p, 1], pixels[p, 2] = _in_view(points[n], viewpoint, turn)
+    return pixels.reshape(height, width, 3)
 
 
 @compiled("contract")
@@ -312,9 +309,9 @@ def _in_view(point: Float32, viewpoint: Float64, turn: Float64) -> tuple[float, 
 
 
 @compiled("contract")
-def _fill_holes(image: Float32, out: Float32) -> None:
-    """Fill an empty pixel with the mean of its neighbours if most of them exist and agree."""
-    height, width, _ = image.shape
+def _fill_holes(image: Float32) -> Float32:
+    """The image, an empty pixel filled with the mean of its neighbours if most exist and agree."""
+    (height, width, _), out = image.shape, image.copy()
     for i in range(1, height - 1):
         for j in range(1, width - 1):
             if not np.isnan(image[i, j, 2]):
@@ -332,3 +329,4 @@ def _fill_holes(image: Float32, out: Float32) -> None:
                         z += depth
             if count >= 4 and high - low < SURFACE + 0.01 * high:
                 out[i, j, 0], out[i, j, 1], out[i, j, 2] = x / count, y / count, z / count
+    return out
