@@ -5,7 +5,7 @@ processor's cache.
 """
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numba
 import numpy as np
@@ -32,161 +32,30 @@ def compiled(*freedom: str) -> Callable[[Loop], Loop]:
     return decorate
 
 
+class InHands(NamedTuple):
+    """N points, and the way from their frame to those of E hands."""
+
+    columns: Float32  # (3, N) x, y and z, metres
+    turn: Float32  # (E, 3, 3)
+    shift: Float32  # (E, 3) metres
+
+
+def in_hands(points: Float32, T_cloud_hand: Float32) -> InHands:
+    """Points (N, 3), as they are looked at from hands (E, 4, 4) by the loops below."""
+    columns = np.ascontiguousarray(points.T, dtype=np.float32)
+    turn = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
+    return InHands(columns, turn, -(turn @ T_cloud_hand[:, :3, 3:])[:, :, 0])
+
+
+@compiled("contract")
 def points_in_hand_boxes(
-    points: Float32, T_cloud_hand: Float32, low: Float32, high: Float32
+    hands: InHands, low: Float32, high: Float32
 ) -> tuple[Int64, Int64, Float32]:
-    """Points (N, 3) between two corners (3,) of hands' frames T_cloud_hand (E, 4, 4), metres.
+    """The points between two corners (3,) of each hand's frame.
 
     Hand (P,) ascending, row (P,) ascending within each, position (3, P) in its frame.
     """
-    return _within(*_to_hand(points, T_cloud_hand), low, high)
-
-
-def any_point_in_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Bools:
-    """Which hands (E,) have a point (N, 3) in one of their boxes (B, 2, 3), hand frame."""
-    around = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)]).astype(np.float32)
-    return _meet(*_to_hand(points, T_cloud_hand), boxes.astype(np.float32), around)
-
-
-def any_point_on_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, way: Float32) -> Bools:
-    """As `any_point_in_boxes`, of hands that move straight along `way` (3,), cloud frame."""
-    columns, turn, shift = _to_hand(points, T_cloud_hand)
-    lift = np.ascontiguousarray(turn @ way.astype(np.float32))
-    return _meet_on_way(columns, turn, shift, boxes.astype(np.float32), lift)
-
-
-def signed_distance_to_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Float32:
-    """Signed distance (E,) of points (N, 3) to the boxes (B, 2, 3) of each hand, the least."""
-    middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2
-    extents = np.stack((middle, half), axis=1).astype(np.float32)
-    return _nearest_to_boxes(*_to_hand(points, T_cloud_hand), extents)
-
-
-def free_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, behind: float) -> Float32:
-    """How far (E,) hands can move along their z until a box has a point right ahead, metres.
-
-    Points are (N, 3), T_cloud_hand (E, 4, 4), the hand's boxes (B, 2, 3); points up to `behind`
-    metres behind a box are in its way too. Negative where a hand would have to move back; infinity
-    where nothing is ahead.
-    """
-    hands = _to_hand(points, T_cloud_hand)
-    return _until_met(*hands, boxes.astype(np.float32), np.float32(behind))
-
-
-def extents_between(
-    points: Float32, rows: Int64, first: Int64, last: Int64, T_cloud_hand: Float32, pads: Float32
-) -> Float32:
-    """Least and greatest y (E, 2) of the points between the pads of hands; (inf, -inf) without one.
-
-    Hand e looks at rows first[e] to last[e]; `pads` are least and greatest x and z, hand frame.
-    """
-    return _between_pads(*_to_hand(points[rows], T_cloud_hand), first, last, pads)
-
-
-def _to_hand(points: Float32, T_cloud_hand: Float32) -> tuple[Float32, Float32, Float32]:
-    """Points as rows x, y, z (3, N); rotations (E, 3, 3) and shifts (E, 3) to hand frames."""
-    columns = np.ascontiguousarray(points.T, dtype=np.float32)
-    turn = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
-    return columns, turn, -(turn @ T_cloud_hand[:, :3, 3:])[:, :, 0]
-
-
-@compiled("contract")
-def _position(
-    px: np.float32, py: np.float32, pz: np.float32, turn: Float32, shift: Float32
-) -> tuple[np.float32, np.float32, np.float32]:
-    return (
-        turn[0, 0] * px + turn[0, 1] * py + turn[0, 2] * pz + shift[0],
-        turn[1, 0] * px + turn[1, 1] * py + turn[1, 2] * pz + shift[1],
-        turn[2, 0] * px + turn[2, 1] * py + turn[2, 2] * pz + shift[2],
-    )
-
-
-@compiled("contract")
-def _between(x: np.float32, y: np.float32, z: np.float32, low: Float32, high: Float32) -> bool:
-    inside: bool = (
-        (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1]) & (z > low[2]) & (z < high[2])
-    )
-    return inside
-
-
-@compiled("contract")
-def _count_between(
-    columns: Float32, k: int, turn: Float32, shift: Float32, low: Float32, high: Float32
-) -> int:
-    """How many points of block k lie between two corners of a hand's frame."""
-    # As separate functions on contiguous arrays, such loops are vectorised to 16 points at a time.
-    start, stop = k * BLOCK, (k + 1) * BLOCK
-    xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
-    found = 0
-    for i in range(len(xs)):
-        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
-        found += _between(x, y, z, low, high)
-    return found
-
-
-@compiled("contract")
-def _least_between(
-    columns: Float32,
-    k: int,
-    turn: Float32,
-    shift: Float32,
-    low: Float32,
-    high: Float32,
-    ahead: Float32,
-) -> np.float32:
-    """Least z of the points of block k between two corners; `ahead` (BLOCK,) is written over."""
-    start, stop = k * BLOCK, (k + 1) * BLOCK
-    xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
-    for i in range(len(xs)):
-        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
-        ahead[i] = z if _between(x, y, z, low, high) else np.float32(np.inf)
-    least = np.float32(np.inf)
-    for i in range(len(xs)):
-        least = min(least, ahead[i])
-    return least
-
-
-@compiled("contract")
-def _blocks(columns: Float32) -> Float32:
-    """Bounding spheres (K, 4) of BLOCK points at a time: middle and radius."""
-    count = columns.shape[1]
-    sphere = np.zeros(((count + BLOCK - 1) // BLOCK, 4), np.float32)
-    for k in range(len(sphere)):
-        block = columns[:, k * BLOCK : (k + 1) * BLOCK]
-        furthest = np.float32(0.0)
-        for d in range(3):
-            sphere[k, d] = (block[d].min() + block[d].max()) / np.float32(2.0)
-        for i in range(block.shape[1]):
-            x, y, z = (
-                block[0, i] - sphere[k, 0],
-                block[1, i] - sphere[k, 1],
-                block[2, i] - sphere[k, 2],
-            )
-            furthest = max(furthest, x * x + y * y + z * z)
-        sphere[k, 3] = np.sqrt(furthest) + np.float32(SLACK)
-    return sphere
-
-
-@compiled("contract")
-def _may_reach(sphere: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32) -> bool:
-    """Whether a point of a block may lie in a box of the hand frame, given by two corners."""
-    x, y, z = _position(sphere[0], sphere[1], sphere[2], turn, shift)
-    r = sphere[3]
-    inside: bool = (
-        (x + r > low[0])
-        & (x - r < high[0])
-        & (y + r > low[1])
-        & (y - r < high[1])
-        & (z + r > low[2])
-        & (z - r < high[2])
-    )
-    return inside
-
-
-@compiled("contract")
-def _within(
-    columns: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32
-) -> tuple[Int64, Int64, Float32]:
+    columns, turn, shift = hands
     sphere = _blocks(columns)
     xs, ys, zs = columns[0], columns[1], columns[2]
     count = 0
@@ -209,18 +78,20 @@ def _within(
 
 
 @compiled("contract")
-def _meet(
-    columns: Float32, turn: Float32, shift: Float32, boxes: Float32, around: Float32
-) -> Bools:
-    sphere, hit = _blocks(columns), np.zeros(len(turn), np.bool_)
-    least, most = around
+def any_point_in_boxes(hands: InHands, boxes: Float64) -> Bools:
+    """Which hands (E,) have a point in one of their boxes (B, 2, 3), hand frame."""
+    columns, turn, shift = hands
+    sphere, hit, solid = _blocks(columns), np.zeros(len(turn), np.bool_), boxes.astype(np.float32)
+    least, most = solid[0]
+    for low, high in solid:
+        least, most = np.minimum(least, low), np.maximum(most, high)
     for e in range(len(turn)):
         for k in range(len(sphere)):
             if not _may_reach(sphere[k], turn[e], shift[e], least, most):
                 continue
             inside = 0
-            for b in range(len(boxes)):
-                low, high = boxes[b, 0], boxes[b, 1]
+            for b in range(len(solid)):
+                low, high = solid[b, 0], solid[b, 1]
                 if _may_reach(sphere[k], turn[e], shift[e], low, high):
                     inside += _count_between(columns, k, turn[e], shift[e], low, high)
             if inside:
@@ -230,42 +101,16 @@ def _meet(
 
 
 @compiled("contract")
-def _count_on_way(
-    columns: Float32,
-    k: int,
-    turn: Float32,
-    shift: Float32,
-    low: Float32,
-    high: Float32,
-    per_way: Floats,
-) -> int:
-    """How many points of block k a box passes over; `per_way` (3,): 1 / its way, hand frame."""
-    start, stop = k * BLOCK, (k + 1) * BLOCK
-    xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
-    found = 0
-    for i in range(len(xs)):
-        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
-        # Shares of the way at which the point enters and leaves the box along each axis.
-        x0, x1 = (x - high[0]) * per_way[0], (x - low[0]) * per_way[0]
-        y0, y1 = (y - high[1]) * per_way[1], (y - low[1]) * per_way[1]
-        z0, z1 = (z - high[2]) * per_way[2], (z - low[2]) * per_way[2]
-        enter = max(min(x0, x1), min(y0, y1), min(z0, z1), np.float32(0.0))
-        leave = min(max(x0, x1), max(y0, y1), max(z0, z1), np.float32(1.0))
-        found += enter < leave
-    return found
-
-
-@compiled("contract")
-def _meet_on_way(
-    columns: Float32, turn: Float32, shift: Float32, boxes: Float32, lift: Float32
-) -> Bools:
-    sphere, hit = _blocks(columns), np.zeros(len(turn), np.bool_)
+def any_point_on_way(hands: InHands, boxes: Float64, lift: Float32) -> Bools:
+    """As `any_point_in_boxes`, of hands that move straight along `lift` (E, 3), their frames."""
+    columns, turn, shift = hands
+    sphere, hit, solid = _blocks(columns), np.zeros(len(turn), np.bool_), boxes.astype(np.float32)
     none = np.float32(0.0)
     for e in range(len(turn)):
         below, above = np.minimum(lift[e], none), np.maximum(lift[e], none)
         per_way = np.float32(1.0) / np.where(np.abs(lift[e]) < SLACK, np.float32(SLACK), lift[e])
-        for b in range(len(boxes)):
-            low, high = boxes[b]
+        for b in range(len(solid)):
+            low, high = solid[b]
             for k in range(len(sphere)):
                 near = _may_reach(sphere[k], turn[e], shift[e], low + below, high + above)
                 if near and _count_on_way(columns, k, turn[e], shift[e], low, high, per_way):
@@ -277,7 +122,11 @@ def _meet_on_way(
 
 
 @compiled("contract", "nnan", "nsz", "reassoc")
-def _nearest_to_boxes(columns: Float32, turn: Float32, shift: Float32, extents: Float32) -> Float32:
+def signed_distance_to_boxes(hands: InHands, boxes: Float64) -> Float32:
+    """Signed distance (E,) of the points to the boxes (B, 2, 3) of each hand, the least."""
+    columns, turn, shift = hands
+    extents = np.empty(boxes.shape, np.float32)  # middles and halves
+    extents[:, 0], extents[:, 1] = (boxes[:, 0] + boxes[:, 1]) / 2, (boxes[:, 1] - boxes[:, 0]) / 2
     sphere, nearest = _blocks(columns), np.full(len(turn), np.inf, np.float32)
     for e in range(len(turn)):
         for k in range(len(sphere)):
@@ -293,40 +142,22 @@ def _nearest_to_boxes(columns: Float32, turn: Float32, shift: Float32, extents: 
     return nearest
 
 
-@compiled("contract", "nnan", "nsz", "reassoc")
-def _nearest_to_box(columns: Float32, turn: Float32, shift: Float32, extent: Float32) -> np.float32:
-    xs, ys, zs = columns[0], columns[1], columns[2]
-    zero = np.float32(0.0)
-    middle, half = extent[0], extent[1]
-    apart, deepest = np.float32(np.inf), zero  # squared distance outside, depth inside
-    for i in range(len(xs)):
-        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
-        x = abs(x - middle[0]) - half[0]
-        y = abs(y - middle[1]) - half[1]
-        z = abs(z - middle[2]) - half[2]
-        deepest = min(deepest, max(x, y, z))
-        x, y, z = max(x, zero), max(y, zero), max(z, zero)
-        apart = min(apart, x * x + y * y + z * z)
-    nearest: np.float32 = deepest if deepest < zero else np.sqrt(apart)
-    return nearest
-
-
 @compiled("contract")
-def _until_met(
-    columns: Float32,
-    turn: Float32,
-    shift: Float32,
-    boxes: Float32,
-    behind: np.float32,
-) -> Float32:
-    sphere, way = _blocks(columns), np.empty(len(turn), np.float32)
+def free_way(hands: InHands, boxes: Float64, behind: float) -> Float32:
+    """How far (E,) hands can move along their z until a box has a point right ahead, metres.
+
+    The hand's boxes are (B, 2, 3); points up to `behind` metres behind a box are in its way too.
+    Negative where a hand would have to move back; infinity where nothing is ahead.
+    """
+    columns, turn, shift = hands
+    sphere, way, solid = _blocks(columns), np.empty(len(turn), np.float32), boxes.astype(np.float32)
     ahead = np.empty(BLOCK, np.float32)
     for e in range(len(turn)):
         nearest = np.float32(np.inf)
-        for b in range(len(boxes)):
-            low, high = boxes[b, 0].copy(), boxes[b, 1].copy()
+        for b in range(len(solid)):
+            low, high = solid[b, 0].copy(), solid[b, 1].copy()
             front = high[2]
-            low[2] -= behind
+            low[2] -= np.float32(behind)
             for k in range(len(sphere)):
                 high[2] = front + nearest  # farther boxes change nothing
                 if _may_reach(sphere[k], turn[e], shift[e], low, high):
@@ -337,9 +168,12 @@ def _until_met(
 
 
 @compiled("contract")
-def _between_pads(
-    columns: Float32, turn: Float32, shift: Float32, first: Int64, last: Int64, pads: Float32
-) -> Float32:
+def extents_between(hands: InHands, first: Int64, last: Int64, pads: Float32) -> Float32:
+    """Least and greatest y (E, 2) of the points between the pads of hands; (inf, -inf) without one.
+
+    Hand e looks at points first[e] to last[e]; `pads` are least and greatest x and z, hand frame.
+    """
+    columns, turn, shift = hands
     (low, high), extent = pads, np.empty((len(turn), 2), np.float32)
     for e in range(len(turn)):
         xs, ys, zs = columns[:, first[e] : last[e]]
@@ -411,24 +245,6 @@ def mean_of_alike(
 
 
 @compiled("contract")
-def _least_likeness(angle: float) -> np.float32:
-    """The trace of a rotation by an angle; all hands are alike from half a turn on."""
-    return np.float32(1.0 + 2.0 * np.cos(angle) if angle < np.pi else -np.inf)
-
-
-@compiled("contract")
-def _likeness(one: Float32, other: Float32) -> np.float32:
-    """Trace of the rotation between two poses; half a turn about z counts as none."""
-    x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)  # cosines of matching axes
-    for d in range(3):
-        x += one[d, 0] * other[d, 0]
-        y += one[d, 1] * other[d, 1]
-        z += one[d, 2] * other[d, 2]
-    likeness: np.float32 = z + abs(x + y)
-    return likeness
-
-
-@compiled("contract")
 def distance_behind(
     # (2 H + 1, 2 H + 1) metres from the camera in each cell, the middle cell straight ahead; inf
     # where nothing was seen.
@@ -449,3 +265,158 @@ def distance_behind(
                 first = surface[int(i) + half, int(j) + half]
                 behind[e, s] = max(np.sqrt(x * x + y * y + z * z) - first, np.float32(0.0))
     return behind
+
+
+@compiled("contract")
+def _blocks(columns: Float32) -> Float32:
+    """Bounding spheres (K, 4) of BLOCK points at a time: middle and radius."""
+    count = columns.shape[1]
+    sphere = np.zeros(((count + BLOCK - 1) // BLOCK, 4), np.float32)
+    for k in range(len(sphere)):
+        block = columns[:, k * BLOCK : (k + 1) * BLOCK]
+        furthest = np.float32(0.0)
+        for d in range(3):
+            sphere[k, d] = (block[d].min() + block[d].max()) / np.float32(2.0)
+        for i in range(block.shape[1]):
+            x, y, z = (
+                block[0, i] - sphere[k, 0],
+                block[1, i] - sphere[k, 1],
+                block[2, i] - sphere[k, 2],
+            )
+            furthest = max(furthest, x * x + y * y + z * z)
+        sphere[k, 3] = np.sqrt(furthest) + np.float32(SLACK)
+    return sphere
+
+
+@compiled("contract")
+def _may_reach(sphere: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32) -> bool:
+    """Whether a point of a block may lie in a box of the hand frame, given by two corners."""
+    x, y, z = _position(sphere[0], sphere[1], sphere[2], turn, shift)
+    r = sphere[3]
+    inside: bool = (
+        (x + r > low[0])
+        & (x - r < high[0])
+        & (y + r > low[1])
+        & (y - r < high[1])
+        & (z + r > low[2])
+        & (z - r < high[2])
+    )
+    return inside
+
+
+@compiled("contract")
+def _position(
+    px: np.float32, py: np.float32, pz: np.float32, turn: Float32, shift: Float32
+) -> tuple[np.float32, np.float32, np.float32]:
+    return (
+        turn[0, 0] * px + turn[0, 1] * py + turn[0, 2] * pz + shift[0],
+        turn[1, 0] * px + turn[1, 1] * py + turn[1, 2] * pz + shift[1],
+        turn[2, 0] * px + turn[2, 1] * py + turn[2, 2] * pz + shift[2],
+    )
+
+
+@compiled("contract")
+def _between(x: np.float32, y: np.float32, z: np.float32, low: Float32, high: Float32) -> bool:
+    inside: bool = (
+        (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1]) & (z > low[2]) & (z < high[2])
+    )
+    return inside
+
+
+@compiled("contract")
+def _count_between(
+    columns: Float32, k: int, turn: Float32, shift: Float32, low: Float32, high: Float32
+) -> int:
+    """How many points of block k lie between two corners of a hand's frame."""
+    # As separate functions on contiguous arrays, such loops are vectorised to 16 points at a time.
+    start, stop = k * BLOCK, (k + 1) * BLOCK
+    xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
+    found = 0
+    for i in range(len(xs)):
+        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        found += _between(x, y, z, low, high)
+    return found
+
+
+@compiled("contract")
+def _count_on_way(
+    columns: Float32,
+    k: int,
+    turn: Float32,
+    shift: Float32,
+    low: Float32,
+    high: Float32,
+    per_way: Floats,
+) -> int:
+    """How many points of block k a box passes over; `per_way` (3,): 1 / its way, hand frame."""
+    start, stop = k * BLOCK, (k + 1) * BLOCK
+    xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
+    found = 0
+    for i in range(len(xs)):
+        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        # Shares of the way at which the point enters and leaves the box along each axis.
+        x0, x1 = (x - high[0]) * per_way[0], (x - low[0]) * per_way[0]
+        y0, y1 = (y - high[1]) * per_way[1], (y - low[1]) * per_way[1]
+        z0, z1 = (z - high[2]) * per_way[2], (z - low[2]) * per_way[2]
+        enter = max(min(x0, x1), min(y0, y1), min(z0, z1), np.float32(0.0))
+        leave = min(max(x0, x1), max(y0, y1), max(z0, z1), np.float32(1.0))
+        found += enter < leave
+    return found
+
+
+@compiled("contract", "nnan", "nsz", "reassoc")
+def _nearest_to_box(columns: Float32, turn: Float32, shift: Float32, extent: Float32) -> np.float32:
+    xs, ys, zs = columns[0], columns[1], columns[2]
+    zero = np.float32(0.0)
+    middle, half = extent[0], extent[1]
+    apart, deepest = np.float32(np.inf), zero  # squared distance outside, depth inside
+    for i in range(len(xs)):
+        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        x = abs(x - middle[0]) - half[0]
+        y = abs(y - middle[1]) - half[1]
+        z = abs(z - middle[2]) - half[2]
+        deepest = min(deepest, max(x, y, z))
+        x, y, z = max(x, zero), max(y, zero), max(z, zero)
+        apart = min(apart, x * x + y * y + z * z)
+    nearest: np.float32 = deepest if deepest < zero else np.sqrt(apart)
+    return nearest
+
+
+@compiled("contract")
+def _least_between(
+    columns: Float32,
+    k: int,
+    turn: Float32,
+    shift: Float32,
+    low: Float32,
+    high: Float32,
+    ahead: Float32,
+) -> np.float32:
+    """Least z of the points of block k between two corners; `ahead` (BLOCK,) is written over."""
+    start, stop = k * BLOCK, (k + 1) * BLOCK
+    xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
+    for i in range(len(xs)):
+        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        ahead[i] = z if _between(x, y, z, low, high) else np.float32(np.inf)
+    least = np.float32(np.inf)
+    for i in range(len(xs)):
+        least = min(least, ahead[i])
+    return least
+
+
+@compiled("contract")
+def _least_likeness(angle: float) -> np.float32:
+    """The trace of a rotation by an angle; all hands are alike from half a turn on."""
+    return np.float32(1.0 + 2.0 * np.cos(angle) if angle < np.pi else -np.inf)
+
+
+@compiled("contract")
+def _likeness(one: Float32, other: Float32) -> np.float32:
+    """Trace of the rotation between two poses; half a turn about z counts as none."""
+    x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)  # cosines of matching axes
+    for d in range(3):
+        x += one[d, 0] * other[d, 0]
+        y += one[d, 1] * other[d, 1]
+        z += one[d, 2] * other[d, 2]
+    likeness: np.float32 = z + abs(x + y)
+    return likeness

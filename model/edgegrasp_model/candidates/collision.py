@@ -10,6 +10,7 @@ from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import (
     any_point_in_boxes,
     any_point_on_way,
+    in_hands,
     points_in_hand_boxes,
     signed_distance_to_boxes,
 )
@@ -58,10 +59,11 @@ def _hits(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collis
         behind = max(behind, request.retreat_length)
     swept = boxes.copy()
     swept[:, 0, 2] -= behind
-    hit = any_point_in_boxes(scene.cloud.points, T_cloud_hand, swept)
+    hit = any_point_in_boxes(in_hands(scene.cloud.points, T_cloud_hand), swept)
     if lift > 0:
         free = np.flatnonzero(~hit)
-        hit[free] = any_point_on_way(scene.cloud.points, T_cloud_hand[free], boxes, lift * UP)
+        hands = in_hands(scene.cloud.points, T_cloud_hand[free])
+        hit[free] = any_point_on_way(hands, boxes, hands.turn @ (lift * UP))
     if scene.support is not None:
         normal = np.asarray(scene.support.normal)
         height = support_clearance(T_cloud_hand, scene.support, gripper)
@@ -84,7 +86,7 @@ def closes_on_background(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) 
     half, opening = gripper.pad_half_width, gripper.max_opening
     low = np.array([-half, -opening / 2, gripper.palm_z], dtype=np.float32)
     high = np.array([half, opening / 2, gripper.tip_z], dtype=np.float32)
-    hand, _, _ = points_in_hand_boxes(fixed, T_cloud_hand, low, high)
+    hand, _, _ = points_in_hand_boxes(in_hands(fixed, T_cloud_hand), low, high)
     return np.bincount(hand, minlength=len(T_cloud_hand)) >= MIN_FIXED
 
 
@@ -94,7 +96,7 @@ def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32
     Canonical frame. Negative: the greatest depth at which something lies inside a box of the hand.
     """
     boxes = gripper.open_boxes
-    nearest = signed_distance_to_boxes(scene.cloud.points, T_cloud_hand, boxes)
+    nearest = signed_distance_to_boxes(in_hands(scene.cloud.points, T_cloud_hand), boxes)
     if scene.support is not None:
         nearest = np.minimum(nearest, support_clearance(T_cloud_hand, scene.support, gripper))
     if scene.obstacles is not None:
@@ -149,7 +151,7 @@ def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandVie
     high = boxes[:, 1].max(axis=0) + np.array([NEAR, NEAR, 2 * NEAR])
     high[2] += gripper.max_tip_z - gripper.tip_z
     reach = low.astype(np.float32), high.astype(np.float32)
-    hand, row, position = points_in_hand_boxes(cloud.points, T_cloud_hand, *reach)
+    hand, row, position = points_in_hand_boxes(in_hands(cloud.points, T_cloud_hand), *reach)
     bounds = np.searchsorted(hand, np.arange(len(T_cloud_hand) + 1))
     return HandView(hand, row, position, bounds)
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from edgegrasp_camera.arrays import Bools, Float32, Int64
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.kernels import extents_between
+from edgegrasp_model.kernels import extents_between, in_hands
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 
@@ -235,8 +235,8 @@ def centred_grasps(
     first, last = crop.bounds(crop.ball_of_point[candidates.pair[wide]])
     half = gripper.pad_half_width + BESIDE_PADS
     pads = np.array([[-half, gripper.palm_z], [half, gripper.max_tip_z]], dtype=np.float32)
-    hands = candidates.T_cloud_hand[wide]
-    low, high = extents_between(points, crop.ball_rows, first, last, hands, pads).T
+    hands = in_hands(points[crop.ball_rows], candidates.T_cloud_hand[wide])
+    low, high = extents_between(hands, first, last, pads).T
     middle, width = (low + high) / 2, high - low
     moved = (width > WIDE * gripper.max_opening) & (width < gripper.max_opening)
     moved &= (np.abs(middle) > MIN_SHIFT) & (np.abs(middle) < MAX_SHIFT)

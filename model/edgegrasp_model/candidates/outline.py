@@ -20,7 +20,7 @@ from edgegrasp_model.candidates.edge_grasps import (
     support_clearance,
 )
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.kernels import compiled, free_way
+from edgegrasp_model.kernels import compiled, free_way, in_hands
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import UP, unit
 
@@ -137,7 +137,7 @@ def _inserted(
     enough = np.flatnonzero(room >= least)
     candidates = candidates.take(enough)
     boxes = gripper.open_boxes + margin * np.array([[-1.0], [1.0]])
-    way = free_way(points, candidates.T_cloud_hand, boxes, APPROACH_LENGTH) - CLEARANCE
+    way = free_way(in_hands(points, candidates.T_cloud_hand), boxes, APPROACH_LENGTH) - CLEARANCE
     way = np.minimum(way, room[enough])
     row = np.flatnonzero(way >= least)
     hands = candidates.take(row)
