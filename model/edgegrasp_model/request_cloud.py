@@ -202,8 +202,19 @@ class Intrinsics(Strict):
     cy: Finite = Field(description="pixels")
 
 
-class CameraView(Strict):
-    """How a camera saw an image of depths. Camera frame: x right, y down, z forward."""
+class Depth(Strict):
+    """An image of depths, row by row from the top left pixel; 0 or NaN: no reading."""
+
+    height: Size = Field(default=0, description="pixels; not needed of a PNG, like the width")
+    width: Size = 0
+    encoding: Literal["32FC1", "64FC1", "16UC1", "png"] = Field(
+        description="32FC1 or 64FC1, metres; 16UC1 or a 16-bit PNG file, millimetres"
+    )
+    data: Bytes = Field(description="packed little-endian pixels or the file, as base64 in JSON")
+
+
+class DepthImage(Strict):
+    """An image of a depth camera. Camera frame: x right, y down, z forward."""
 
     intrinsics: Annotated[
         Intrinsics,
@@ -222,22 +233,6 @@ class CameraView(Strict):
         default=None,
         description="metres for one unit of depth; null: 0.001 of whole numbers, 1 of floats",
     )
-
-
-class Depth(Strict):
-    """An image of depths, row by row from the top left pixel; 0 or NaN: no reading."""
-
-    height: Size = Field(default=0, description="pixels; not needed of a PNG, like the width")
-    width: Size = 0
-    encoding: Literal["32FC1", "64FC1", "16UC1", "png"] = Field(
-        description="32FC1 or 64FC1, metres; 16UC1 or a 16-bit PNG file, millimetres"
-    )
-    data: Bytes = Field(description="packed little-endian pixels or the file, as base64 in JSON")
-
-
-class DepthImage(CameraView):
-    """An image of a depth camera. Camera frame: x right, y down, z forward."""
-
     depth: SkipValidation[list[list[float]] | Depth] = Field(
         description="rows of metres, or an object as Depth"
     )
