@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import AutoPlane, DetectOptions, Region, Rows, SupportPlane, Workspace
+from edgegrasp_model.options import AutoPlane, DetectOptions, Rows, SupportPlane, Workspace
 from edgegrasp_model.results import OBSTACLE, SUPPORT, UNLABELLED
 from edgegrasp_model.scene.cloud import (
     UP,
@@ -254,22 +254,22 @@ def build_scene(
     if cloud is None:
         return None
     in_cloud = frame.points_in_cloud(middles)
-    inside = inside_workspace(in_cloud, options.workspace)[kept]
     number = voxels.commonest(selected.number)[kept]
-
-    def allowed(region: Region | None) -> Bools:
-        held = True if region is None else inside_region(region, in_cloud, voxels, sent)[kept]
-        return np.asarray(held & inside & (number >= 0))
-
-    approach = allowed(options.approach_region)
+    held = inside_workspace(in_cloud, options.workspace)[kept] & (number >= 0)
+    approach, contact = (
+        held if region is None else held & inside_region(region, in_cloud, voxels, sent)[kept]
+        for region in (options.approach_region, options.contact_region)
+    )
     counts["in_approach_region"] = int(approach.sum())
+    point_of_row = np.full(sent.rows_sent, -1, dtype=np.int64)
+    point_of_row[sent.row] = np.where(kept, np.cumsum(kept) - 1, -1)[voxels.voxel]
     return Scene(
         frame=frame,
         cloud=cloud,
         points_in_cloud=in_cloud[kept],
-        point_of_row=_point_of_row(sent, voxels, kept),
+        point_of_row=point_of_row,
         approach_allowed=approach,
-        contact_allowed=allowed(options.contact_region),
+        contact_allowed=contact,
         object_of_point=number,
         support=None if support is None else plane_in_frame(support.plane, frame),
         at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, sent.points),
@@ -300,14 +300,6 @@ def _projection(
     P = np.linalg.eigh(equations.T @ equations)[1][:, 0].reshape(3, 3)
     P *= np.sign((sight @ P[2]).sum())
     return np.column_stack([P, -P @ eye])
-
-
-def _point_of_row(sent: CheckedCloud, voxels: Voxels, kept: Bools) -> Int64:
-    """The kept voxel (R,) of each row of the cloud as sent; -1: none."""
-    place = np.where(kept, np.cumsum(kept) - 1, -1)
-    point = np.full(sent.rows_sent, -1, dtype=np.int64)
-    point[sent.row] = place[voxels.voxel]
-    return point
 
 
 def _clean_cloud(
