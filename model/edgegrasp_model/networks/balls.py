@@ -2,19 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from edgegrasp_camera.arrays import Float32, Floats, Int64
 from edgegrasp_model.candidates.edge_grasps import BallCrop, crop_balls
-from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks.config import NetworkConfig
-
-ROUNDING = 1e-4  # share of a squared distance; a generous bound of float32 errors
 
 
 @dataclass(frozen=True)
@@ -117,50 +116,9 @@ def nearest_in_groups(points: Float32, bounds: Int64, k: int) -> Int64:
     Points are (P, 3), group after group, from bounds[g] to bounds[g + 1]; the own row fills up
     small groups.
     """
-    nearest = np.empty((len(points), k), dtype=np.int64)
-    if len(points):
-        _nearest(np.ascontiguousarray(points.T, dtype=np.float32), bounds, nearest)
+    nearest = np.repeat(np.arange(len(points))[:, None], k, axis=1)
+    for start, stop in pairwise(bounds.tolist()):
+        group = points[start:stop]
+        there = min(k, len(group))
+        nearest[start:stop, :there] = start + cKDTree(group).query(group, k=range(1, there + 1))[1]
     return nearest
-
-
-@compiled("contract")
-def _nearest(columns: Float32, bounds: Int64, nearest: Int64) -> None:
-    k = nearest.shape[1]
-    largest = np.max(bounds[1:] - bounds[:-1])
-    squared = np.empty(largest, np.float32)
-    near = np.empty(largest, np.int64)
-    best = np.empty(k, np.float64)
-    for group in range(len(bounds) - 1):
-        start, stop = bounds[group], bounds[group + 1]
-        xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
-        best[:] = np.inf
-        for i in range(len(xs)):
-            px, py, pz = xs[i], ys[i], zs[i]
-            # The k nearest of the previous row bound the distance to this row's k nearest.
-            step = 0.0
-            if i > 0:
-                step = np.float64(px - xs[i - 1]) ** 2
-                step += np.float64(py - ys[i - 1]) ** 2 + np.float64(pz - zs[i - 1]) ** 2
-            limit = np.float32((np.sqrt(best[k - 1]) + np.sqrt(step)) ** 2 * (1.0 + ROUNDING))
-            for j in range(len(xs)):
-                x, y, z = xs[j] - px, ys[j] - py, zs[j] - pz
-                squared[j] = x * x + y * y + z * z
-            found = 0
-            for j in range(len(xs)):
-                near[found] = j
-                found += squared[j] <= limit
-            mine = nearest[start + i]
-            mine[:] = start + i
-            best[:] = np.inf
-            for c in range(found):
-                j = near[c]
-                x = np.float64(xs[j]) - np.float64(px)
-                y = np.float64(ys[j]) - np.float64(py)
-                z = np.float64(zs[j]) - np.float64(pz)
-                here = x * x + y * y + z * z
-                if here < best[k - 1]:
-                    place = k - 1
-                    while place > 0 and best[place - 1] > here:
-                        best[place], mine[place] = best[place - 1], mine[place - 1]
-                        place -= 1
-                    best[place], mine[place] = here, start + j
