@@ -139,24 +139,14 @@ class BallChunk(NamedTuple):
 
 
 def ball_chunks(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[BallChunk]:
-    """Split values (P, ...) of a batch's points into chunks in float32 inference."""
-    ball_of_point = batch.ball_of_point
-    sizes: list[int] = torch.bincount(ball_of_point, minlength=batch.num_balls).tolist()
-    if not float32_inference(values):
-        return [BallChunk(values, ball_of_point, list(range(len(sizes))), sizes)]
-    ends = torch.tensor(sizes).cumsum(0).tolist()
+    """Split values (P, ...) of a batch's points into chunks, one alone except in inference."""
+    rows = rows if float32_inference(values) else len(values)
     chunks = []
-    ball, start = 0, 0
-    for number, (part, ball_of_row) in enumerate(in_chunks(rows, values, ball_of_point)):
-        end = (number + 1) * rows
-        balls, sizes = [], []
-        while ball < len(ends) and start < end:
-            stop = min(ends[ball], end)
-            balls.append(ball)
-            sizes.append(stop - start)
-            start = stop
-            ball += stop == ends[ball]
-        chunks.append(BallChunk(part, ball_of_row, balls, [*sizes, end - start]))
+    for number, (part, ball_of_row) in enumerate(in_chunks(rows, values, batch.ball_of_point)):
+        there = batch.ball_of_point[number * rows : (number + 1) * rows]
+        balls, sizes = torch.unique_consecutive(there, return_counts=True)
+        padding = len(part) - len(there)
+        chunks.append(BallChunk(part, ball_of_row, balls.tolist(), [*sizes.tolist(), padding]))
     return chunks
 
 
