@@ -187,8 +187,9 @@ def _with_reach(layer: nn.Linear, reach: nn.Linear) -> Tensor:
 def relu(both: Tensor) -> Tensor:
     """Removes from each vector its part against its direction, if any: (M, 3, 2C) to (M, 3, C)."""
     if float32_inference(both):
-        result = torch.empty(len(both), 3, both.shape[2] // 2)
-        _relu_rows(both.numpy(), result.numpy())
+        result, alone = torch.empty(len(both), 3, both.shape[2] // 2), np.arange(len(both))[:, None]
+        nowhere, offset = np.zeros((len(both), 3), np.float32), np.zeros(both.shape[2], np.float32)
+        _gathered_relu_rows(both.numpy(), nowhere, offset, alone, result.numpy())
         return result
     vectors, directions = both.chunk(2, dim=-1)
     along = (vectors * directions).sum(dim=-2, keepdim=True).clamp(max=0.0)  # (M, 1, C)
@@ -259,21 +260,6 @@ def _gathered_relu_rows(
                 a, b, g = there[0, d] - wd * px, there[1, d] - wd * py, there[2, d] - wd * pz
                 along = min(x * a + y * b + z * g, zero) / (a * a + b * b + g * g + tiny)
                 row[0, c], row[1, c], row[2, c] = x - along * a, y - along * b, z - along * g
-
-
-@_compiled
-def _relu_rows(both: Float32, result: Float32) -> None:
-    """`relu` of each row of `both` (M, 3, 2C) into `result` (M, 3, C)."""
-    width = result.shape[2]
-    zero, tiny = np.float32(0.0), np.float32(1e-7)
-    for i in range(len(result)):
-        here, row = both[i], result[i]
-        for c in range(width):
-            d = width + c
-            x, y, z = here[0, c], here[1, c], here[2, c]
-            a, b, g = here[0, d], here[1, d], here[2, d]
-            along = min(x * a + y * b + z * g, zero) / (a * a + b * b + g * g + tiny)
-            row[0, c], row[1, c], row[2, c] = x - along * a, y - along * b, z - along * g
 
 
 @_compiled
