@@ -378,8 +378,7 @@ def _nearest_to_box(columns: Float32, turn: Float32, shift: Float32, extent: Flo
         deepest = min(deepest, max(x, y, z))
         x, y, z = max(x, zero), max(y, zero), max(z, zero)
         apart = min(apart, x * x + y * y + z * z)
-    nearest: np.float32 = deepest if deepest < zero else np.sqrt(apart)
-    return nearest
+    return deepest if deepest < zero else np.sqrt(apart)
 
 
 @compiled("contract")
@@ -418,5 +417,4 @@ def _likeness(one: Float32, other: Float32) -> np.float32:
         x += one[d, 0] * other[d, 0]
         y += one[d, 1] * other[d, 1]
         z += one[d, 2] * other[d, 2]
-    likeness: np.float32 = z + abs(x + y)
-    return likeness
+    return z + abs(x + y)

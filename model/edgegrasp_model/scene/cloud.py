@@ -182,9 +182,7 @@ class Cloud:
     normals: Float32  # (N, 3)
 
 
-def _valid_points(
-    cloud: object,
-) -> tuple[Floats, Floats, Floats]:
+def _valid_points(cloud: object) -> tuple[Floats, Floats, Floats]:
     """A caller's array (N, 3), metres, and its low and high corner (3,)."""
     if not isinstance(cloud, np.ndarray):
         kind = type(cloud).__name__
