@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.candidates.edge_grasps import support_clearance
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import (
@@ -100,24 +100,16 @@ def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32
     if scene.support is not None:
         nearest = np.minimum(nearest, support_clearance(T_cloud_hand, scene.support, gripper))
     if scene.obstacles is not None:
-        nearest = _nearest_obstacle(scene.obstacles, T_cloud_hand, boxes, nearest)
+        solid = SolidBoxes.of_hands(T_cloud_hand, boxes)
+        for place in range(len(scene.obstacles)):
+            box = scene.obstacles.take(np.full(len(solid), place))
+            # A cheap lower bound leaves few boxes to measure exactly.
+            gap = np.linalg.norm(box.center - solid.center, axis=1) - solid.radius - box.radius
+            near = np.flatnonzero(gap < np.repeat(nearest, len(boxes)))
+            distance = np.full(len(solid), np.inf)
+            distance[near] = signed_distance(solid.take(near), box.take(near))
+            nearest = np.minimum(nearest, distance.reshape(len(nearest), len(boxes)).min(axis=1))
     return nearest.astype(np.float32)
-
-
-def _nearest_obstacle(
-    obstacles: SolidBoxes, T_cloud_hand: Float32, boxes: Float64, nearest: Floats
-) -> Floats:
-    """The distances `nearest` (E,), or those of obstacles that are nearer."""
-    hands = SolidBoxes.of_hands(T_cloud_hand, boxes)
-    for place in range(len(obstacles)):
-        box = obstacles.take(np.full(len(hands), place))
-        # A cheap lower bound leaves few boxes to measure exactly.
-        gap = np.linalg.norm(box.center - hands.center, axis=1) - hands.radius - box.radius
-        near = np.flatnonzero(gap < np.repeat(nearest, len(boxes)))
-        distance = np.full(len(hands), np.inf)
-        distance[near] = signed_distance(hands.take(near), box.take(near))
-        nearest = np.minimum(nearest, distance.reshape(len(nearest), len(boxes)).min(axis=1))
-    return nearest
 
 
 def _hits_any(boxes: SolidBoxes, obstacles: SolidBoxes, sweep: Float64 | None) -> Bools:

@@ -108,18 +108,15 @@ def signed_distance(ours: SolidBoxes, theirs: SolidBoxes) -> Float64:
     apart = np.flatnonzero(distance > 0)
     for start in range(0, len(apart), CHUNK):
         rows = apart[start : start + CHUNK]
-        distance[rows] = _distance_apart(ours.take(rows), theirs.take(rows))
-    return distance
-
-
-def _distance_apart(ours: SolidBoxes, theirs: SolidBoxes) -> Float64:
-    """Distance (M,) of boxes that do not overlap: of a corner and a box, or of two edges."""
-    one, other = ours.corners(), theirs.corners()
-    distance = np.minimum(_corner_distance(one, theirs), _corner_distance(other, ours))
-    for first in _EDGES:
-        start, end = one[:, first[0], None], one[:, first[1], None]
-        apart = _segment_distance(start, end, other[:, _EDGES[:, 0]], other[:, _EDGES[:, 1]])
-        distance = np.minimum(distance, apart.min(axis=1))
+        one, other = ours.take(rows), theirs.take(rows)
+        # A corner of a box is nearest to the other box, or two edges are to each other.
+        p, q = one.corners(), other.corners()
+        least = np.minimum(_corner_distance(p, other), _corner_distance(q, one))
+        edges = q[:, _EDGES[:, 0]], q[:, _EDGES[:, 1]]
+        for first, last in _EDGES:
+            between = _segment_distance(p[:, first, None], p[:, last, None], *edges)
+            least = np.minimum(least, between.min(axis=1))
+        distance[rows] = least
     return distance
 
 
