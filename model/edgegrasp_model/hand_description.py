@@ -18,7 +18,7 @@ from edgegrasp_model.candidates.edge_grasps import Candidates, support_clearance
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import SupportPlane
-from edgegrasp_model.scene.cloud import UP, Cloud
+from edgegrasp_model.scene.cloud import UP, Cloud, unit
 from edgegrasp_model.unseen import DepthMap, unseen_space, visible_extents
 
 AXIS = 0.001  # metres from the approach axis, on which the approach point itself lies
@@ -82,8 +82,7 @@ def describe_hands(
     unseen = unseen_space(depths, hands, seen.first_met, ends)
     toward = np.zeros((len(mirrored), 3), dtype=np.float32)
     if around.viewpoint is not None:
-        toward = around.viewpoint - hands[:, :3, 3]
-        toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
+        toward = unit(around.viewpoint - hands[:, :3, 3])
     ups = np.broadcast_to(up / np.linalg.norm(up), toward.shape)
     length, swing = gripper.tip_z - gripper.palm_z, gripper.max_tip_z - gripper.tip_z
     thick = max(high[1] for _, high in gripper.finger_boxes)

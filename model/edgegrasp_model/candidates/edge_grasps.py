@@ -12,7 +12,7 @@ from edgegrasp_camera.arrays import Bools, Float32, Int64
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import extents_between, in_hands
 from edgegrasp_model.options import SupportPlane
-from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_model.scene.cloud import Cloud, unit
 
 MIN_EDGE = 0.003  # metres between approach and contact point
 EDGE_MARGIN = 0.002  # metres an edge stays below half the opening
@@ -152,8 +152,7 @@ class EdgeMeasures(NamedTuple):
 
 def measure_edges(cloud: Cloud, approach_index: Int64, contact_index: Int64) -> EdgeMeasures:
     """Measure the edges of pairs (M,), (M,) of points, rows of the cloud."""
-    normal = cloud.normals[contact_index]
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    normal = unit(cloud.normals[contact_index])
     edge = cloud.points[contact_index] - cloud.points[approach_index]  # (M, 3) r
     along = np.einsum("md,md->m", edge, normal)
     ahead = edge - along[:, None] * normal
