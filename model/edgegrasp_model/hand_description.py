@@ -122,8 +122,8 @@ def points_around_fingers(
     palm_z = seen_part(gripper).palm_z
     low, high = (-x, -y, palm_z - BEHIND), (x, y, gripper.tip_z + BEYOND_TIPS)
     box = np.array([low, high, (0.0, 0.0, gripper.tip_z)], dtype=np.float32)
-    seen, side = (view.bounds, view.row, view.position), around.mirror_sides(T_cloud_hand)
-    return _around_fingers(*seen, around.cloud.normals, T_cloud_hand, side, box, limit)
+    side = around.mirror_sides(T_cloud_hand)
+    return _around_fingers(view, around.cloud.normals, T_cloud_hand, side, box, limit)
 
 
 def seen_part(gripper: Gripper) -> Gripper:
@@ -172,7 +172,7 @@ def _look(
     lengths = (np.float32(length) for length in (*across, *along))
     hand = _Hand(boxes[:first], boxes[first:last], *lengths)
     cut = np.zeros(len(normals), dtype=bool) if at_side is None else at_side
-    _look_from_each(view.bounds, view.row, view.position, normals, mirrored, side, cut, hand, seen)
+    _look_from_each(view, normals, mirrored, side, cut, hand, seen)
     return seen
 
 
@@ -203,9 +203,7 @@ def _stance(around: Surroundings, candidates: Candidates, gripper: Gripper) -> l
 
 @compiled("contract")
 def _look_from_each(
-    bounds: Int64,
-    row: Int64,
-    columns: Float32,
+    view: HandView,
     normals: Float32,
     axes: Float32,
     side: Float32,
@@ -214,8 +212,9 @@ def _look_from_each(
     seen: _Seen,
 ) -> None:
     for e in range(len(side)):
-        start, stop = bounds[e], bounds[e + 1]
-        x, y, z = side[e] * columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
+        start, stop = view.bounds[e], view.bounds[e + 1]
+        x, y, z = view.position[:, start:stop]
+        x = side[e] * x
         _count_hits(x, y, z, hand, seen.hits[e])
         across, ahead = np.abs(y) < hand.inner, z > hand.palm
         pads = across & ahead & (np.abs(x) < hand.half + NEAR) & (z < hand.tip + NEAR)
@@ -224,9 +223,9 @@ def _look_from_each(
         points[0], points[1], points[2] = x[wide], y[wide], z[wide] - hand.palm
         for d in range(3):
             for i in range(len(wide)):
-                n = normals[row[start + wide[i]]]
+                n = normals[view.row[start + wide[i]]]
                 facing[d, i] = n[0] * axes[e, 0, d] + n[1] * axes[e, 1, d] + n[2] * axes[e, 2, d]
-        seen.cut_off[e] = np.log1p(np.sum(cut[row[start:stop]] & pads))
+        seen.cut_off[e] = np.log1p(np.sum(cut[view.row[start:stop]] & pads))
         _measure_between(points, facing, hand, seen.between[e])
         _runs_along(points[1][np.abs(points[0]) < hand.half], seen.first_met[e], seen.runs[e])
 
@@ -337,9 +336,7 @@ def _runs_along(y: Float32, ends: Float32, runs: Float32) -> None:
 
 @compiled("contract")
 def _around_fingers(
-    bounds: Int64,
-    row: Int64,
-    columns: Float32,
+    view: HandView,
     normals: Float32,
     T_cloud_hand: Float32,
     side: Float32,
@@ -349,17 +346,18 @@ def _around_fingers(
     points, count = np.zeros((len(side), limit, 6), np.float32), np.zeros(len(side), np.int64)
     low, high, origin = box
     for e in range(len(side)):
-        x, y, z = columns[:, bounds[e] : bounds[e + 1]]
+        start, stop = view.bounds[e], view.bounds[e + 1]
+        x, y, z = view.position[:, start:stop]
         inside = (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
-        near = bounds[e] + np.flatnonzero(inside & (z > low[2]) & (z < high[2]))
+        near = start + np.flatnonzero(inside & (z > low[2]) & (z < high[2]))
         count[e] = min(len(near), limit)
         for slot in range(count[e]):
             # If there are too many, an even selection in the cloud's order.
             p = near[((slot + 1) * len(near) - 1) // limit if len(near) > limit else slot]
             for d in range(3):
-                points[e, slot, d] = columns[d, p] - origin[d]
+                points[e, slot, d] = view.position[d, p] - origin[d]
                 for k in range(3):
-                    points[e, slot, 3 + d] += normals[row[p], k] * T_cloud_hand[e, k, d]
+                    points[e, slot, 3 + d] += normals[view.row[p], k] * T_cloud_hand[e, k, d]
             points[e, slot, 0] *= side[e]
             points[e, slot, 3] *= side[e]
     return points, count

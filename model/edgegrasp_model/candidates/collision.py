@@ -1,6 +1,6 @@
 """The points near a hand, its collisions and clearance, and the opening its fingers need."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -126,8 +126,7 @@ def _hits_any(boxes: SolidBoxes, obstacles: SolidBoxes, sweep: Float64 | None) -
     return hit
 
 
-@dataclass(frozen=True)
-class HandView:
+class HandView(NamedTuple):
     """Cloud points in hand frames, without those out of reach."""
 
     candidate: Int64  # (P,) ascending
