@@ -24,7 +24,7 @@ CELL = 0.005  # metres, of the height map that objects are put down on
 REACH = 0.9  # metres that it extends to either side
 APART = np.array([0.015, 0.015, 0.0])  # metres between objects that do not touch
 LONGEST_OBJECT = 0.36  # metres; a longer one is background
-EMPTY_SHARE = 0.03  # of the scenes that have no object
+EMPTY_SHARE, FEW_SHARE = 0.03, 0.2  # of the scenes that have no object; one to three
 CROWDED_SHARE = 0.35  # of the tables and floors, with large background close to the objects
 
 
@@ -241,7 +241,11 @@ def _fill(scene: SceneMeshes, heights: "HeightMap") -> None:
 
 
 def _count(rng: np.random.Generator, mean: float) -> int:
-    return 0 if rng.random() < EMPTY_SHARE else 1 + int(rng.poisson(mean))
+    """None, a few as at the end of clearing, or about `mean`."""
+    few = rng.random() < FEW_SHARE
+    if rng.random() < EMPTY_SHARE:
+        return 0
+    return int(rng.integers(1, 4)) if few else 1 + int(rng.poisson(mean))
 
 
 def _room(scene: SceneMeshes, floor: float, label: int = OTHER) -> None:
