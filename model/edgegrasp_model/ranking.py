@@ -194,8 +194,8 @@ def found_support(support: Support | None) -> FoundSupport | None:
     if support is None:
         return None
     residual = None if math.isnan(support.residual) else support.residual
-    normal = support.normal.astype(np.float32)
-    return FoundSupport(normal, support.plane.offset, residual, support.share)
+    offset = -float(support.frame.T_canonical_cloud[2, 3])  # of the normal of length 1
+    return FoundSupport(support.normal.astype(np.float32), offset, residual, support.share)
 
 
 def detected_objects(

@@ -419,3 +419,10 @@ def test_a_network_of_edges_gets_edge_grasps_where_they_are_good(catalogue) -> N
     for grasp in found.grasps:  # the approach point lies on the hand's axis
         from_hand = np.linalg.inv(grasp.T_cloud_hand) @ np.append(grasp.approach_point, 1.0)
         assert np.abs(from_hand[:2]).max() < 1e-4
+
+
+def test_the_offset_of_the_support_is_along_its_unit_normal() -> None:
+    cloud = box_on_table(table=True) + np.float32([0.0, 0.0, 50.0])
+    plane = {"normal": [0.0, 0.0, 1.0009], "offset": 1.0009 * 50.0}
+    found = detector().detect(cloud, parse_options({"support": plane, "objects": "off"})).support
+    assert found.offset == pytest.approx(50.0, abs=1e-4)
