@@ -22,7 +22,7 @@ from torch import Tensor
 from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_cli.planners import request_options
 from edgegrasp_model.candidates.collision import collides
-from edgegrasp_model.candidates.edge_grasps import sample_approach_points
+from edgegrasp_model.candidates.edge_grasps import spread
 from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import parse_options
@@ -63,7 +63,7 @@ class ContactGraspNet:
         points = _points(scene, observation, rng)
         middle = points.mean(axis=0)
         with torch.inference_mode():
-            contact, T_hand, width, score = self._grasps((points - middle).astype(np.float32), rng)
+            contact, T_hand, width, score = self._grasps((points - middle).astype(np.float32))
         T_hand[:, :3, 3] += middle
         objects = scene.cloud.points[scene.object_of_point >= 0]
         on_object = cKDTree(objects).query(contact + middle)[0] < ON_OBJECT
@@ -75,14 +75,12 @@ class ContactGraspNet:
         T_world_hand = scene.frame.poses_in_cloud(T_hand[best])
         return PlannedGrasp(T_world_hand, float(score[best]), float(width[best]))
 
-    def _grasps(
-        self, points: Float32, rng: np.random.Generator
-    ) -> tuple[Float32, Float32, Float32, Float32]:
+    def _grasps(self, points: Float32) -> tuple[Float32, Float32, Float32, Float32]:
         """Contacts (G, 3), T_points_hand (G, 4, 4), openings (G,) and confidences (G,)."""
         places, feature = [points], [torch.empty(len(points), 0)]
         for level, (count, radii) in enumerate(LEVELS):
             here = places[-1]
-            centre = sample_approach_points(here, count, "farthest", rng)
+            centre = spread(here, count)
             scales = []
             for scale, radius in enumerate(radii):
                 near = _near(here, here[centre], radius)
@@ -97,8 +95,8 @@ class ContactGraspNet:
             distance, row = cKDTree(at).query(wanted, 3)
             weight = torch.from_numpy(1.0 / np.maximum(distance**2, 1e-16)).float()
             weight = weight / weight.sum(dim=1, keepdim=True)
-            spread = (known[row] * weight[..., None]).sum(dim=1)
-            known = self._layers(f"feat_prop.{level}.nn", torch.cat([spread, skip], dim=1))
+            between = (known[row] * weight[..., None]).sum(dim=1)
+            known = self._layers(f"feat_prop.{level}.nn", torch.cat([between, skip], dim=1))
             at = wanted
         seen = torch.cat([torch.from_numpy(at), known], dim=1)
         logit, closing, approach, width = (self._head(f"multihead.{k}", seen) for k in range(4))

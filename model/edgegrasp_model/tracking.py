@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
+from edgegrasp_model.candidates.edge_grasps import spread
 from edgegrasp_model.candidates.sample import allowed_directions
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
@@ -47,7 +48,8 @@ TANGENT = 0.3  # weight of distances beyond that, relative to 1 across the surfa
 STIFF = (0.5,) * 3 + (0.3,) * 3
 FEWEST = 6  # points that say how an object moved
 FOUND, GOOD = 0.5, 0.75  # share of its points on the cloud: found; well seen
-ON_OBJECT = 0.012  # metres from an object's points within which points belong to it
+# From an object's surface, within which points belong to it: metres, and spacings of its points.
+ON_OBJECT, SPACINGS = 0.012, 1.5
 
 
 @dataclass(frozen=True)
@@ -251,8 +253,9 @@ class Surface(NamedTuple):
     tree: cKDTree
 
     def near(self, places: Float64) -> Int64:
-        """The points within ON_OBJECT of any of some places (K, 3)."""
-        rows = self.tree.query_ball_point(places, ON_OBJECT)
+        """The points on an object, by K points (K, 3) of its surface."""
+        spacing = float(np.median(cKDTree(places).query(places, k=[2])[0]))
+        rows = self.tree.query_ball_point(places, max(ON_OBJECT, SPACINGS * spacing))
         return np.unique(np.concatenate([np.asarray(one, dtype=np.int64) for one in rows]))
 
 
@@ -298,9 +301,8 @@ def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
 
 
 def sampled(points: Float32) -> Float32:
-    """Up to MAX_SURFACE of points (N, 3), at even steps in their order."""
-    rows = np.linspace(0, len(points) - 1, min(MAX_SURFACE, len(points))).astype(np.int64)
-    return points[rows]
+    """Up to MAX_SURFACE of points (N, 3), spread over them."""
+    return points[spread(points, MAX_SURFACE)]
 
 
 def relabelled(labels: Int64, named: Mapping[int, int]) -> Int64:

@@ -55,6 +55,13 @@ def test_a_surface_of_one_place_is_found_there() -> None:
     assert share == 1.0
 
 
+def test_all_points_of_a_large_object_belong_to_it() -> None:
+    places = np.stack(np.meshgrid(np.arange(0, 0.4, 0.0045), np.arange(0, 0.3, 0.0045)), axis=-1)
+    points = np.pad(places.reshape(-1, 2), ((0, 0), (0, 1))).astype(np.float32)
+    surface = Surface(points, np.tile(np.float32([0, 0, 1]), (len(points), 1)), cKDTree(points))
+    assert len(surface.near(sampled(points).astype(np.float64))) > 0.99 * len(points)
+
+
 def grasp(score: float, x: float, free: bool = True, z: float = -1.0) -> Grasp:
     pose = np.diag(np.float32([1, z, z, 1]))
     pose[0, 3] = x

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,27 +20,21 @@ MIN_DEPTH = 1e-4  # metres; a shallower edge has no approach direction
 TIP_MARGIN = 0.002  # metres a contact stays inside the fingertips when the hand retracts
 WIDE = 0.75  # share of the opening from which an object counts as wide
 BESIDE_PADS = 0.004  # metres beside the finger pads in which points count
-CELLS = tuple(0.04 * 0.7**level for level in range(8))  # metres, of grids of approach points
+CELLS = tuple(0.04 * 0.7**level for level in range(8))  # metres, of grids over points
 NODES, SPREAD = 2**14, 2654435761  # nodes along a grid; its multiples modulo 2^32 look random
 
 
-def sample_approach_points(
+def spread(
     points: Float32,  # (N, 3)
     count: int,
-    method: Literal["farthest", "uniform"],  # `farthest` spreads them
-    rng: np.random.Generator,
     before: Sequence[int] | Int64 = (),  # (B,) rows chosen earlier, which are excluded
 ) -> Int64:
-    """Choose `count` different rows of the points, or all of them if there are fewer.
+    """Choose `count` different rows far from each other, or all of them if there are fewer.
 
-    Those that are spread lie nearest to the nodes of grids, of which each is finer than the one
-    before, around the middle of the points: noise and other points hardly change them.
+    They lie nearest to the nodes of grids, of which each is finer than the one before, around the
+    middle of the points: noise and other points hardly change them.
     """
-    count = min(count, len(points) - len(before))
-    if method == "uniform":
-        left = np.delete(np.arange(len(points)), before)
-        return rng.choice(left, count, replace=False).astype(np.int64)
-    chosen, total = np.asarray(before, dtype=np.int64), len(before) + count
+    chosen, total = np.asarray(before, dtype=np.int64), min(len(before) + count, len(points))
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     offset = (points - middle).astype(np.float64)
     for cell in CELLS:

@@ -16,7 +16,7 @@ from edgegrasp_model.candidates.edge_grasps import (
     crop_balls,
     edge_grasps,
     retract,
-    sample_approach_points,
+    spread,
 )
 from edgegrasp_model.candidates.outline import outline_grasps, outlines
 from edgegrasp_model.gripper import Gripper
@@ -189,11 +189,14 @@ class Sampler:
         number, chosen = self.scene.object_of_point[self._rows], [self._rows[:0]]
         for which, count in zip(self._objects[counts > 0], counts[counts > 0], strict=True):
             mine = self._rows[number == which]
-            points, used = self.scene.cloud.points[mine], np.isin(mine, self._used)
-            rows = sample_approach_points(
-                points, count, self.options.sampling, self._rng_approach, np.flatnonzero(used)
-            )
-            chosen.append(mine[rows])
+            used = np.isin(mine, self._used)
+            if self.options.sampling == "uniform":
+                left = mine[~used]
+                count = min(count, len(left))
+                chosen.append(self._rng_approach.choice(left, count, replace=False))
+            else:
+                points = self.scene.cloud.points[mine]
+                chosen.append(mine[spread(points, count, np.flatnonzero(used))])
         return np.concatenate(chosen)
 
 
