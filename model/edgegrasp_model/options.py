@@ -737,8 +737,8 @@ class DetectOptions(Strict):
     )
     order: Literal["score", "highest", "clearance"] = Field(
         default="score",
-        description="score: by score and, where scores are close, by how the hand lies, the best "
-        "grasp of each object first if it has 0.5 or more; "
+        description="score: by score and, where scores are close, by how the hand lies; first a "
+        "grasp of each object that has one of 0.5 or more, surrounded by other good ones; "
         "highest: by height of the TCP along up among scores of 0.9 and more, then the "
         "others by score; clearance: by clearance",
     )

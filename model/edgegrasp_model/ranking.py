@@ -7,6 +7,7 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Array, Bools, Float32, Floats, Int64
@@ -28,7 +29,10 @@ GOOD_SCORE = 0.5  # score from which an object has a good grasp
 SURE_SCORE = 0.9  # score from which the order `highest` goes by height (the paper's robot policy)
 HIDDEN = 0.004  # metres of unseen space into which an object may extend
 FLAT = 0.012  # metres of visible height below which the support may block grasps
-DRAWBACK, FAR = 0.01, 0.1  # of a rating; metres from an object's middle
+DRAWBACK, FAR = 0.02, 0.1  # of a rating; metres from an object's middle
+# Best hands that are compared; weight of the logarithm of how many good ones are around each; loss
+# of rating by which a good one counts 1/e as much.
+BEST, SURROUNDED, LESS = 100, 0.1, 0.02
 OUTSIDE = 0.3  # of the rating of a hand that reaches out of the image
 # Hands that are judged together: metres and radians apart; weight of a hand's own logit; factor
 # that calibrates the average.
@@ -73,7 +77,7 @@ def select(
     T_cloud_tcp = hands @ gripper.T_hand_tcp
     clearance = clearances(scene, hands, gripper) if options.order == "clearance" else None
     contact = sample.candidates.contact_index
-    order = ranked(
+    order, worth = ranked(
         scene, contact, hands, rating, sample.collision_free, gripper, options, clearance
     )
     outcome = np.full(len(score), CODE[Outcome.BEYOND_TOP_K])
@@ -82,7 +86,8 @@ def select(
     order, dropped = order[good], order[:0]
     counts["above_min_score"] = len(order)
     if options.order == "score":
-        order = objects_first(order, rating, scene.object_of_point[contact])
+        liked = surrounded_first(order, worth, T_cloud_tcp)
+        order = objects_first(order, liked, rating, scene.object_of_point[contact])
     if (rule := options.suppression) is not None:
         near = rule.translation, rule.rotation
         order, dropped = non_max_suppression(T_cloud_tcp, order, *near, options.top_k)
@@ -90,6 +95,22 @@ def select(
     outcome[dropped], outcome[order] = CODE[Outcome.SUPPRESSED], CODE[Outcome.RETURNED]
     counts["suppressed"], counts["returned"] = len(dropped), len(order)
     return order, outcome
+
+
+def surrounded_first(order: Int64, worth: Floats, T_cloud_tcp: Floats) -> Int64:
+    """The rows `order`, the best reordered by how many good hands surround each; worth (E,).
+
+    New noise makes another hand the best one, but good ones still surround the same hands.
+    """
+    best = order[:BEST]
+    place, turn = T_cloud_tcp[best, :3, 3], T_cloud_tcp[best, :3, :3].reshape(-1, 9)
+    trace, approach = turn @ turn.T, turn[:, 2::3] @ turn[:, 2::3].T
+    trace = np.maximum(trace, 2 * approach - trace)  # a hand turned by half is the same
+    angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+    away = np.square(cdist(place, place) / ALIKE) + np.square(angle / ALIKE_ANGLE)
+    good = np.exp((worth[best] - worth[best].max(initial=0.0)) / LESS)
+    raised = worth[best] + SURROUNDED * np.log(np.exp(-away / 2) @ good)
+    return np.concatenate([best[np.argsort(-raised, kind="stable")], order[BEST:]])
 
 
 def _drawbacks(
@@ -115,11 +136,11 @@ def _drawbacks(
     return taken
 
 
-def objects_first(order: Int64, score: Floats, number: Int64) -> Int64:
-    """The rows `order`, the first good one of each object (E,) brought to the front; score (E,)."""
-    _, first = np.unique(number[order], return_index=True)
-    first = np.sort(first[score[order[first]] >= GOOD_SCORE])
-    return np.concatenate([order[first], np.delete(order, first)])
+def objects_first(order: Int64, liked: Int64, score: Floats, number: Int64) -> Int64:
+    """The rows `order`, the first good one of each object (E,) in `liked` brought to the front."""
+    good = liked[score[liked] >= GOOD_SCORE]
+    first = good[np.sort(np.unique(number[good], return_index=True)[1])]
+    return np.concatenate([first, order[~np.isin(order, first)]])
 
 
 def ranked(
@@ -133,8 +154,8 @@ def ranked(
     # first, by clearance
     options: DetectOptions,
     clearance: Floats | None,  # (E,) for `clearance`
-) -> Int64:
-    """Rows best first: by the order asked for, and then by score; canonical frame."""
+) -> tuple[Int64, Floats]:
+    """Rows best first, by the order asked for and then by what scores are worth (E,), and that."""
     collision_free = collision_free | (options.collision.mode == "ignore")
     if options.order == "score":
         score = score - _drawbacks(scene, contact_index, hands, gripper)
@@ -145,7 +166,7 @@ def ranked(
         keys = (-worth, np.where(sure, -height, -worth), ~sure)
     if options.order == "clearance" and clearance is not None:
         keys = (-score, -clearance, ~collision_free)
-    return np.lexsort(keys).astype(np.int64)
+    return np.lexsort(keys).astype(np.int64), worth
 
 
 def grasps_in_cloud(

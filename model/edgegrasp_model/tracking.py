@@ -213,9 +213,12 @@ def untracked(previous: Previous) -> Tracking:
 def _order(
     grasps: list[Grasp], options: DetectOptions, scene: Scene, gripper: Gripper, kept: int
 ) -> list[int]:
-    """Rows of grasps, best first, without duplicates of the first `kept` or of a better one."""
-    if not grasps:
-        return []
+    """Rows of grasps, best first, without duplicates of the first `kept` or of a better one.
+
+    The others are already in order.
+    """
+    if kept == 0:
+        return list(range(len(grasps)))
     rule = options.suppression or Suppression()
     T_cloud_tcp = np.stack([grasp.T_cloud_tcp for grasp in grasps])
     rows = np.arange(len(grasps), dtype=np.int64)
@@ -233,10 +236,10 @@ def _order(
     hands = scene.frame.poses([one.T_cloud_hand for one in some])
     places = np.stack([one.contact_point for one in some])
     contact = np.asarray(cKDTree(scene.points_in_cloud).query(places)[1])
-    order = ranked(scene, contact, hands, score, free, gripper, options, clearance)
+    order, _ = ranked(scene, contact, hands, score, free, gripper, options, clearance)
     if options.order == "score":
         number = np.array([-1 if one.object is None else one.object for one in some])
-        order = objects_first(order, score, number)
+        order = objects_first(order, order, score, number)
     return [int(row) for row in rows[order]]
 
 

@@ -35,7 +35,8 @@ LEARNING_RATE = 3e-3
 WARM_UP = 200  # steps
 SAVE_EVERY = 300  # seconds
 AVERAGED = 0.998  # of the mean weights that stay at each step
-LINK_WEIGHT, UP_WEIGHT = 0.5, 0.5  # in the loss
+LINK_WEIGHT, UP_WEIGHT, NEAR_WEIGHT = 0.5, 0.5, 0.3  # in the loss
+NEAR = 4  # output pixels around an object, where the classes of all objects count alike
 APART = 4.0  # weight of a link between different objects
 
 
@@ -138,22 +139,26 @@ def _cropped(points: Float32, label: Int64, plane: Float32, rng: np.random.Gener
 
 def scene_loss(output: SceneOutput, batch: SceneBatch) -> dict[str, Tensor]:
     """The parts of the loss, weighted."""
-    classes = functional.cross_entropy(output.classes, batch.classes, ignore_index=-1)
+    wrong = functional.cross_entropy(
+        output.classes, batch.classes, ignore_index=-1, reduction="none"
+    )
+    seen = batch.classes >= 0
+    near = functional.max_pool2d(batch.weight, 2 * NEAR + 1, 1, NEAR) * seen
     error = functional.smooth_l1_loss(
         output.votes / VOTE_UNIT, batch.votes / VOTE_UNIT, reduction="none", beta=0.2
     )
     votes = (error.sum(dim=1) * batch.weight).sum() / batch.weight.sum().clamp(min=1e-6)
     judged = (batch.links >= 0).float()
     weight = judged * torch.where(batch.links == 0, APART, 1.0)
-    wrong = functional.binary_cross_entropy_with_logits(
+    apart = functional.binary_cross_entropy_with_logits(
         output.links, batch.links.clamp(min=0), reduction="none"
     )
-    links = (wrong * weight).sum() / weight.sum().clamp(min=1.0)
+    links = (apart * weight).sum() / weight.sum().clamp(min=1.0)
     agree = functional.cosine_similarity(output.up, batch.up[..., None, None], dim=1)
-    seen = batch.classes >= 0
     up = ((1.0 - agree) * seen).sum() / seen.sum().clamp(min=1)
     return {
-        "classes": classes,
+        "classes": wrong.sum() / seen.sum().clamp(min=1),
+        "near": NEAR_WEIGHT * (wrong * near).sum() / near.sum().clamp(min=1e-6),
         "votes": votes,
         "links": LINK_WEIGHT * links,
         "up": UP_WEIGHT * up,

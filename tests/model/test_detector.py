@@ -17,6 +17,7 @@ from edgegrasp_model.kernels import mean_of_alike
 from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, parse_options
+from edgegrasp_model.ranking import surrounded_first
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Detection, Grasp
@@ -352,6 +353,13 @@ def test_hands_are_averaged_with_others_on_the_same_object_that_are_near_and_tur
     found = mean_of_alike(logits, poses, number, 0.03, 0.5)
     np.testing.assert_allclose(found[:3], [-1.5, 0.5, 1.0], atol=1e-6)
     assert np.isnan(found[3:]).all()
+
+
+def test_a_hand_among_good_ones_comes_before_a_lone_one_that_is_hardly_better() -> None:
+    poses, order = hands([0.0, 0.01, 0.02, 0.2], [0.0] * 4), np.array([3, 1, 0, 2])
+    for lone, first in ((0.92, 1), (0.99, 3)):
+        worth = np.array([0.9, 0.91, 0.9, lone])
+        assert surrounded_first(order, worth, poses)[0] == first
 
 
 # Grasps across an outline: seen from straight above, where no side of an object is seen.
