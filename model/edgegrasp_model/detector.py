@@ -21,7 +21,6 @@ from edgegrasp_model.candidates.sample import NOTHING, Sample, Sampler
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import Given, check_edges, check_hand_poses, from_edges, from_hand_poses
 from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
-from edgegrasp_model.hand_description import Surroundings
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import check_reference_logits, load_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
@@ -38,7 +37,7 @@ from edgegrasp_model.ranking import (
     select,
 )
 from edgegrasp_model.results import NoGrasp, Pace
-from edgegrasp_model.scene.cloud import UP, CheckedCloud, check_cloud, seen_from_origin
+from edgegrasp_model.scene.cloud import CheckedCloud, check_cloud, seen_from_origin
 from edgegrasp_model.scene.scene import (
     MAX_VOXELS,
     Scene,
@@ -376,12 +375,8 @@ def _batches(
     There is one ball for each approach point.
     """
     if network.architecture == "hand":
-        known = scene.support, scene.viewpoints, scene.at_side, scene.object_of_point, scene.depths
-        around, sizes = (
-            Surroundings(scene.cloud, UP, *known),
-            (network.hand_points, network.description_size),
-        )
-        yield np.arange(len(candidates)), HandBatch.of_hands(around, candidates, gripper, *sizes)
+        sizes = network.hand_points, network.description_size
+        yield np.arange(len(candidates)), HandBatch.of_hands(scene, candidates, gripper, *sizes)
         return
     points, normals = scene.cloud.points, scene.cloud.normals
     balls = np.unique(candidates.approach_index)

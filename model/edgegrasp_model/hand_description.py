@@ -6,8 +6,7 @@ seen, how the hand is oriented to gravity and support, how much of the space aro
 did not see, the hand's own measures, and the visible extent of the object around it.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,9 +16,9 @@ from edgegrasp_model.candidates.collision import APPROACH_LENGTH, NEAR, HandView
 from edgegrasp_model.candidates.edge_grasps import Candidates, support_clearance
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import compiled
-from edgegrasp_model.options import SupportPlane
-from edgegrasp_model.scene.cloud import UP, Cloud, unit
-from edgegrasp_model.unseen import DepthMap, unseen_space, visible_extents
+from edgegrasp_model.scene.cloud import UP, unit
+from edgegrasp_model.scene.scene import Surroundings
+from edgegrasp_model.unseen import unseen_space, visible_extents
 
 AXIS = 0.001  # metres from the approach axis, on which the approach point itself lies
 SLAB = 0.004  # metres; thickness of the first layer each finger would meet
@@ -35,34 +34,6 @@ HEIGHTS = slice(58, 61)  # which of them are heights over the support plane
 BEYOND = slice(65, 67)  # which of them are unseen metres outward from each finger's first contact
 
 
-@dataclass(frozen=True)
-class Surroundings:
-    """The scene as hands see it, in one frame, metres: N points and what is known about them."""
-
-    cloud: Cloud  # with normals
-    up: Float32  # (3,) away from gravity
-    support: SupportPlane | None = None  # heights are measured from this plane
-    viewpoints: Float32 | None = None  # (W, 3) the cameras
-    at_side: Bools | None = None  # (N,) cut off by a side of the workspace; None: nowhere
-    object_of_point: Int64 | None = None  # (N,) None: all points are of one
-    depths: Sequence[DepthMap] | None = None  # what each camera saw; None: computed when needed
-
-    @property
-    def viewpoint(self) -> Float32 | None:
-        """The camera (3,), where there is exactly one."""
-        one = self.viewpoints is not None and len(self.viewpoints) == 1
-        return self.viewpoints[0] if self.viewpoints is not None and one else None
-
-    def mirror_sides(self, T_cloud_hand: Float32) -> Float32:
-        """Factor (E,), 1 or -1, on a hand's x that puts a single camera on its positive side."""
-        if self.viewpoint is None:
-            return np.ones(len(T_cloud_hand), dtype=np.float32)
-        # If a hand approaches straight from the camera, up decides instead of rounding errors.
-        toward = self.viewpoint + ABOVE * UP - T_cloud_hand[:, :3, 3]
-        along_x = np.einsum("ed,ed->e", toward, T_cloud_hand[:, :3, 0])
-        return np.where(along_x < 0.0, -1.0, 1.0).astype(np.float32)
-
-
 def describe_hands(
     around: Surroundings,  # what they look at
     candidates: Candidates,  # E candidates
@@ -72,14 +43,11 @@ def describe_hands(
 ) -> Float32:
     """The description (E, F) of candidates: log(1 + counts), metres and cosines."""
     cloud, up, hands = around.cloud, around.up, candidates.T_cloud_hand
-    side, ends = around.mirror_sides(hands), seen_part(gripper)
+    side, ends = _mirror_sides(around, hands), seen_part(gripper)
     mirrored = hands[:, :3, :3].copy()
     mirrored[:, :, 0] *= side[:, None]
     seen = _look(view, cloud.normals, mirrored, side, around.at_side, ends)
-    depths = around.depths
-    if depths is None:
-        depths = DepthMap.of_each(cloud.points, around.viewpoints, up)
-    unseen = unseen_space(depths, hands, seen.first_met, ends)
+    unseen = unseen_space(around.depths, hands, seen.first_met, ends)
     toward = np.zeros((len(mirrored), 3), dtype=np.float32)
     if around.viewpoint is not None:
         toward = unit(around.viewpoint - hands[:, :3, 3])
@@ -122,8 +90,18 @@ def points_around_fingers(
     palm_z = seen_part(gripper).palm_z
     low, high = (-x, -y, palm_z - BEHIND), (x, y, gripper.tip_z + BEYOND_TIPS)
     box = np.array([low, high, (0.0, 0.0, gripper.tip_z)], dtype=np.float32)
-    side = around.mirror_sides(T_cloud_hand)
+    side = _mirror_sides(around, T_cloud_hand)
     return _around_fingers(view, around.cloud.normals, T_cloud_hand, side, box, limit)
+
+
+def _mirror_sides(around: Surroundings, T_cloud_hand: Float32) -> Float32:
+    """Factor (E,), 1 or -1, on a hand's x that puts a single camera on its positive side."""
+    if around.viewpoint is None:
+        return np.ones(len(T_cloud_hand), dtype=np.float32)
+    # If a hand approaches straight from the camera, up decides instead of rounding errors.
+    toward = around.viewpoint + ABOVE * UP - T_cloud_hand[:, :3, 3]
+    along_x = np.einsum("ed,ed->e", toward, T_cloud_hand[:, :3, 0])
+    return np.where(along_x < 0.0, -1.0, 1.0).astype(np.float32)
 
 
 def seen_part(gripper: Gripper) -> Gripper:
@@ -158,7 +136,7 @@ def _look(
     normals: Float32,
     mirrored: Float32,
     side: Float32,
-    at_side: Bools | None,
+    cut: Bools,
     gripper: Gripper,
 ) -> _Seen:
     """Look from hands with axes (E, 3, 3), the x of which is mirrored where `side` (E,) is -1."""
@@ -171,7 +149,6 @@ def _look(
     along = gripper.palm_z, gripper.tip_z, gripper.max_tip_z
     lengths = (np.float32(length) for length in (*across, *along))
     hand = _Hand(boxes[:first], boxes[first:last], *lengths)
-    cut = np.zeros(len(normals), dtype=bool) if at_side is None else at_side
     _look_from_each(view, normals, mirrored, side, cut, hand, seen)
     return seen
 

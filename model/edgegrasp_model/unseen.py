@@ -181,7 +181,7 @@ def _grid(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Float32:
 
 def visible_extents(
     points: Float32,  # (N, 3)
-    number: Int64 | None,  # (N,) the object of each point; None: one object
+    number: Int64,  # (N,) the object of each point
     contact_index: Int64,  # (E,) rows of `points`: the object of that point is measured
     T_cloud_hand: Float32,  # (E, 4, 4) hands
     side: Float32,  # (E,) 1 or -1, the factor on x
@@ -194,7 +194,6 @@ def visible_extents(
     three pads and before the palm; along x and -x; ahead of the tips, behind the palm; length,
     width, height.
     """
-    number = np.zeros(len(points), dtype=np.int64) if number is None else number
     labels, groups = np.unique(number[contact_index], return_inverse=True)
     vertical = np.asarray(up, dtype=np.float64) / np.linalg.norm(np.asarray(up, dtype=np.float64))
     parts, sizes = [], np.zeros((len(labels), 3), dtype=np.float32)

@@ -17,12 +17,13 @@ from torch import Tensor
 from edgegrasp_camera.arrays import Float32, Int64
 from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls, edge_grasps, retract
 from edgegrasp_model.candidates.outline import outline_grasps, outlines
-from edgegrasp_model.hand_description import HEIGHTS, UNKNOWN_HEIGHT, Surroundings
+from edgegrasp_model.hand_description import HEIGHTS, UNKNOWN_HEIGHT
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
+from edgegrasp_model.scene.scene import Surroundings
 from edgegrasp_training.recipes import LENGTH_UNIT
 from edgegrasp_training.views import UNTRIED, UP, LabelledView, load_view
 

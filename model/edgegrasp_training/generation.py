@@ -341,7 +341,7 @@ def label(
         success=np.asarray([result.success for result in results], dtype=np.int8),
         firm=np.asarray([bool(result.held_after_shaking) for result in results], dtype=np.int8),
         support=np.array([0.0] * 4 if plane is None else [*plane.normal, plane.offset], np.float32),
-        at_side=None if scene.at_side is None else scene.at_side[kept],
+        at_side=scene.at_side[kept],
         object_of_point=scene.object_of_point[kept].astype(np.int16),
     )
     return view, None if best is None else T_world_hand[best]

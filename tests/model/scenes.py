@@ -9,7 +9,7 @@ from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
-from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
+from edgegrasp_model.scene.cloud import UP, CanonicalFrame, Cloud
 from edgegrasp_model.scene.scene import Scene
 
 SEED = 2**32 - 1  # the greatest
@@ -49,8 +49,10 @@ def box_on_table(
 def scene_of(points: np.ndarray, **fields: object) -> Scene:
     """A scene of one object's points (N, 3) float32, as they are sent: no plane, no obstacles."""
     every = np.ones(len(points), dtype=bool)
-    plain = {"support": None, "obstacles": None} | fields
+    plain = {"support": None, "obstacles": None, "viewpoints": None} | fields
     return Scene(
+        up=UP,
+        at_side=~every,
         frame=CanonicalFrame(np.eye(4)),
         cloud=Cloud(points, points),
         points_in_cloud=points,

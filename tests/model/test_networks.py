@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.candidates.edge_grasps import crop_balls, edge_grasps
-from edgegrasp_model.hand_description import Surroundings
 from edgegrasp_model.networks.balls import BallBatch, nearest_in_groups
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import EDGEGRASP_SMALL, HAND, NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_model.scene.scene import Surroundings
 
 from .scenes import PANDA, SEED, TINY
 
@@ -168,7 +168,9 @@ def look(seed: int) -> HandBatch:
     candidates = edge_grasps(cloud, *rng.integers(150, size=(2, 60)), PANDA)
     up, camera = np.float32([0.0, 0.0, 1.0]), np.float32([[0.3, 0.2, 0.5]])
     support = SupportPlane(normal=(0.0, 0.0, 1.0), offset=-0.05)
-    return HandBatch.of_hands(Surroundings(cloud, up, support, camera), candidates, PANDA, 400)
+    at_side, number = np.zeros(150, dtype=bool), np.zeros(150, dtype=np.int64)
+    around = Surroundings(cloud, up, support, camera, at_side, number)
+    return HandBatch.of_hands(around, candidates, PANDA, 400)
 
 
 def hand_scores(batch: HandBatch, config: NetworkConfig = TINY["hand"]) -> torch.Tensor:

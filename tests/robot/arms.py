@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.options import SupportPlane, parse_options
-from edgegrasp_model.scene.cloud import CanonicalFrame
+from edgegrasp_model.scene.cloud import UP, CanonicalFrame
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_results import DetectedObject, Detection, Grasp, GripperOutline
 from edgegrasp_robot import plan_picks, with_robot
@@ -53,8 +53,8 @@ def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=(), eyes=None):
     foot = frame.points(in_cloud(np.zeros((1, 3))))[0]
     every = np.ones(len(objects), dtype=bool)
     scene = Scene(
-        frame=frame, cloud=None, points_in_cloud=objects, point_of_row=number,
-        approach_allowed=every, contact_allowed=every, object_of_point=number,
+        frame=frame, cloud=None, up=UP, points_in_cloud=objects, point_of_row=number,
+        approach_allowed=every, contact_allowed=every, at_side=~every, object_of_point=number,
         support=SupportPlane(normal=(0.0, 0.0, 1.0), offset=float(foot[2])), obstacles=None,
         viewpoints=None if eyes is None else frame.points(in_cloud(np.array(eyes))),
     )  # fmt: skip

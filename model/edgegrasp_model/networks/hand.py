@@ -20,7 +20,6 @@ from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_description import (
     HAND_DESCRIPTION_SIZE,
-    Surroundings,
     describe_hands,
     points_around_fingers,
 )
@@ -35,6 +34,7 @@ from edgegrasp_model.networks.layers import (
     maximum,
     mlp,
 )
+from edgegrasp_model.scene.scene import Surroundings
 
 POINT_UNIT = 0.05  # metres; scale of the positions around the fingers
 DROPOUT = 0.1  # dropout of the classifier's inputs

@@ -58,29 +58,42 @@ CUT_OUT = 0.95  # confidence of clusters where a cloud was cut off above its sup
 
 
 @dataclass(frozen=True)
-class Scene:
-    """The scene in which grasps are searched; canonical frame. V voxels are left of the cloud."""
+class Surroundings:
+    """What hands see around them, in one frame, metres: N points and what is known about them."""
 
-    frame: CanonicalFrame
-    cloud: Cloud  # V points
-    points_in_cloud: Float32  # (V, 3) the same in the cloud's frame
-    point_of_row: Int64  # (R,) voxel of each row of the cloud as sent; -1: none
-    approach_allowed: Bools  # (V,) in the approach region
-    contact_allowed: Bools  # (V,) in the contact region
-    object_of_point: Int64  # (V,) number of each point's object; FIXED; UNKNOWN
+    cloud: Cloud  # N points
+    up: Float32  # (3,) away from gravity
     support: SupportPlane | None
-    obstacles: SolidBoxes | None  # beside the cloud; None: there are none
-    viewpoints: Float32 | None = None  # (W, 3) the cameras, if known
-    confidence: dict[int, float] = field(default_factory=dict)  # probability of each, if found
-    at_side: Bools | None = None  # (V,) where a side of the workspace cuts the cloud off
-    # (3, 4) point to place in the image that was sent, its sides at -1 and 1; None: not known
-    P_image_cloud: Float64 | None = None
-    corrected: Float32 | None = None  # (N, 3) all points, cloud frame, if depths were corrected
+    viewpoints: Float32 | None  # (W, 3) the cameras, if known
+    at_side: Bools  # (N,) where a side of the workspace cuts the cloud off
+    object_of_point: Int64  # (N,) number of each point's object; FIXED; UNKNOWN
 
     @cached_property
     def depths(self) -> list[DepthMap]:
         """What each camera saw."""
-        return DepthMap.of_each(self.cloud.points, self.viewpoints, UP)
+        return DepthMap.of_each(self.cloud.points, self.viewpoints, self.up)
+
+    @property
+    def viewpoint(self) -> Float32 | None:
+        """The camera (3,), where there is exactly one."""
+        one = self.viewpoints is not None and len(self.viewpoints) == 1
+        return self.viewpoints[0] if self.viewpoints is not None and one else None
+
+
+@dataclass(frozen=True)
+class Scene(Surroundings):
+    """The scene in which grasps are searched; canonical frame. N voxels are left of the cloud."""
+
+    frame: CanonicalFrame
+    points_in_cloud: Float32  # (N, 3) the points in the cloud's frame
+    point_of_row: Int64  # (R,) voxel of each row of the cloud as sent; -1: none
+    approach_allowed: Bools  # (N,) in the approach region
+    contact_allowed: Bools  # (N,) in the contact region
+    obstacles: SolidBoxes | None  # beside the cloud; None: there are none
+    confidence: dict[int, float] = field(default_factory=dict)  # probability of each, if found
+    # (3, 4) point to place in the image that was sent, its sides at -1 and 1; None: not known
+    P_image_cloud: Float64 | None = None
+    corrected: Float32 | None = None  # (M, 3) all points, cloud frame, if depths were corrected
 
 
 @dataclass(frozen=True)
@@ -264,8 +277,9 @@ def build_scene(
     point_of_row = np.full(sent.rows_sent, -1, dtype=np.int64)
     point_of_row[sent.row] = np.where(kept, np.cumsum(kept) - 1, -1)[voxels.voxel]
     return Scene(
-        frame=frame,
         cloud=cloud,
+        up=UP,
+        frame=frame,
         points_in_cloud=in_cloud[kept],
         point_of_row=point_of_row,
         approach_allowed=approach,
