@@ -117,9 +117,9 @@ def edge_grasps(
 ) -> Candidates:
     """The pairs of approach and contact points that define an edge grasp which fits the gripper.
 
-    r = p_c - p_a; its part orthogonal to n_c points from the hand to the object (paper section
-    III-A). The contact lies at the gripper's contact_z and the approach point on the hand's axis.
-    The pairs are rows (M,) of the cloud.
+    r = p_c - p_a; its part r_perp orthogonal to n_c points from the hand to the object (paper
+    section III-A): z = r_perp / d, y = n_c, x = y x z. The contact lies at the gripper's contact_z
+    and the approach point on the hand's axis. The pairs are rows (M,) of the cloud.
     """
     edge = measure_edges(cloud, approach_index, contact_index)
     pair = np.flatnonzero(
@@ -128,10 +128,17 @@ def edge_grasps(
         & (edge.depth > MIN_DEPTH)
         & (edge.depth < gripper.finger_depth)
     )
-    ahead, normal, depth = edge.ahead[pair], edge.normal[pair], edge.depth[pair]
+    approach_index, contact_index = approach_index[pair], contact_index[pair]
+    normal, depth = edge.normal[pair], edge.depth[pair]
     contact_z = gripper.contact_z_at(2 * np.abs(edge.along[pair]))
-    pose = edge_grasp_poses(cloud.points[approach_index[pair]], ahead, normal, depth, contact_z)
-    return Candidates(pair, approach_index[pair], contact_index[pair], depth, pose)
+    z = edge.ahead[pair] / depth[:, None]
+    y = normal - np.einsum("ed,ed->e", normal, z)[:, None] * z
+    y = y / np.linalg.norm(y, axis=1, keepdims=True)
+    pose = np.zeros((len(z), 4, 4), dtype=np.float32)
+    pose[:, :3, :3] = np.stack([np.cross(y, z), y, z], axis=2)
+    pose[:, :3, 3] = cloud.points[approach_index] + (depth - contact_z)[:, None] * z
+    pose[:, 3, 3] = 1.0
+    return Candidates(pair, approach_index, contact_index, depth, pose)
 
 
 class EdgeMeasures(NamedTuple):
@@ -152,26 +159,6 @@ def measure_edges(cloud: Cloud, approach_index: Int64, contact_index: Int64) -> 
     ahead = edge - along[:, None] * normal
     length, depth = np.linalg.norm(edge, axis=1), np.linalg.norm(ahead, axis=1)
     return EdgeMeasures(normal, along, ahead, length, depth)
-
-
-def edge_grasp_poses(
-    approach_point: Float32,  # (E, 3) p_a
-    ahead: Float32,  # (E, 3) r_perp, the part of p_c - p_a orthogonal to n_c
-    normal: Float32,  # (E, 3) unit n_c
-    depth: Float32,  # (E,) d = |r_perp|
-    contact_z: Float32,  # (E,) where the contact lies along the hand's z
-) -> Float32:
-    """T_cloud_hand (E, 4, 4) of edge grasps: z = r_perp / d, y = n_c, x = y x z."""
-    z = ahead / depth[:, None]
-    y = normal - np.einsum("ed,ed->e", normal, z)[:, None] * z
-    y = y / np.linalg.norm(y, axis=1, keepdims=True)
-    pose = np.zeros((len(z), 4, 4), dtype=np.float32)
-    pose[:, :3, 0] = np.cross(y, z)
-    pose[:, :3, 1] = y
-    pose[:, :3, 2] = z
-    pose[:, :3, 3] = approach_point + (depth - contact_z)[:, None] * z
-    pose[:, 3, 3] = 1.0
-    return pose
 
 
 def retract(
