@@ -46,8 +46,8 @@ def describe_hands(
     side, ends = _mirror_sides(around, hands), seen_part(gripper)
     mirrored = hands[:, :3, :3].copy()
     mirrored[:, :, 0] *= side[:, None]
-    seen = _look(view, cloud.normals, mirrored, side, around.at_side, ends)
-    unseen = unseen_space(around.depths, hands, seen.first_met, ends)
+    seen, first_met, runs = _look(view, cloud.normals, mirrored, side, around.at_side, ends)
+    unseen = unseen_space(around.depths, hands, first_met, ends)
     toward = np.zeros((len(mirrored), 3), dtype=np.float32)
     if around.viewpoint is not None:
         toward = unit(around.viewpoint - hands[:, :3, 3])
@@ -56,9 +56,7 @@ def describe_hands(
     thick = max(high[1] for _, high in gripper.finger_boxes)
     measures = gripper.max_opening, length, gripper.pad_half_width, thick, swing  # of a finger
     columns = [
-        *seen.hits.T,
-        *seen.between.T,
-        seen.cut_off,
+        *seen.T,
         *np.einsum("ed,edk->ke", toward, mirrored),  # 0 where the camera is unknown
         *np.einsum("ed,edk->ke", ups, mirrored),
         *unseen.parts,
@@ -68,7 +66,7 @@ def describe_hands(
         *unseen.depths,
         *unseen.beyond,
         unseen.free,
-        *seen.runs.T,
+        *runs.T,
         *np.tile(measures, (len(candidates), 1)).T,
     ]
     if size > len(columns):
@@ -109,16 +107,6 @@ def seen_part(gripper: Gripper) -> Gripper:
     return replace(gripper, palm_z=max(gripper.palm_z, gripper.tip_z - SEEN_LENGTH))
 
 
-class _Seen(NamedTuple):
-    """What E hands see of the cloud. Counts n are given as log(1 + n)."""
-
-    hits: Float32  # (E, 7) as `_count_hits` orders them
-    between: Float32  # (E, 29) as `_measure_between` orders them
-    cut_off: Float32  # (E,) points between the fingers where the workspace cuts objects off
-    first_met: Float32  # (E, 2) greatest and least y between the fingers; 0 if nothing is there
-    runs: Float32  # (E, 3) as `_runs_along` orders them
-
-
 class _Hand(NamedTuple):
     """The open gripper as the compiled loops read it; metres."""
 
@@ -138,19 +126,23 @@ def _look(
     side: Float32,
     cut: Bools,
     gripper: Gripper,
-) -> _Seen:
-    """Look from hands with axes (E, 3, 3), the x of which is mirrored where `side` (E,) is -1."""
-    count = len(mirrored)
-    shapes = (count, 7), (count, 29), (count,), (count, 2), (count, 3)
-    seen = _Seen(*(np.zeros(shape, dtype=np.float32) for shape in shapes))
+) -> tuple[Float32, Float32, Float32]:
+    """Look from hands with axes (E, 3, 3), the x of which is mirrored where `side` (E,) is -1.
+
+    Returns (E, 37) numbers: those of `_count_hits`, those of `_measure_between`, and how many
+    points between the fingers lie where the workspace cuts objects off, `cut` (N,); then the
+    results of `_runs_along`: greatest and least y between the fingers (E, 2), and runs (E, 3).
+    Counts n are given as log(1 + n).
+    """
+    seen, first_met, runs = (np.zeros((len(side), size), np.float32) for size in (37, 2, 3))
     boxes = gripper.open_boxes.astype(np.float32)
     first, last = len(gripper.hand_boxes), len(gripper.hand_boxes) + len(gripper.finger_boxes)
     across = gripper.pad_half_width, gripper.max_opening / 2
     along = gripper.palm_z, gripper.tip_z, gripper.max_tip_z
     lengths = (np.float32(length) for length in (*across, *along))
     hand = _Hand(boxes[:first], boxes[first:last], *lengths)
-    _look_from_each(view, normals, mirrored, side, cut, hand, seen)
-    return seen
+    _look_from_each(view, normals, mirrored, side, cut, hand, seen, first_met, runs)
+    return seen, first_met, runs
 
 
 def _stance(around: Surroundings, candidates: Candidates, gripper: Gripper) -> list[Float32]:
@@ -186,13 +178,15 @@ def _look_from_each(
     side: Float32,
     cut: Bools,
     hand: _Hand,
-    seen: _Seen,
+    seen: Float32,
+    first_met: Float32,
+    runs: Float32,
 ) -> None:
     for e in range(len(side)):
         start, stop = view.bounds[e], view.bounds[e + 1]
         x, y, z = view.position[:, start:stop]
         x = side[e] * x
-        _count_hits(x, y, z, hand, seen.hits[e])
+        _count_hits(x, y, z, hand, seen[e, :7])
         across, ahead = np.abs(y) < hand.inner, z > hand.palm
         pads = across & ahead & (np.abs(x) < hand.half + NEAR) & (z < hand.tip + NEAR)
         wide = np.flatnonzero(across & ahead & (np.abs(x) < 3 * hand.half) & (z < hand.end))
@@ -202,9 +196,9 @@ def _look_from_each(
             for i in range(len(wide)):
                 n = normals[view.row[start + wide[i]]]
                 facing[d, i] = n[0] * axes[e, 0, d] + n[1] * axes[e, 1, d] + n[2] * axes[e, 2, d]
-        seen.cut_off[e] = np.log1p(np.sum(cut[view.row[start:stop]] & pads))
-        _measure_between(points, facing, hand, seen.between[e])
-        _runs_along(points[1][np.abs(points[0]) < hand.half], seen.first_met[e], seen.runs[e])
+        _measure_between(points, facing, hand, seen[e, 7:36])
+        seen[e, 36] = np.log1p(np.sum(cut[view.row[start:stop]] & pads))
+        _runs_along(points[1][np.abs(points[0]) < hand.half], first_met[e], runs[e])
 
 
 @compiled("contract")
