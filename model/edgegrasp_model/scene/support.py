@@ -400,17 +400,13 @@ def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> floa
         window = held[start : start + width]
         if window.max() >= enough:
             scale = _middle(factors, float(tried[start + int(window.argmax())]), reach)
-            if scale is not None and _covers(points, viewpoint, plane, scale):
-                return scale
+            if scale is not None:
+                scaled = viewpoint + scale * (points[thinned(len(points))] - viewpoint)
+                if _wide(scaled[np.abs(plane.heights(scaled)) < NEAR], plane):
+                    return scale
             start += width - 1
         start += 1
     return None
-
-
-def _covers(points: Floats, viewpoint: Float64, plane: SupportPlane, scale: float) -> bool:
-    """Whether scaled points (N, 3) that lie in the plane cover more than an object's flat top."""
-    scaled = viewpoint + scale * (points[thinned(len(points))] - viewpoint)
-    return _wide(scaled[np.abs(plane.heights(scaled)) < NEAR], plane)
 
 
 def _wide(points: Floats, plane: SupportPlane) -> bool:
