@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.candidates.edge_grasps import crop_balls, edge_grasps
-from edgegrasp_model.networks.balls import BallBatch, nearest_in_groups
+from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import EDGEGRASP_SMALL, HAND, NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
@@ -61,7 +61,7 @@ class RandomScene:
         edges = self.edges[self.edges[:, 0] == ball] * (0, 1)
         return replace(self, approach_index=self.approach_index[[ball]], edges=edges)
 
-    def batch(self, dtype: torch.dtype = torch.float64) -> BallBatch:
+    def batch(self, dtype: type = np.float64) -> BallBatch:
         crop = crop_balls(self.points, self.approach_index, 0.05)
         size = len(self.points)
         row = np.searchsorted(
@@ -71,18 +71,12 @@ class RandomScene:
         normal = self.normals[self.edges[:, 1]]
         ahead = edge - (edge * normal).sum(axis=1, keepdims=True) * normal
         depth = np.linalg.norm(ahead, axis=1)
-        centre = self.points[self.approach_index][crop.ball_of_point]
-        centred = self.points[crop.ball_rows] - centre
-        bounds = np.searchsorted(crop.ball_of_point, np.arange(len(self.approach_index) + 1))
-        return BallBatch(
-            points=torch.from_numpy(centred).to(dtype),
-            normals=torch.from_numpy(self.normals[crop.ball_rows]).to(dtype),
-            neighbors=torch.from_numpy(nearest_in_groups(centred, bounds, 16)),
-            ball_of_point=torch.from_numpy(crop.ball_of_point),
-            num_balls=len(self.approach_index),
-            contact=torch.from_numpy(row),
-            approach=torch.from_numpy(-ahead / depth[:, None]).to(dtype),
-            depth=torch.from_numpy(depth).to(dtype),
+        points, normals, approach, depth = (
+            each.astype(dtype)
+            for each in (self.points, self.normals, -ahead / depth[:, None], depth)
+        )
+        return BallBatch.from_cloud(
+            points, normals, self.approach_index, crop, row, approach, depth
         )
 
 
@@ -129,18 +123,18 @@ def test_scores_depend_neither_on_point_order_nor_on_other_balls(architecture, s
 )
 def test_a_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it(config):
     network, scene = build_network(config), RandomScene.of_seed(3)
-    together = scores(network, scene.batch(torch.float32))
+    together = scores(network, scene.batch(np.float32))
     for ball in range(len(scene.approach_index)):
-        alone = scores(network, scene.only_ball(ball).batch(torch.float32))
+        alone = scores(network, scene.only_ball(ball).batch(np.float32))
         assert torch.equal(alone, together[torch.from_numpy(scene.edges[:, 0] == ball)])
     some = replace(scene, edges=scene.edges[::3])
-    assert torch.equal(scores(network, some.batch(torch.float32)), together[::3])
+    assert torch.equal(scores(network, some.batch(np.float32)), together[::3])
 
 
 @architectures
 def test_neither_single_precision_nor_recorded_gradients_change_a_score(architecture):
     network, scene = build_network(TINY[architecture]), RandomScene.of_seed(3)
-    batch = scene.batch(torch.float32)
+    batch = scene.batch(np.float32)
     single = scores(network, batch)  # by fused loops
     in_one_place = replace(batch, points=0 * batch.points, normals=0 * batch.normals)
     assert scores(network, in_one_place).isfinite().all()
@@ -154,7 +148,7 @@ def test_neither_single_precision_nor_recorded_gradients_change_a_score(architec
 @architectures
 def test_a_batch_without_grasps_has_no_scores(architecture):
     empty = replace(RandomScene.of_seed(1), edges=np.empty((0, 2), dtype=np.int64))
-    assert scores(build_network(TINY[architecture]), empty.batch(torch.float32)).shape == (0,)
+    assert scores(build_network(TINY[architecture]), empty.batch(np.float32)).shape == (0,)
 
 
 # What a hand sees of the cloud in its own frame, and the network that scores it by that.

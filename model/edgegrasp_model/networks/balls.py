@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from edgegrasp_camera.arrays import Float32, Floats, Int64
+from edgegrasp_camera.arrays import Floats, Int64
 from edgegrasp_model.candidates.edge_grasps import BallCrop, crop_balls
 from edgegrasp_model.networks.config import NetworkConfig
 
@@ -32,27 +32,27 @@ class BallBatch:
     @classmethod
     def from_cloud(
         cls,
-        points: Float32,  # (N, 3)
-        normals: Float32,  # (N, 3)
+        points: Floats,  # (N, 3); all arrays of one type
+        normals: Floats,  # (N, 3)
         approach_index: NDArray[np.integer],  # (A,)
         crop: BallCrop,
         contact: NDArray[np.integer],  # (E,)
-        approach: Float32,  # (E, 3)
-        depth: Float32,  # (E,)
+        approach: Floats,  # (E, 3)
+        depth: Floats,  # (E,)
         k: int = 16,  # neighbours of each point (paper, section IV)
     ) -> Self:
         """Pack a cloud and its balls; contacts are rows of the crop, as each belongs to a ball."""
         centred = points[crop.ball_rows] - points[approach_index][crop.ball_of_point]
         bounds = np.searchsorted(crop.ball_of_point, np.arange(len(approach_index) + 1))
         return cls(
-            points=_float_tensor(centred),
-            normals=_float_tensor(normals[crop.ball_rows]),
+            points=torch.from_numpy(centred),
+            normals=torch.from_numpy(normals[crop.ball_rows]),
             neighbors=torch.from_numpy(nearest_in_groups(centred, bounds, k)),
             ball_of_point=torch.from_numpy(crop.ball_of_point),
             num_balls=len(approach_index),
             contact=torch.from_numpy(np.asarray(contact, dtype=np.int64)),
-            approach=_float_tensor(approach),
-            depth=_float_tensor(depth),
+            approach=torch.from_numpy(np.ascontiguousarray(approach)),
+            depth=torch.from_numpy(depth),
         )
 
     @staticmethod
@@ -106,11 +106,7 @@ class BallBatch:
         return replace(self, **{name: part.to(device) for name, part in tensors.items()})
 
 
-def _float_tensor(array: Floats) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
-
-
-def nearest_in_groups(points: Float32, bounds: Int64, k: int) -> Int64:
+def nearest_in_groups(points: Floats, bounds: Int64, k: int) -> Int64:
     """Rows (P, k) of the k nearest points of the same group, the point itself first.
 
     Points are (P, 3), group after group, from bounds[g] to bounds[g + 1]; the own row fills up
