@@ -1,9 +1,9 @@
 """The batch that the ball networks score: the neighbourhoods of the approach points."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -18,13 +18,12 @@ from edgegrasp_model.networks.config import NetworkConfig
 
 @dataclass(frozen=True)
 class BallBatch:
-    """P points in `num_balls` balls of one cloud or several, E edge grasps; metres."""
+    """P points in balls of one cloud or several, E edge grasps; metres."""
 
     points: Tensor  # (P, 3) float32, centred on their own ball's approach point
     normals: Tensor  # (P, 3) float32
     neighbors: Tensor  # (P, k) int64, rows of `points` in the same ball, the own row included
     ball_of_point: Tensor  # (P,) int64, ascending, 0..num_balls-1, none of them empty
-    num_balls: int
     contact: Tensor  # (E,) int64, rows of `points`: the contact point of each edge grasp
     approach: Tensor  # (E, 3) float32, outward approach direction u, unit length
     depth: Tensor  # (E,) float32, |r_perp|: contact below approach point along u
@@ -49,7 +48,6 @@ class BallBatch:
             normals=torch.from_numpy(normals[crop.ball_rows]),
             neighbors=torch.from_numpy(nearest_in_groups(centred, bounds, k)),
             ball_of_point=torch.from_numpy(crop.ball_of_point),
-            num_balls=len(approach_index),
             contact=torch.from_numpy(np.asarray(contact, dtype=np.int64)),
             approach=torch.from_numpy(np.ascontiguousarray(approach)),
             depth=torch.from_numpy(depth),
@@ -67,7 +65,6 @@ class BallBatch:
             normals=torch.cat([batch.normals for batch in batches]),
             neighbors=torch.cat([batch.neighbors + first for batch, first in points]),
             ball_of_point=torch.cat([batch.ball_of_point + first for batch, first in balls]),
-            num_balls=first_ball[-1],
             contact=torch.cat([batch.contact + first for batch, first in points]),
             approach=torch.cat([batch.approach for batch in batches]),
             depth=torch.cat([batch.depth for batch in batches]),
@@ -95,15 +92,18 @@ class BallBatch:
         )
 
     @property
+    def num_balls(self) -> int:
+        """How many balls there are."""
+        return int(self.ball_of_point[-1]) + 1
+
+    @property
     def ball_of_edge(self) -> Tensor:
         """Ball (E,) int64 of each edge grasp."""
         return self.ball_of_point[self.contact]
 
     def to(self, device: torch.device | str) -> "BallBatch":
         """Moves every tensor to a device."""
-        parts = vars(self).items()
-        tensors: dict[str, Any] = {name: part for name, part in parts if isinstance(part, Tensor)}
-        return replace(self, **{name: part.to(device) for name, part in tensors.items()})
+        return BallBatch(*(tensor.to(device) for tensor in vars(self).values()))
 
 
 def nearest_in_groups(points: Floats, bounds: Int64, k: int) -> Int64:

@@ -95,12 +95,12 @@ class GlobalFeature(nn.Module):
     def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 224) to ball features (B, 1024)."""
         chunks = ball_chunks(local, batch)
-        mlp_1, maximum_1 = PackedMlp(self.mlp_1), BallMaximum(batch.num_balls)
+        mlp_1, maximum_1 = PackedMlp(self.mlp_1), BallMaximum()
         for chunk in chunks:
             maximum_1.add(mlp_1(chunk.values), chunk)
         pooled = maximum_1.result()  # (B, 512)
         join = SharedProduct(self.join.weight, self.join.bias, pooled)
-        mlp_2, maximum_2 = PackedMlp(self.mlp_2), BallMaximum(batch.num_balls)
+        mlp_2, maximum_2 = PackedMlp(self.mlp_2), BallMaximum()
         for chunk in chunks:
             joined = join(chunk.values, chunk.ball_of_point).relu_()  # (p, 1024)
             maximum_2.add(mlp_2(joined), chunk)

@@ -4,6 +4,7 @@ In inference a row's result does not depend on the other rows, to the last bit: 
 is the same whatever else is scored with it.
 """
 
+from collections import defaultdict
 from collections.abc import Callable, MutableMapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
@@ -172,8 +173,8 @@ def by_chunks(layer: Callable[[Tensor], Tensor], values: Tensor, rows: int = ROW
 class BallMaximum:
     """Maximum over the points of each ball, chunk by chunk."""
 
-    def __init__(self, num_balls: int) -> None:
-        self._parts: list[list[Tensor]] = [[] for _ in range(num_balls)]
+    def __init__(self) -> None:
+        self._parts: defaultdict[int, list[Tensor]] = defaultdict(list)  # by ball, ascending
 
     def add(self, values: Tensor, chunk: BallChunk) -> None:
         """Take in the values (p, C) of a chunk's points."""
@@ -182,7 +183,7 @@ class BallMaximum:
 
     def result(self) -> Tensor:
         """The maximum (B, C) of each ball."""
-        return torch.stack([maximum(torch.stack(parts), dim=0) for parts in self._parts])
+        return torch.stack([maximum(torch.stack(parts), dim=0) for parts in self._parts.values()])
 
 
 def maximum(values: Tensor, dim: int) -> Tensor:
