@@ -40,17 +40,6 @@ def collides(
     background. The margin is added on every side of each box of the hand. It is negative for hands
     that were fully checked earlier, of which only what they hit is checked.
     """
-    hit = _hits(scene, T_cloud_hand, gripper, request)
-    if request.margin < 0.0:
-        return hit
-    free = np.flatnonzero(~hit)
-    hit[free] = closes_on_background(scene, T_cloud_hand[free], gripper)
-    hit[free] |= enters_unseen(scene.depths, T_cloud_hand[free], gripper)
-    return hit
-
-
-def _hits(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
-    """Which open hands collide with the cloud, the support plane or an obstacle.  # (E,)."""
     boxes = gripper.open_boxes + request.margin * np.array([[-1.0], [1.0]])  # (B, 2, 3)
     behind, lift = request.approach_length, 0.0  # metres along the hand's z, and straight up
     if request.retreat_direction == "up":
@@ -77,6 +66,10 @@ def _hits(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collis
             way = lift * UP.astype(np.float64)
             solid |= _hits_any(SolidBoxes.of_hands(T_cloud_hand, boxes), scene.obstacles, way)
         hit |= solid.reshape(len(hit), len(boxes)).any(axis=1)
+    if request.margin >= 0.0:
+        free = np.flatnonzero(~hit)
+        hit[free] = closes_on_background(scene, T_cloud_hand[free], gripper)
+        hit[free] |= enters_unseen(scene.depths, T_cloud_hand[free], gripper)
     return hit
 
 
