@@ -1,7 +1,5 @@
 """Scenes of solid boxes, as a depth camera sees them."""
 
-from dataclasses import dataclass, field
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -9,13 +7,12 @@ WIDTH, HEIGHT, FOCAL_LENGTH = 320, 240, 270.0
 NOISE = 0.0015  # metres at one metre; grows with the square of the distance
 
 
-@dataclass
 class SolidBox:
-    """A box; world frame, metres, z up."""
+    """A box, turned about z; world frame, metres, z up."""
 
-    center: np.ndarray  # (3,)
-    half: np.ndarray  # (3,)
-    turn: np.ndarray = field(default_factory=lambda: np.eye(3))  # R_world_box
+    def __init__(self, center: object, half: object, yaw: float = 0.0) -> None:
+        self.center, self.half = np.asarray(center, float), np.asarray(half, float)  # (3,) each
+        self.turn = Rotation.from_euler("z", yaw).as_matrix()  # R_world_box
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Distance (N,) of points (N, 3) from the box; 0 inside."""
@@ -23,9 +20,7 @@ class SolidBox:
         return np.linalg.norm(np.maximum(apart, 0.0), axis=1)
 
 
-def box(center: object, half: object, yaw: float = 0.0) -> SolidBox:
-    turn = Rotation.from_euler("z", yaw).as_matrix()
-    return SolidBox(np.asarray(center, float), np.asarray(half, float), turn)
+box = SolidBox
 
 
 def table(half_width: float = 0.5, half_depth: float = 0.4) -> SolidBox:
@@ -66,14 +61,8 @@ def to_world(T_world_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
 def render(boxes: list[SolidBox], T_world_camera: np.ndarray, seed: int = 0) -> np.ndarray:
     """The organised cloud (HEIGHT, WIDTH, 3) in the camera's frame, NaN where nothing is seen."""
     row, column = np.indices((HEIGHT, WIDTH))
-    rays = np.stack(
-        [
-            (column - WIDTH / 2) / FOCAL_LENGTH,
-            (row - HEIGHT / 2) / FOCAL_LENGTH,
-            np.ones((HEIGHT, WIDTH)),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
+    x, y = (column - WIDTH / 2) / FOCAL_LENGTH, (row - HEIGHT / 2) / FOCAL_LENGTH
+    rays = np.stack([x, y, np.ones((HEIGHT, WIDTH))], axis=-1).reshape(-1, 3)
     in_world, eye = rays @ T_world_camera[:3, :3].T, T_world_camera[:3, 3]
     depth = np.full(len(rays), np.inf)
     for one in boxes:
