@@ -108,10 +108,10 @@ class GraspDetector:
         self,
         network: nn.Module,  # scores the candidates
         metadata: CheckpointMetadata,  # of the weights
-        gripper: Gripper,  # that it was trained for, used if a request names none
         device: torch.device | str = "cpu",  # where the network runs
         grippers: Mapping[str, Gripper] | None = None,  # the user's own, by name
     ) -> None:
+        """Load the gripper that the weights were trained for; raises InvalidGripper."""
         self.network = network.to(device).eval()
         self.metadata = metadata
         # Whether the network scores the hand pose itself rather than the edge.
@@ -119,7 +119,7 @@ class GraspDetector:
         # Of calibrated logits, fitted to outcomes of a robot.
         rescaled: tuple[float, float] = metadata.training.get("outcomes_scale_shift", (1.0, 0.0))
         self._scale, self._shift = rescaled
-        self.gripper = gripper
+        self.gripper = load_gripper(metadata.gripper)  # used if a request names none
         self.device = torch.device(device)
         self.grippers = dict(grippers or {})
 
@@ -131,8 +131,7 @@ class GraspDetector:
         grippers: Mapping[str, Gripper] | None = None,
     ) -> "GraspDetector":
         """Load a checkpoint and its gripper; raises InvalidCheckpoint or InvalidGripper."""
-        network, metadata = load_checkpoint(path)
-        return cls(network, metadata, load_gripper(metadata.gripper), device, grippers)
+        return cls(*load_checkpoint(path), device, grippers)
 
     def detect(self, cloud: object, options: DetectOptions | None = None) -> Detection:
         """Detect grasps in a cloud; an empty list is an answer whose counts and warnings say why.

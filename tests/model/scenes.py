@@ -26,7 +26,7 @@ TINY = {
 def detector() -> GraspDetector:
     """A quick detector; random weights whose scores the temperature spreads."""
     metadata = CheckpointMetadata("tiny", TINY["hand"], 0.0045, "panda", temperature=0.01)
-    return GraspDetector(build_network(TINY["hand"]), metadata, PANDA)
+    return GraspDetector(build_network(TINY["hand"]), metadata)
 
 
 @cache

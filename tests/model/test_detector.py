@@ -316,7 +316,7 @@ def convinced(logit: float) -> GraspDetector:
     network = build_network(TINY["hand"])
     with torch.no_grad():
         list(network.parameters())[-1].fill_(logit)  # the bias of the last layer
-    return GraspDetector(network, CheckpointMetadata("no", TINY["hand"], 0.0045, "panda"), PANDA)
+    return GraspDetector(network, CheckpointMetadata("no", TINY["hand"], 0.0045, "panda"))
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,7 @@ def test_grasps_fit_the_gripper_that_was_asked_for(gripper: Gripper) -> None:
 def test_weights_trained_with_many_hands_warn_about_no_gripper() -> None:
     of_one = detector()
     metadata = replace(of_one.metadata, training={"training_hands": 400})
-    of_many = GraspDetector(of_one.network, metadata, of_one.gripper)
+    of_many = GraspDetector(of_one.network, metadata)
     found = of_many.detect(box_on_table(), DetectOptions(viewpoint=VIEW, gripper="wsg-50"))
     assert found.grasps
     assert not any("trained for" in warning for warning in found.warnings)
