@@ -7,11 +7,10 @@ import numpy as np
 from edgegrasp_camera.arrays import Array, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import HandView, hand_views
 from edgegrasp_model.candidates.edge_grasps import (
-    EDGE_MARGIN,
-    MIN_DEPTH,
     MIN_EDGE,
     Candidates,
     edge_grasps,
+    faults_of,
     measure_edges,
     retract,
 )
@@ -80,13 +79,8 @@ def from_edges(
     reason: list[NoGrasp | None] = [NoGrasp.NO_POINT] * len(edges)
     there = np.flatnonzero((point >= 0).all(axis=1))
     measures = measure_edges(scene.cloud, point[there, 0], point[there, 1])
-    longest = min(gripper.max_opening / 2 - EDGE_MARGIN, crop_radius)
-    faults = {
-        NoGrasp.TOO_SHORT: measures.length <= MIN_EDGE,
-        NoGrasp.TOO_LONG: measures.length >= longest,
-        NoGrasp.NO_DIRECTION: measures.depth <= MIN_DEPTH,
-        NoGrasp.TOO_DEEP: measures.depth >= gripper.finger_depth,
-    }
+    faults = faults_of(measures, gripper)
+    faults[NoGrasp.TOO_LONG] |= measures.length >= crop_radius
     for place, row in enumerate(there.tolist()):
         reason[row] = next((fault for fault, found in faults.items() if found[place]), None)
     fit = there[[reason[row] is None for row in there]]

@@ -12,6 +12,7 @@ from edgegrasp_camera.arrays import Bools, Float32, Int64
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import extents_between, in_hands
 from edgegrasp_model.options import SupportPlane
+from edgegrasp_model.results import NoGrasp
 from edgegrasp_model.scene.cloud import Cloud, unit
 
 MIN_EDGE = 0.003  # metres between approach and contact point
@@ -122,12 +123,7 @@ def edge_grasps(
     and the approach point on the hand's axis. The pairs are rows (M,) of the cloud.
     """
     edge = measure_edges(cloud, approach_index, contact_index)
-    pair = np.flatnonzero(
-        (edge.length > MIN_EDGE)
-        & (edge.length < gripper.max_opening / 2 - EDGE_MARGIN)
-        & (edge.depth > MIN_DEPTH)
-        & (edge.depth < gripper.finger_depth)
-    )
+    pair = np.flatnonzero(~np.any(list(faults_of(edge, gripper).values()), axis=0))
     approach_index, contact_index = approach_index[pair], contact_index[pair]
     normal, depth = edge.normal[pair], edge.depth[pair]
     contact_z = gripper.contact_z_at(2 * np.abs(edge.along[pair]))
@@ -159,6 +155,16 @@ def measure_edges(cloud: Cloud, approach_index: Int64, contact_index: Int64) -> 
     ahead = edge - along[:, None] * normal
     length, depth = np.linalg.norm(edge, axis=1), np.linalg.norm(ahead, axis=1)
     return EdgeMeasures(normal, along, ahead, length, depth)
+
+
+def faults_of(edge: EdgeMeasures, gripper: Gripper) -> dict[NoGrasp, Bools]:
+    """Which edges (M,) define no edge grasp that fits the gripper, by reason."""
+    return {
+        NoGrasp.TOO_SHORT: edge.length <= MIN_EDGE,
+        NoGrasp.TOO_LONG: edge.length >= gripper.max_opening / 2 - EDGE_MARGIN,
+        NoGrasp.NO_DIRECTION: edge.depth <= MIN_DEPTH,
+        NoGrasp.TOO_DEEP: edge.depth >= gripper.finger_depth,
+    }
 
 
 def retract(
