@@ -264,13 +264,6 @@ class DepthMap:
     distance: Float32  # (2 H + 1, 2 H + 1) metres from the camera; inf where nothing was seen
 
     @classmethod
-    def of_each(cls, points: Float32, viewpoints: Float32 | None, up: Float32) -> list[Self]:
-        """The depth map of each camera (W, 3) for a cloud (N, 3); none if unknown."""
-        if viewpoints is None or len(points) == 0:
-            return []
-        return [cls.of_cloud(points, viewpoint, up) for viewpoint in viewpoints]
-
-    @classmethod
     def of_cloud(cls, points: Float32, viewpoint: Float32, up: Float32) -> Self:
         """The depth map of points (N, 3), metres, from a camera; `up` fixes its roll."""
         way = points.mean(axis=0, dtype=np.float64) - viewpoint.astype(np.float64)

@@ -70,8 +70,10 @@ class Surroundings:
 
     @cached_property
     def depths(self) -> list[DepthMap]:
-        """What each camera saw."""
-        return DepthMap.of_each(self.cloud.points, self.viewpoints, self.up)
+        """What each camera saw; nothing if the cameras are unknown."""
+        if self.viewpoints is None or len(self.cloud.points) == 0:
+            return []
+        return [DepthMap.of_cloud(self.cloud.points, eye, self.up) for eye in self.viewpoints]
 
     @property
     def viewpoint(self) -> Float32 | None:
@@ -384,11 +386,8 @@ def _given_numbers(sent: CheckedCloud) -> Int64:
 
 def object_probability(scene: Scene, points: Int64) -> Float64:
     """Confidence of the objects of points (E,), rows of the cloud; 1 if given by the caller."""
-    number = scene.object_of_point[points]
-    probability = np.ones(len(points))
-    for which, confidence in scene.confidence.items():
-        probability[number == which] = confidence
-    return probability
+    number = scene.object_of_point[points].tolist()
+    return np.array([scene.confidence.get(which, 1.0) for which in number])
 
 
 def near_objects_along(plan: Float64, number: Int64) -> Bools:
