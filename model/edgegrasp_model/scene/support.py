@@ -64,15 +64,9 @@ class Support:
         return np.asarray(self.frame.T_canonical_cloud[2, :3])
 
     def heights(self, seen: "Seen") -> tuple[Float32, Float32]:
-        """Heights of points over the support, which may be bowed, and its margin.
+        """Heights (N,) over the support, which may be bowed, and up to which points belong to it.
 
         The noise of depth cameras grows with the square of the distance.
-
-        Args:
-            seen: N points.
-
-        Returns:
-            The height (N,) of each, and the height (N,) up to which it belongs to the support.
         """
         height, squared = np.empty((2, len(seen.points)), dtype=np.float32)
         eye = np.zeros(3) if seen.viewpoint is None else seen.viewpoint
