@@ -16,16 +16,17 @@ TURNED[:3, :3] = Rotation.from_euler("xyz", (0.3, -0.2, 1.0)).as_matrix()
 TURNED[:3, 3] = (0.2, -0.3, 0.5)
 
 
+def grid(*axes):
+    """All points (N, 3) with these coordinates."""
+    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+
+
 def surface(x, y, half_height, step=0.004):
     """Points (N, 3) on the sides and top of a box that stands on z = 0."""
     side = np.arange(-HALF, HALF + 1e-9, step)
     up = np.arange(0.0, 2 * half_height + 1e-9, step)
-    top = np.stack(np.meshgrid(side, side, [2 * half_height]), axis=-1).reshape(-1, 3)
-    walls = [
-        np.stack(np.meshgrid(*axes, up), axis=-1).reshape(-1, 3)
-        for axes in (([-HALF, HALF], side), (side, [-HALF, HALF]))
-    ]
-    return np.concatenate([top, *walls]) + np.array((x, y, 0.0))
+    walls = grid([-HALF, HALF], side, up), grid(side, [-HALF, HALF], up)
+    return np.concatenate([grid(side, side, [2 * half_height]), *walls]) + np.array((x, y, 0.0))
 
 
 def hand_over(gripper, x, y, half_height, tilt=0.0):
@@ -38,8 +39,7 @@ def hand_over(gripper, x, y, half_height, tilt=0.0):
 
 def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=(), eyes=None):
     """A scene of boxes on a table, its whole cloud, and a detection with a hand over each box."""
-    plane = np.stack(np.meshgrid(np.arange(0.3, 0.8, 0.01), np.arange(-0.4, 0.4, 0.01)), -1)
-    table = np.column_stack([plane.reshape(-1, 2), np.zeros(plane.size // 2)])
+    table = grid(np.arange(0.3, 0.8, 0.01), np.arange(-0.4, 0.4, 0.01), [0.0])
     things = [surface(*box) for box in boxes]
     T_cloud_base = np.linalg.inv(T_base_cloud)
 

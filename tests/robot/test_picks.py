@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("roboplan", reason="the extra robot is not installed")
 
 from tests.checks import refusal
-from tests.robot.arms import BOXES, HALF, TURNED, picks_of, scene_of, surface
+from tests.robot.arms import BOXES, HALF, TURNED, grid, picks_of, scene_of, surface
 
 from edgegrasp_model.options import parse_options
 from edgegrasp_results import Tracking
@@ -109,10 +109,7 @@ def test_the_same_request_gives_the_same_picks_however_the_base_is_turned(fr3):
 def test_the_motion_goes_around_what_is_seen(fr3):
     turned = fr3.home.copy()
     turned[0] = -1.4  # beside the table
-    seen = np.stack(
-        np.meshgrid(np.arange(0.25, 0.75, 0.008), [-0.33], np.arange(0.0, 0.5, 0.008)), -1
-    )
-    seen = seen.reshape(-1, 3)
+    seen = grid(np.arange(0.25, 0.75, 0.008), [-0.33], np.arange(0.0, 0.5, 0.008))
     detection = picks_of(fr3, joints=turned, boxes=BOXES[:1], more=[seen])
     ((_, plan),) = plans_of(detection)
     assert not any(touches(fr3, joints, seen) for joints in plan.trajectory.positions)
@@ -165,8 +162,8 @@ def test_a_lid_over_an_object_is_a_collision_of_the_arm(fr3):
 
 
 def test_the_arm_meets_the_cloud_as_its_depths_were_corrected(fr3):
-    sheet = np.stack(np.meshgrid(np.arange(0.4, 0.6, 0.008), np.arange(-0.1, 0.1, 0.008), 0.2), -1)
-    as_sent = {"boxes": BOXES[:1], "more": [sheet.reshape(-1, 3)]}
+    sheet = grid(np.arange(0.4, 0.6, 0.008), np.arange(-0.1, 0.1, 0.008), [0.2])
+    as_sent = {"boxes": BOXES[:1], "more": [sheet]}
     _, corrected, _ = scene_of(fr3, boxes=BOXES[:1])
     assert picks_of(fr3, **as_sent).counts["reachable"] == 0
     found = picks_of(fr3, changed=lambda s, d: (replace(s, corrected=corrected), d), **as_sent)
@@ -192,8 +189,7 @@ BELOW_SIGN, ABOVE = (0.5, -0.8, 0.1), (0.5, 0.0, 1.2)
 @pytest.mark.parametrize(("eyes", "reachable"), [([BELOW_SIGN], 0), ([BELOW_SIGN, ABOVE], 1)])
 def test_what_no_camera_saw_is_avoided_where_asked(fr3, eyes, reachable):
     """A low camera sees a box below a sign, and not whether anything hangs over the box."""
-    x, y, z = np.meshgrid(np.arange(0.3, 0.7, 0.008), [-0.4], np.arange(0.13, 0.6, 0.008))
-    sign = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    sign = grid(np.arange(0.3, 0.7, 0.008), [-0.4], np.arange(0.13, 0.6, 0.008))
     for avoid, expected in ((False, 1), (True, reachable)):
         detection = picks_of(fr3, boxes=BOXES[:1], more=[sign], eyes=eyes, avoid_unseen=avoid)
         assert detection.counts["reachable"] == expected
