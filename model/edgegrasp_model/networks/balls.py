@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from edgegrasp_camera.arrays import Floats, Int64
+from edgegrasp_camera.arrays import Floats
 from edgegrasp_model.candidates.edge_grasps import BallCrop, crop_balls
 from edgegrasp_model.networks.config import NetworkConfig
 
@@ -43,10 +43,17 @@ class BallBatch:
         """Pack a cloud and its balls; contacts are rows of the crop, as each belongs to a ball."""
         centred = points[crop.ball_rows] - points[approach_index][crop.ball_of_point]
         bounds = np.searchsorted(crop.ball_of_point, np.arange(len(approach_index) + 1))
+        # The nearest points of the same ball, the point itself first; it fills up small balls.
+        neighbors = np.repeat(np.arange(len(centred))[:, None], k, axis=1)
+        for start, stop in pairwise(bounds.tolist()):
+            ball = centred[start:stop]
+            there = min(k, len(ball))
+            nearest = cKDTree(ball).query(ball, k=range(1, there + 1))[1]
+            neighbors[start:stop, :there] = start + nearest
         return cls(
             points=torch.from_numpy(centred),
             normals=torch.from_numpy(normals[crop.ball_rows]),
-            neighbors=torch.from_numpy(nearest_in_groups(centred, bounds, k)),
+            neighbors=torch.from_numpy(neighbors),
             ball_of_point=torch.from_numpy(crop.ball_of_point),
             contact=torch.from_numpy(np.asarray(contact, dtype=np.int64)),
             approach=torch.from_numpy(np.ascontiguousarray(approach)),
@@ -104,17 +111,3 @@ class BallBatch:
     def to(self, device: torch.device | str) -> "BallBatch":
         """Moves every tensor to a device."""
         return BallBatch(*(tensor.to(device) for tensor in vars(self).values()))
-
-
-def nearest_in_groups(points: Floats, bounds: Int64, k: int) -> Int64:
-    """Rows (P, k) of the k nearest points of the same group, the point itself first.
-
-    Points are (P, 3), group after group, from bounds[g] to bounds[g + 1]; the own row fills up
-    small groups.
-    """
-    nearest = np.repeat(np.arange(len(points))[:, None], k, axis=1)
-    for start, stop in pairwise(bounds.tolist()):
-        group = points[start:stop]
-        there = min(k, len(group))
-        nearest[start:stop, :there] = start + cKDTree(group).query(group, k=range(1, there + 1))[1]
-    return nearest
