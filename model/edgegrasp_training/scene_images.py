@@ -91,24 +91,22 @@ def generate(
         rng = np.random.default_rng([seed, number])
         images: list[SceneImage] = []
         while len(images) < SCENES_PER_FILE * VIEWS_PER_SCENE:
-            images += make_images(rng, draw_scene(rng, pool, arms))
+            images += make_images(draw_scene(rng, pool, arms))
         partial = path.with_suffix(".partial.npz")
         arrays = SceneImage(*map(np.stack, zip(*images, strict=True)))
         np.savez(partial, allow_pickle=False, **arrays._asdict())
         partial.replace(path)
 
 
-def make_images(rng: np.random.Generator, scene: SceneMeshes) -> list[SceneImage]:
+def make_images(scene: SceneMeshes) -> list[SceneImage]:
     """VIEWS_PER_SCENE images of a scene, without those that are too near or empty."""
     casting = _casting(scene.parts)
-    drawn = [_make_image(rng, scene, casting) for _ in range(VIEWS_PER_SCENE)]
+    drawn = [_make_image(scene, casting) for _ in range(VIEWS_PER_SCENE)]
     return [image for image in drawn if image is not None]
 
 
-def _make_image(
-    rng: np.random.Generator, scene: SceneMeshes, casting: o3d.t.geometry.RaycastingScene
-) -> SceneImage | None:
-    pose = _draw_pose(rng, scene)
+def _make_image(scene: SceneMeshes, casting: o3d.t.geometry.RaycastingScene) -> SceneImage | None:
+    rng, pose = scene.rng, _draw_pose(scene)
     focal = WIDTH / 2 / np.tan(np.radians(rng.uniform(35, 80)) / 2)
     camera = Intrinsics(WIDTH, HEIGHT, focal, WIDTH / 2, HEIGHT / 2, 0.1, 13.0)
     depth, label, steep = _cast(casting, scene.parts, camera, pose)
@@ -116,7 +114,7 @@ def _make_image(
     seen = np.bincount(label.ravel(), minlength=OBJECT + MAX_OBJECTS)[OBJECT:]
     if close > 0.15 or (scene.centres and (seen > 25).sum() < 1):
         return None
-    noisy, label = _faults(rng, depth, label, camera, pose, scene)
+    noisy, label = _faults(scene, depth, label, camera, pose)
     if rng.random() < UNSEEN_WALLS:  # which leaves their rims floating
         unseen = _blobs(rng, depth.shape) < rng.uniform(0.3, 1.0)
         noisy[steep & (label == OTHER) & unseen] = np.nan
@@ -132,8 +130,9 @@ def _make_image(
     return SceneImage(stored, label, centre, *as_float)
 
 
-def _draw_pose(rng: np.random.Generator, scene: SceneMeshes) -> Float64:
+def _draw_pose(scene: SceneMeshes) -> Float64:
     """A camera pose T_world_camera (4, 4) that looks at the scene's objects."""
+    rng = scene.rng
     target = np.array([*rng.normal(0.0, scene.spread, 2), rng.uniform(-0.05, 0.15)])
     if scene.centres and rng.random() < 0.7:
         target = scene.centres[int(rng.integers(len(scene.centres)))].copy()
@@ -180,14 +179,14 @@ def _cast(
 
 
 def _faults(
-    rng: np.random.Generator,
+    scene: SceneMeshes,
     depth: Float64,
     label: NDArray[np.uint8],
     camera: Intrinsics,
     pose: Float64,
-    scene: SceneMeshes,
 ) -> tuple[Float64, NDArray[np.uint8]]:
     """The image with a real camera's faults, NaN without a reading, and its labels."""
+    rng = scene.rng
     numbers = np.arange(OBJECT, OBJECT + len(scene.centres))
     glass = numbers[rng.random(len(numbers)) < 0.03]
     if len(glass):

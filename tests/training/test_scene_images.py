@@ -27,7 +27,7 @@ def test_labels_agree_with_the_depths(pool: list[PoolMesh], seed: int) -> None:
     rng = np.random.default_rng(seed)
     images = []
     while len(images) < 3:
-        images += make_images(rng, draw_scene(rng, pool, []))
+        images += make_images(draw_scene(rng, pool, []))
     for image in images:
         points = image_points(image)
         on = points[(image.label == SUPPORT) & (image.depth > 0)]
