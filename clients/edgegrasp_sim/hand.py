@@ -135,6 +135,7 @@ class Gripper:
     """The simulated hand, in the hand frame of its file: z out of the palm, y closes."""
 
     body: Hand
+    motion: ArmTrajectory | None = None  # of an arm, in the next grasp
     on_the_way = False  # whether it is on an arm that has not come to its pregrasp
 
     def __init__(self, world: World, model: HandModel, min_opening: float) -> None:
@@ -190,9 +191,7 @@ class Gripper:
 
 
 class ArmGripper(Gripper):
-    """The hand on an arm; `motion` is that of the next grasp."""
-
-    motion: ArmTrajectory | None = None
+    """The hand on an arm."""
 
     def __init__(
         self, world: World, hand: HandModel, arm: ArmModel, min_opening: float = MIN_OPENING
@@ -210,17 +209,11 @@ class ArmGripper(Gripper):
 
     def approach(self, T_world_hand: Matrix) -> Iterator[None]:
         """Follow the motion to the grasp."""
-        motion = self._planned
-        self.on_the_way = True
-        for seconds in self._follow(0, motion.grasp_row):
-            self.on_the_way = bool(seconds < motion.times[motion.pregrasp_row])
-            yield
+        return self._follow(0, self._planned.grasp_row)
 
     def retreat(self, T_world_hand: Matrix) -> Iterator[None]:
         """Follow the motion away from the grasp."""
-        motion = self._planned
-        for _ in self._follow(motion.grasp_row, len(motion.times) - 1):
-            yield
+        return self._follow(self._planned.grasp_row, len(self._planned.times) - 1)
 
     @property
     def _planned(self) -> ArmTrajectory:
@@ -228,8 +221,8 @@ class ArmGripper(Gripper):
             raise ValueError("the grasp has no motion of the arm; plan it with a robot")
         return self.motion
 
-    def _follow(self, first: int, last: int) -> Iterator[float]:
-        """Yields the time after every time step."""
+    def _follow(self, first: int, last: int) -> Iterator[None]:
+        """Follow some rows of the motion; yields after each time step."""
         motion, substeps = self._planned, self._arm.substeps
         begin, end = motion.times[first], motion.times[last]
         steps = int(np.ceil((end - begin + SETTLE_SECONDS) / TIME_STEP))
@@ -242,7 +235,8 @@ class ArmGripper(Gripper):
             ]
             self._arm.drive(*rows)
             self.world.step()
-            yield float(times[-1])
+            self.on_the_way = bool(times[-1] < motion.times[motion.pregrasp_row])
+            yield
 
 
 def seconds_of(motion: ArmTrajectory) -> float:

@@ -266,8 +266,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         Raises:
             ValueError: The pose is not rigid.
         """
-        if isinstance(self._hand, ArmGripper):
-            self._hand.motion = motion
+        self._hand.motion = motion
         result = self._run(T_world_hand, to_the_end=True)
         if self._rest_state is not None:
             self.world.remove_state(self._rest_state)
