@@ -99,7 +99,7 @@ class Round:
 
 
 class RoundDriver:
-    """A round, step by step: `look`, `plan`, `execute`, as long as `end` is None."""
+    """A round: `run` it with a planner, or `look` and `execute` in turn to repeat one."""
 
     def __init__(
         self,
@@ -121,10 +121,8 @@ class RoundDriver:
             protocol.scene.scale(scene),
             protocol.scene.table_thickness,
         )
-        self.view = -1
-        self._seen: Observation | None = None
+        self.view, self._points = -1, 0
         self._failures = 0
-        self._planning_seconds = 0.0
         names = tuple(model.name for model in simulation.object_models)
         wide = tuple(model.name for model in simulation.too_wide)
         self._round = Round(seed, index, names, (), 0, RoundEnd.CLEARED, too_wide=wide)
@@ -142,15 +140,27 @@ class RoundDriver:
     def run(self, planner: Planner) -> Round:
         """Run the round to its end."""
         while (end := self.end) is None:
-            grasp = self.plan(planner, self.look())
-            if grasp is not None:
-                self.execute(grasp)
+            seen, seed = self.look(), int(self._policy.integers(2**31))
+            # Something in front may hide all of the objects.
+            height = crop(seen.cloud, seen.workspace)[:, 2] - seen.table_height
+            shown = np.count_nonzero(height > 0.005) >= MIN_SEEN
+            started = time.perf_counter()
+            try:
+                grasp = planner(seen, seed) if shown else None
+            except StartCollides:
+                grasp, before = None, self._round.start_collisions
+                self._round = replace(self._round, start_collisions=before + 1)
+            seconds = time.perf_counter() - started
+            if grasp is None:
+                self._round = replace(self._round, no_grasp=self._round.no_grasp + 1)
+            else:
+                self.execute(grasp, seconds)
         return replace(self._round, end=end)
 
     def look(self) -> Observation:
         """Take the next view."""
         rules = self.protocol
-        self._seen = self.simulation.observe_from(
+        seen = self.simulation.observe_from(
             rules.camera.sample(self._camera, rules.camera.views),
             self._noise,
             noise_std=rules.noise.point_std,
@@ -158,27 +168,10 @@ class RoundDriver:
             sensor=rules.noise.depth_sensor(self._noise),
             table=rules.planning.table,
         )
-        self.view += 1
-        return self._seen
+        self.view, self._points = self.view + 1, len(seen.cloud)
+        return seen
 
-    def plan(self, planner: Planner, observation: Observation) -> PlannedGrasp | None:
-        """Ask the planner; None if it finds no grasp, or the view shows almost nothing."""
-        seed = int(self._policy.integers(2**31))
-        # Something in front may hide all of the objects.
-        height = crop(observation.cloud, observation.workspace)[:, 2] - observation.table_height
-        shown = np.count_nonzero(height > 0.005) >= MIN_SEEN
-        started = time.perf_counter()
-        try:
-            grasp = planner(observation, seed) if shown else None
-        except StartCollides:
-            grasp, started_in = None, self._round.start_collisions
-            self._round = replace(self._round, start_collisions=started_in + 1)
-        self._planning_seconds = time.perf_counter() - started
-        if grasp is None:
-            self._round = replace(self._round, no_grasp=self._round.no_grasp + 1)
-        return grasp
-
-    def execute(self, grasp: PlannedGrasp) -> Attempt:
+    def execute(self, grasp: PlannedGrasp, planning_seconds: float = 0.0) -> Attempt:
         """Execute a grasp planned in the last view; raises ValueError unless its pose is rigid."""
         result = self.simulation.execute_grasp(grasp.T_world_hand, grasp.motion)
         attempt = Attempt(
@@ -191,8 +184,8 @@ class RoundDriver:
             opening=result.opening,
             start_contact=result.start_contact,
             view=self.view,
-            points=len(self._seen.cloud) if self._seen is not None else 0,
-            planning_seconds=self._planning_seconds,
+            points=self._points,
+            planning_seconds=planning_seconds,
             T_world_hand=np.asarray(grasp.T_world_hand, dtype=np.float64).tolist(),
             motion_seconds=0.0 if grasp.motion is None else seconds_of(grasp.motion),
             touched_on_the_way=result.touched_on_the_way,
