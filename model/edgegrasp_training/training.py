@@ -80,12 +80,8 @@ class Trainer:
         generator = torch.Generator().manual_seed(options.seed)
         self.network = build_network(metadata.network, generator).to(device)
         prepare_to_train(self.network)
-        self.start = start
-        self.started_from: CheckpointMetadata | None = None
-        known = 0
-        if start is not None:
-            trained, self.started_from = load_checkpoint(start)
-            known = start_from(self.network, trained)
+        self.start = None if start is None else load_checkpoint(start)
+        known = 0 if self.start is None else start_from(self.network, self.start[0])
         self.average = deepcopy(self.network).requires_grad_(False).eval()
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), options.learning_rate, weight_decay=WEIGHT_DECAY
@@ -154,7 +150,7 @@ class Trainer:
         # Mixed once with where it started (Wortsman et al., CVPR 2022).
         if self.start is not None and not saved.training:
             first = deepcopy(self.average)
-            start_from(first, load_checkpoint(self.start, self.device)[0])
+            start_from(first, self.start[0])
             with torch.no_grad():
                 for new, old in zip(self.average.parameters(), first.parameters(), strict=True):
                     new.lerp_(old, self.options.keep)
@@ -172,8 +168,8 @@ class Trainer:
         if self.teacher is not None:
             taught = self.teacher.metadata
             training |= {"teacher": taught.name, "teacher_digest": taught.digest}
-        if self.started_from is not None:
-            started = self.started_from
+        if self.start is not None:
+            _, started = self.start
             training |= {"started_from": started.name, "started_from_digest": started.digest}
             training |= {"kept_of_it": self.options.keep}
         metadata = replace(self.metadata, temperature=evaluation.temperature, training=training)
