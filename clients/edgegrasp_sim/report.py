@@ -145,26 +145,21 @@ def image(kind: str, content: bytes, text: str) -> str:
     return f"<img src='{source}' alt='{escape(text, quote=True)}'>"
 
 
-def _key_figures(summary: dict[str, Any]) -> list[Row]:
-    times, ends = summary["planning_seconds"], summary["round_ends"]
-    names = ["GSR % [95 % interval]", "DR % [95 % interval]"]
-    for seed in summary["grasp_success_rate"]["by_seed"]:
-        names.append(f"seed {seed}: GSR, DR")
-    names.append("mean ± standard deviation over seeds: GSR, DR")
+def _key_figures(summary: dict[str, Any]) -> Iterator[Row]:
     rates = [summary[name] for name in RATE_LABELS]
-    by_seed = zip(*(rate["by_seed"].values() for rate in rates), strict=True)
-    values = [*map(percent, rates), *(", ".join(map(_share, both)) for both in by_seed)]
-    values.append(", ".join(map(over_seeds, rates)))
-    return [
-        ("", ""),
-        *zip(names, values, strict=True),
-        ("protocol", f"{summary['protocol']}, version {summary['protocol_version']}"),
-        ("rounds", ", ".join(f"{count} ended: {end}" for end, count in ends.items())),
-        ("grasps held", f"{summary['successes']} of {summary['attempts']}"),
-        ("of those another object than the one aimed at", summary["wrong_object_successes"]),
-        ("objects", summary["objects"]),
-        ("planning, median", f"{times['median']:.2f} s" if times else "-"),
-    ]
+    times, ends = summary["planning_seconds"], summary["round_ends"]
+    yield "", ""
+    for name, label in RATE_LABELS.items():
+        yield f"{label} % [95 % interval]", percent(summary[name])
+    for seed in rates[0]["by_seed"]:
+        yield f"seed {seed}: GSR, DR", ", ".join(_share(rate["by_seed"][seed]) for rate in rates)
+    yield "mean ± standard deviation over seeds: GSR, DR", ", ".join(map(over_seeds, rates))
+    yield "protocol", f"{summary['protocol']}, version {summary['protocol_version']}"
+    yield "rounds", ", ".join(f"{count} ended: {end}" for end, count in ends.items())
+    yield "grasps held", f"{summary['successes']} of {summary['attempts']}"
+    yield "of those another object than the one aimed at", summary["wrong_object_successes"]
+    yield "objects", summary["objects"]
+    yield "planning, median", f"{times['median']:.2f} s" if times else "-"
 
 
 def _object_rows(summary: dict[str, Any]) -> Iterator[Row]:
