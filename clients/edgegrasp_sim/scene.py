@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from math import ceil
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -26,7 +27,6 @@ from edgegrasp_sim.surroundings import (
 
 PACKED_SCALE = (0.7, 0.8)
 PILE_SCALE = (0.8, 1.0)
-
 
 PACKED_ATTEMPTS = 12  # objects drawn to be stood upright on a table
 PACKED_RANGE = (0.08, 0.22)  # metres, of x and y
@@ -143,10 +143,8 @@ def make_pile(layout: Layout) -> list[SceneObject]:
 
 def wait_for_rest(world: World, objects: Sequence[SceneObject], seconds: float) -> None:
     """Simulate until all objects rest, for at most `seconds`."""
-    elapsed = 0.0
-    while elapsed < seconds:
+    for _ in range(ceil(seconds / (REST_STEPS * TIME_STEP))):
         world.step(REST_STEPS)
-        elapsed += REST_STEPS * TIME_STEP
         if all(item.body.speed <= REST_SPEED for item in objects):
             return
 

@@ -27,7 +27,6 @@ MIDDLE = SIZE / 2  # metres, x and y of the middle of every scene
 Span = tuple[float, float]  # least and greatest, metres
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]  # lowest, highest; metres
 
-
 # Random bins. Length, width and height inside: the palm of the Panda's hand is 20 cm wide and 5 cm
 # above its fingertips, so that along a higher wall it holds little.
 BIN_INSIDE: tuple[Span, Span, Span] = ((0.40, 0.60), (0.30, 0.42), (0.03, 0.08))

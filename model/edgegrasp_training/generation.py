@@ -104,7 +104,6 @@ RADIUS = 0.05, 0.11  # of the link that carries such a finger
 REACH = 0.6, 1.0  # outward part of that link in the open hand, in halves of the opening
 STEEPEST = 0.75  # most of it, in radii
 
-
 Query = tuple[Observation, DetectOptions]  # a view of a scene, and a request for grasps in it
 detector = lru_cache(maxsize=1)(GraspDetector.load)  # loads weights once in a process
 
