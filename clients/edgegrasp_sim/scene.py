@@ -74,6 +74,8 @@ def load_object(
     scale: float,
 ) -> SceneObject:
     """Load an object with its link frame there; `scale` comes on top of the model's own."""
+    if not model.urdf.is_file():
+        raise FileNotFoundError(f"no object file at {model.urdf}; check the object folder")
     body = world.load_urdf(model.urdf, position, quaternion_xyzw, scale * model.scale)
     return SceneObject(model, scale, body)
 

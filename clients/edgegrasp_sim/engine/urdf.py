@@ -36,12 +36,8 @@ class Shape(NamedTuple):
 def read_urdf(path: Path, scale: float) -> Shape:
     """The shape of the first link of a URDF file, `scale` times as large.
 
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It cannot be read, or has no solid collision shape.
+    ValueError: it cannot be read, or has no solid collision shape.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"no object file at {path}; check the object folder")
     centre, *surfaces = _read_urdf(path, path.stat().st_mtime_ns)
     visible, hulls = (
         [Surface(scale * points, faces) for points, faces in parts] for parts in surfaces

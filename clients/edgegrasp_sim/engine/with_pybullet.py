@@ -86,8 +86,6 @@ class PybulletWorld(World):
     def load_urdf(
         self, path: Path, position: Vector, quaternion_xyzw: Vector, scale: float
     ) -> "PybulletBody":
-        if not path.is_file():
-            raise FileNotFoundError(f"no object file at {path}; check the object folder")
         try:
             uid = self.client.loadURDF(str(path), position, quaternion_xyzw, globalScaling=scale)
         except pybullet.error as error:
