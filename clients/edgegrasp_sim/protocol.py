@@ -33,10 +33,6 @@ class SceneRules:
     pile_scale: Range  # range of that factor in piles and bins
     table_thickness: float = OPEN_THICKNESS  # of packed and pile scenes, metres
 
-    def scale(self, kind: SceneKind) -> Range:
-        """The range of scales of a kind of scene."""
-        return self.packed_scale if kind.objects is SceneKind.PACKED else self.pile_scale
-
 
 @dataclass(frozen=True, config=STRICT)
 class RoundRules:
@@ -99,10 +95,6 @@ class Protocol:
     planning: PlanningRules  # what a planner is given
     engine: str = ""  # the physics engine that its figures are of; empty: any
     kind: SceneKind | None = None  # of scenes that it is meant for; None: packed ones and piles
-
-    def num_objects(self, index: int) -> int:
-        """How many objects to try to place in a round."""
-        return self.scene.num_objects[index % len(self.scene.num_objects)]
 
     def to_json(self) -> dict[str, Any]:
         """All constants but engine and kind, which a result names by itself; ready for JSON."""

@@ -114,12 +114,13 @@ class RoundDriver:
         # None depends on what another was used for.
         streams = (np.random.default_rng([seed, index, stream]) for stream in range(4))
         layout, self._camera, self._noise, self._policy = streams
+        rules, upright = protocol.scene, scene.objects is SceneKind.PACKED
         simulation.reset(
             scene,
             layout,
-            protocol.num_objects(index),
-            protocol.scene.scale(scene),
-            protocol.scene.table_thickness,
+            rules.num_objects[index % len(rules.num_objects)],
+            rules.packed_scale if upright else rules.pile_scale,
+            rules.table_thickness,
         )
         self.view, self._points = -1, 0
         self._failures = 0
