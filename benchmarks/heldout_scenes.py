@@ -21,7 +21,7 @@ from edgegrasp_camera.arrays import Float64
 from edgegrasp_sim.camera import FARTHEST, look_at, points_of
 from edgegrasp_sim.engine import Intrinsics
 from edgegrasp_sim.engine.with_pybullet import PybulletWorld
-from edgegrasp_sim.objects import ObjectSet, SceneKind
+from edgegrasp_sim.objects import CLUTTER, ObjectSet
 from edgegrasp_sim.scene import SceneObject, load_object, wait_for_rest
 from edgegrasp_sim.sensor import random_sensor
 
@@ -55,8 +55,7 @@ class Maker:
 
     def __init__(self, objects: Path, rng: np.random.Generator) -> None:
         self.world, self.rng = PybulletWorld(), rng
-        kinds = (SceneKind.PACKED, SceneKind.PILE)
-        self.sets = [ObjectSet.from_folder(objects, kind, "test") for kind in kinds]
+        self.sets = [ObjectSet.from_folder(objects, kind, "test") for kind in CLUTTER]
         self.objects: list[SceneObject] = []
 
     def box(self, size: object, centre: object, turn: Rotation | None = None) -> int:

@@ -70,7 +70,7 @@ def run_benchmark(
     digest = config.object_set().digest  # fails here on a wrong folder, not in every worker
     tasks = config.tasks()
     kept = folder.rounds() if folder is not None else []
-    rounds = {(r.seed, r.index): r for r in kept if (r.seed, r.index) in set(tasks)}
+    rounds = {(done.seed, done.index): done for done in kept}
     missing = [task for task in tasks if task not in rounds]
     make_runner = partial(RoundRunner, config, make_planner, digest)
     for task, done in run_tasks(make_runner, missing, workers=workers, ray=ray):
