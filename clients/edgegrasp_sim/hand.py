@@ -87,7 +87,7 @@ def run_grasp(
     touched = False
 
     def result(cause: FailureCause | None, held: SceneObject | None = None) -> GraspResult:
-        seen = gripper.opening, start_contact, held, target, cause
+        seen = gripper.body.opening, start_contact, held, target, cause
         return GraspResult(*seen, touched_on_the_way=touched)
 
     if _cut_into(gripper) & obstacles:
@@ -145,14 +145,9 @@ class Gripper:
         self.park()
 
     @property
-    def opening(self) -> float:
-        """Metres between the fingers."""
-        return self.body.opening
-
-    @property
     def is_shut(self) -> bool:
         """Whether the fingers are too close to hold anything."""
-        return self.opening <= self.min_opening
+        return self.body.opening <= self.min_opening
 
     def park(self) -> None:
         """Put the open hand where it touches nothing and no camera sees it."""
@@ -296,11 +291,11 @@ def _corners(boxes: Matrix) -> Parts:
 
 def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: bool) -> None:
     """Close the fingers; unless `to_the_end`, only until they are shut or hold firmly."""
-    opening, still_steps = gripper.opening, 0
+    opening, still_steps = gripper.body.opening, 0
     gripper.body.close_fingers()
     for _ in range(round(CLOSE_SECONDS / TIME_STEP)):
         gripper.world.step()
-        before, opening = opening, gripper.opening
+        before, opening = opening, gripper.body.opening
         still_steps = still_steps + 1 if abs(opening - before) < STILL else 0
         shut = opening <= gripper.min_opening
         if not to_the_end and (shut or (still_steps >= STILL_STEPS and _touched(gripper, objects))):
@@ -313,13 +308,13 @@ class _Watch:
     def __init__(self, gripper: Gripper, objects: Mapping[int, SceneObject]) -> None:
         self._gripper, self._objects = gripper, objects
         self._empty_steps = self._held_steps = 0
-        self._opening = gripper.opening
+        self._opening = gripper.body.opening
         self._offset: Matrix | None = None
 
     def is_clear(self) -> bool:
         """Whether the fingers are empty, or hold one object that rests on nothing else."""
         touched = _touched(self._gripper, self._objects)
-        before, self._opening = self._opening, self._gripper.opening
+        before, self._opening = self._opening, self._gripper.body.opening
         closing = abs(self._opening - before) >= STILL  # and may yet catch something
         self._empty_steps = 0 if touched or closing else self._empty_steps + 1
         if self._gripper.is_shut or self._empty_steps >= EMPTY_STEPS:
