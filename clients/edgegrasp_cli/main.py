@@ -1,9 +1,7 @@
 """The program `edgegrasp`: a table of commands, whose modules are imported when they run."""
 
-import functools
 import importlib
 import sys
-from collections.abc import Callable
 from typing import Annotated, Any
 
 try:
@@ -42,6 +40,19 @@ class LazyGroup(TyperGroup):
         name, _, rest = super().resolve_command(ctx, args)
         return name, load_command(str(name)), rest
 
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command; errors the user can fix end the program with their message."""
+        try:
+            return super().invoke(ctx)
+        except Exception as error:
+            name = ctx.invoked_subcommand
+            if isinstance(error, ModuleNotFoundError):
+                sys.exit(_missing(name, error))
+            own = type(error).__module__.startswith("edgegrasp_")
+            if own or isinstance(error, (ValueError, OSError)):
+                sys.exit(f"edgegrasp {name}: {error}")
+            raise
+
 
 def load_command(name: str) -> Any:
     """Import a command; raises SystemExit where packages that it needs are not installed."""
@@ -54,28 +65,7 @@ def load_command(name: str) -> Any:
     if not isinstance(program, typer.Typer):  # a single command, not a group of them
         function, program = program, typer.Typer(add_completion=False)
         program.command(name)(function)
-    for command in program.registered_commands:
-        if command.callback is not None:
-            command.callback = _ending_with_a_sentence(name, command.callback)
     return typer.main.get_command(program)
-
-
-def _ending_with_a_sentence(name: str, function: Callable[..., None]) -> Callable[..., None]:
-    """Wrap a command so that errors the user can fix end the program with their message."""
-
-    @functools.wraps(function)
-    def run(*args: Any, **kwargs: Any) -> None:
-        try:
-            function(*args, **kwargs)
-        except ModuleNotFoundError as error:
-            sys.exit(_missing(name, error))
-        except Exception as error:
-            own = type(error).__module__.startswith("edgegrasp_")
-            if own or isinstance(error, (ValueError, OSError)):
-                sys.exit(f"edgegrasp {name}: {error}")
-            raise
-
-    return run
 
 
 def _missing(name: str, error: ModuleNotFoundError) -> str:
