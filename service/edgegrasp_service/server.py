@@ -9,7 +9,7 @@ import logging
 import signal
 import socket
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,12 +46,10 @@ class Server:
         InvalidSettings: A certificate, a token or another file of the settings cannot be used.
     """
 
-    def __init__(
-        self, settings: Settings, nursery: Sequence[str] = (), launched: Launched | None = None
-    ) -> None:
+    def __init__(self, settings: Settings, launched: Launched | None = None) -> None:
         self._settings = settings
         self.metrics = Metrics(lambda: self.pool.models)
-        self.pool = WorkerPool(settings, nursery, self.metrics.workers_replaced.inc, launched)
+        self.pool = WorkerPool(settings, self.metrics.workers_replaced.inc, launched)
         self.service = GraspService(settings, self.pool, self.metrics)
         if settings.outcomes_file is not None:
             check_outcomes(settings.outcomes_file)
@@ -193,7 +191,7 @@ async def _serve_until_signalled(
     settings: Settings, log: LogQueue, launched: Launched | None
 ) -> None:
     stop = asyncio.Event()
-    server = Server(settings, launched=launched)
+    server = Server(settings, launched)
     server.metrics.watch("log_lines_dropped", "log lines not written", lambda: log.dropped)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):

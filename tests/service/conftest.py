@@ -287,7 +287,8 @@ async def begin(tmp_path, monkeypatch, nursery) -> AsyncIterator[Serve]:
             if tokens := given.pop(f"{name}s", None):
                 given[f"{name}_file"] = folder / name
                 (folder / name).write_text("\n".join(tokens))
-        server = Server(Settings(**(ours | given)), (*nursery, str(folder)))
+        server = Server(Settings(**(ours | given)))
+        server.pool.command = (*nursery, str(folder))
         server.service.observers.append(note)
         opened, ready, stop = asyncio.Event(), asyncio.Event(), asyncio.Event()
         serving = asyncio.create_task(server.serve(stop, opened.set, ready.set))

@@ -155,8 +155,8 @@ def launch(settings: Settings, command: Sequence[str] = ()) -> Launched:
     control, theirs = socket.socketpair()
     with theirs:
         environment = KEPT_MEMORY | os.environ | dict.fromkeys(ONE_THREAD, "1")
-        command = [*(command or NURSERY), settings.model_dump_json()]
-        return subprocess.Popen(command, stdin=theirs.fileno(), env=environment), control
+        words = [*(command or NURSERY), settings.model_dump_json()]
+        return subprocess.Popen(words, stdin=theirs.fileno(), env=environment), control
 
 
 class WorkerPool:
@@ -165,12 +165,11 @@ class WorkerPool:
     def __init__(
         self,
         settings: Settings,
-        nursery: Sequence[str] = (),
-        replaced: Callable[[], None] = lambda: None,
-        launched: Launched | None = None,
+        replaced: Callable[[], None],  # called for each worker that died
+        launched: Launched | None,
     ) -> None:
         self._settings = settings
-        self._nursery_command = nursery
+        self.command: Sequence[str] = ()  # in place of NURSERY
         self._replaced = replaced
         self._launched = launched
         self.models: list[dict[str, Any]] = []  # facts of loaded weights; empty before `start`
@@ -205,7 +204,7 @@ class WorkerPool:
         Raises:
             EdgeGraspError: Weights cannot be used.
         """
-        launched = self._launched or launch(self._settings, self._nursery_command)
+        launched = self._launched or launch(self._settings, self.command)
         self._launched = None
         nursery = _Nursery(*launched)
         workers = [_Worker(nursery) for _ in range(self.size)]
