@@ -322,18 +322,11 @@ def _tagged(message: Message) -> dict[str, Any]:
     return {} if which is None else {"kind": which} | _plain_fields(getattr(message, which))
 
 
-def _support(message: grasp_pb2.Support) -> dict[str, Any] | None:
+def _unless_disabled(message: Message) -> dict[str, Any] | None:
     fields = _plain_fields(message)
-    if fields.pop("disabled"):
-        return None
-    for kind in ("ransac", "auto"):
+    for kind in ("ransac", "auto"):  # of a support
         if kind in fields:
             fields |= {"kind": kind} | fields.pop(kind)
-    return fields
-
-
-def _suppression(message: grasp_pb2.Suppression) -> dict[str, Any] | None:
-    fields = _plain_fields(message)
     return None if fields.pop("disabled") else fields
 
 
@@ -347,6 +340,6 @@ _FORMS: dict[type[Message], Callable[[Any], Any]] = {
     grasp_pb2.GripperChoice: _gripper,
     grasp_pb2.Shape: _tagged,
     grasp_pb2.Obstacle: _tagged,
-    grasp_pb2.Support: _support,
-    grasp_pb2.Suppression: _suppression,
+    grasp_pb2.Support: _unless_disabled,
+    grasp_pb2.Suppression: _unless_disabled,
 }
