@@ -7,6 +7,7 @@ import logging
 import math
 import mimetypes
 import re
+import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, nullcontext, suppress
 from dataclasses import dataclass
@@ -352,7 +353,6 @@ class HttpProtocol(HttpToolsProtocol):
         self._write_timer: asyncio.TimerHandle | None = None
         self._header_timer: asyncio.TimerHandle | None = None
         self._header_bytes = 0
-        self._refusal: EdgeGraspError | None = None  # why the parser is ended
         self._place = Place("", lambda: None)
 
     def connection_made(self, transport: Any) -> None:
@@ -391,11 +391,7 @@ class HttpProtocol(HttpToolsProtocol):
 
     def on_headers_complete(self) -> None:
         """Mark the connection as busy for requests to /v1/."""
-        try:
-            self._places.use(self._place, idle=not self.url.startswith(b"/v1/"))
-        except Overloaded as error:
-            self._refusal = error
-            raise  # ends the parser too
+        self._places.use(self._place, idle=not self.url.startswith(b"/v1/"))
         self._in_headers = False
         if self._header_timer is not None:
             self._header_timer.cancel()
@@ -408,8 +404,7 @@ class HttpProtocol(HttpToolsProtocol):
         self._body_bytes += len(body)
         if self._pieces > MANY_PIECES and self._body_bytes < self._pieces * SMALL_PIECE:
             value = f"{self._body_bytes} bytes in {self._pieces} pieces"
-            self._refusal = InvalidRequest("body", value, "Send larger pieces.")
-            raise self._refusal  # ends the parser too
+            raise InvalidRequest("body", value, "Send larger pieces.")
         super().on_body(body)
 
     def on_response_complete(self) -> None:
@@ -439,9 +434,11 @@ class HttpProtocol(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def send_400_response(self, msg: str) -> None:
-        """Answer a malformed request."""
-        fix = "Send an HTTP/1.1 request."
-        self._refuse(self._refusal or InvalidRequest("request", "malformed HTTP", fix))
+        """Answer a malformed request, or one for which a callback of the parser raised an error."""
+        raised = getattr(sys.exception(), "__context__", None)  # where httptools keeps it
+        if not isinstance(raised, EdgeGraspError):
+            raised = InvalidRequest("request", "malformed HTTP", "Send an HTTP/1.1 request.")
+        self._refuse(raised)
 
     def _refuse(self, error: EdgeGraspError) -> None:
         """Send an error without the application, and close; no more if it is closing."""
