@@ -60,8 +60,8 @@ MOTIONS = {
 class Followed:
     """How the first grasp of a scene was followed."""
 
-    seconds: list[float] = field(default_factory=list)  # when each answer with it was there
-    off: list[tuple[float, float]] = field(default_factory=list)  # mm, degrees; as many
+    # Of each answer with it: seconds at which it was there, mm and degrees that it is off.
+    off: list[tuple[float, float, float]] = field(default_factory=list)
     latency: list[float] = field(default_factory=list)  # seconds, of all answers
     switches: int = 0  # to another first grasp, or to none
     first: Any = None  # grasps; None: there was none
@@ -233,8 +233,7 @@ def follow(client: Any, scene: Scene, seconds: float, clock: Callable[[], float]
         if best is not None and best.id == done.first.id:
             true = scene.moved(now) @ done.first.T_cloud_tcp
             apart = np.linalg.norm(best.T_cloud_tcp[:3, 3] - true[:3, 3])
-            done.seconds.append(now)
-            done.off.append((1000 * float(apart), _degrees(best.T_cloud_tcp, true)))
+            done.off.append((now, 1000 * float(apart), _degrees(best.T_cloud_tcp, true)))
     return done
 
 
@@ -261,10 +260,10 @@ def _degrees(one: Float64, other: Float64) -> float:
 
 def summary(done: list[Followed]) -> dict[str, Any]:
     """Figures over some scenes: medians and 95 %, and how many grasps held an object."""
-    off = np.array([each for one in done for each in one.off]).reshape(-1, 2)
+    off = np.array([each for one in done for each in one.off]).reshape(-1, 3)
     latency = 1000 * np.array([each for one in done for each in one.latency])
-    measured = {"mm": off[:, 0], "degrees": off[:, 1], "ms": latency}
-    minutes = sum(one.seconds[-1] for one in done if one.seconds) / 60
+    measured = {"mm": off[:, 1], "degrees": off[:, 2], "ms": latency}
+    minutes = sum(one.off[-1][0] for one in done if one.off) / 60
     switches = sum(one.switches for one in done)
     return {
         "scenes": len(done),
@@ -316,8 +315,8 @@ def _plot(path: Path, done: dict[str, list[Followed]]) -> None:
 
     figure, axes = pyplot.subplots(figsize=(7, 2.8), layout="constrained")
     for name, each in done.items():
-        away = [millimetres for millimetres, _ in each[0].off]
-        axes.plot(each[0].seconds, away, label=name, linewidth=1)
+        seconds, away, _ = np.reshape(each[0].off, (-1, 3)).T
+        axes.plot(seconds, away, label=name, linewidth=1)
     axes.set(xlabel="seconds", ylabel="mm", ylim=(0, 3))
     figure.legend(loc="outside right upper", fontsize=8)
     figure.savefig(path)

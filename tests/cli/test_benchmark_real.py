@@ -238,6 +238,6 @@ def test_the_grasp_of_an_object_on_a_belt_moves_with_it() -> None:
     assert np.linalg.norm(scene.moved(0.2)[:3, 3]) == pytest.approx(0.02)
     assert len(done.off) >= 3
     # The last image was taken one thirtieth of a second before, 3 mm back.
-    assert max(millimetres for millimetres, _ in done.off) < 8.0
+    assert max(millimetres for _, millimetres, _ in done.off) < 8.0
     assert scene.execute(done).keys() == {"still", "open_loop", "followed"}
     scenes.close()
