@@ -267,12 +267,12 @@ class WorkerPool:
 
     async def _tend(self, worker: "_Worker") -> None:
         """Offer a worker for jobs until it dies, then replace it."""
-        usable, lost = True, False
+        lost = False
         try:
             while True:
                 if worker not in self._workers:
                     worker.close()  # there are newer ones
-                elif usable:
+                elif not worker.killed:  # its last answer may arrive after that
                     self._idle.put_nowait(worker)
                 answer = await worker.receive()
                 if answer is None:
@@ -285,7 +285,6 @@ class WorkerPool:
                 worker.finish(answer)
                 if answer.error is not None and answer.error.kind == WORKER_LOST:
                     worker.kill()  # it ran out of memory: its state cannot be trusted
-                usable = not worker.killed  # its last answer may arrive after that
         finally:
             worker.finish(WorkerLost(LOST))
             worker.close()
