@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
+from rich.table import Column, Table
 from typer import Option
 
 from edgegrasp_camera.arrays import Int64
@@ -114,9 +114,8 @@ def _write(
     title = f"{model} in {len(done)} scenes of real cameras"
     (output / "index.html").write_text(page(title, [*map(table, tables), *pictures]))
     for head, *rows in tables:
-        shown = Table(*head, box=None)
-        for column in shown.columns:
-            column.no_wrap = column.header in ("scene", "plane")
+        columns = (Column(name, no_wrap=name in ("scene", "plane")) for name in head)
+        shown = Table(*columns, box=None)
         for row in rows:
             shown.add_row(*row)
         Console().print(shown)
