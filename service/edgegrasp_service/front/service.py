@@ -321,8 +321,7 @@ class Admission:
         remaining = call.deadline - asyncio.get_running_loop().time()
         if remaining <= 0.0:
             raise DeadlineExceeded()
-        wait = self._estimated_wait
-        if self.calls and wait * MARGIN > remaining:
+        if self.calls and (wait := self._estimated_wait) * MARGIN > remaining:
             raise self._overloaded(
                 f"{len(self.calls)} requests come first, which take about {wait:.3g} s, and "
                 f"the deadline is {remaining:.3g} s away"
