@@ -20,11 +20,10 @@ def file(cloud: np.ndarray, tmp_path: Path) -> str:
     return str(tmp_path / "cloud.npy")
 
 
-def test_every_option_is_a_flag() -> None:
+def test_every_option_is_a_flag_which_wins_over_the_options_file(
+    file, dummy_server, run, refused, tmp_path
+) -> None:
     assert [flag.name for flag in option_flags()] == list(DetectOptions.model_fields)
-
-
-def test_flags_win_over_the_options_file(file, dummy_server, run, refused, tmp_path) -> None:
     options = tmp_path / "options.json"
     options.write_text('{"top_k": null}')  # a field left out, with a server or without
     assert "returned" in run("detect", file, "--options", options)
@@ -135,9 +134,21 @@ def test_several_depth_images_are_one_cloud(camera_files, dummy_server, run, ref
 ARM = ("--robot", "fr3", "--base", "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1")
 
 
-def test_depth_images_that_cannot_be_read(camera_files, file, refused) -> None:
+def test_input_that_cannot_be_used_is_named(
+    camera_files, file, refused, dummy_server, tmp_path
+) -> None:
     depth, mask, *_ = camera_files
+    absent, foreign, unknown = (tmp_path / name for name in ("no.npy", "foreign.npy", "cloud.las"))
+    foreign.write_bytes(b"foreign")
+    unknown.write_bytes(b"0 0 0")
+    to_server = (file, "--server", dummy_server.grpc_address)
     for flags, sentence in (
+        ((absent,), "No such file"),
+        ((unknown,), "Give one of: npy, npz, ply, pcd, xyz; a depth image as"),
+        ((foreign,), "cloud: got 7 bytes that are no whole .npy file"),
+        ((foreign, "--top-k", "0"), "options.top_k: got 0."),
+        ((*to_server, "--model", "resnet"), "options.model: got 'resnet'. Use one of: dummy."),
+        ((*to_server, "--up", "0,0"), "options.up"),
         ((depth,), "--intrinsics: got nothing. Give fx,fy,cx,cy"),
         ((), "give a cloud file, or --depth and --intrinsics"),
         ((file, *camera_files), "give a cloud file, or --depth and --intrinsics"),
@@ -153,32 +164,6 @@ def test_depth_images_that_cannot_be_read(camera_files, file, refused) -> None:
         ((file, mask), "768 values for a cloud of 500 rows"),
     ):
         assert sentence in refused("detect", *flags)
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (["--model", "resnet"], "options.model: got 'resnet'. Use one of: dummy."),
-        (["--up", "0,0"], "options.up"),
-    ],
-)
-def test_a_bad_option_is_named(options, sentence, file, dummy_server, refused) -> None:
-    assert sentence in refused("detect", file, "--server", dummy_server.grpc_address, *options)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "flags", "sentence"),
-    [
-        ("absent.npy", None, (), "No such file"),
-        ("cloud.las", b"0 0 0", (), "Give one of: npy, npz, ply, pcd, xyz; a depth image as"),
-        ("cloud.npy", b"foreign", (), "cloud: got 7 bytes that are no whole .npy file"),
-        ("cloud.npy", b"foreign", ("--top-k", "0"), "options.top_k: got 0."),
-    ],
-)
-def test_bad_input_is_named_without_a_server(name, content, flags, sentence, refused, tmp_path):
-    if content is not None:
-        (tmp_path / name).write_bytes(content)
-    assert sentence in refused("detect", tmp_path / name, *flags)
 
 
 def test_a_device_that_is_not_there_is_named(file, refused, monkeypatch) -> None:

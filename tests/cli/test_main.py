@@ -52,7 +52,8 @@ def test_help_of_every_command_loads_nothing_heavy() -> None:
     assert not loaded & HEAVY
 
 
-def test_version_short_help_and_completion(run) -> None:
+def test_version_short_help_completion_and_an_unknown_command(run) -> None:
+    assert "Did you mean 'detect'?" in invoke(2, "detec")
     assert loaded_by(["--version"])[0] == f"edgegrasp {importlib.metadata.version('edgegrasp')}\n"
     for words in (["-h"], ["detect", "-h"]):
         assert "edgegrasp detect cloud.ply" in " ".join(run(*words).split())
@@ -63,10 +64,6 @@ def test_version_short_help_and_completion(run) -> None:
     asked |= {"_EDGEGRASP_COMPLETE": "complete_bash"}
     done = CliRunner().invoke(main.app, [], prog_name="edgegrasp", env=asked)
     assert "--viewpoint" in done.output.split()
-
-
-def test_unknown_command() -> None:
-    assert "Did you mean 'detect'?" in invoke(2, "detec")
 
 
 @pytest.mark.parametrize(
@@ -142,7 +139,9 @@ def test_a_recorded_request_is_answered_again(transport, run, refused, monkeypat
         assert "differs" in refused("replay", "request", differing)
 
 
-def test_a_scene_is_viewed_until_ctrl_c(tmp_path: Path) -> None:
+def test_a_scene_is_viewed_until_ctrl_c(tmp_path: Path, refused) -> None:
+    assert "No such file" in refused("view", "absent.ply", "--no-browser")
+    assert "or --depth" in refused("view", "absent.ply", "--depth", "depth.png", "--no-browser")
     depth, color = tmp_path / "frame.npy", tmp_path / "color" / "frame.npy"
     color.parent.mkdir()
     np.save(depth, np.full((4, 6), 500, np.uint16))
@@ -160,8 +159,3 @@ def test_a_scene_is_viewed_until_ctrl_c(tmp_path: Path) -> None:
         assert viewer.wait(timeout=30) == 0
     with pytest.raises(httpx.ConnectError):
         httpx.get(address)
-
-
-def test_a_file_to_view_that_is_not_there_is_named(refused) -> None:
-    assert "No such file" in refused("view", "absent.ply", "--no-browser")
-    assert "or --depth" in refused("view", "absent.ply", "--depth", "depth.png", "--no-browser")

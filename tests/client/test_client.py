@@ -5,7 +5,7 @@ import dataclasses
 import itertools
 import os
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -96,7 +96,7 @@ ALL_OPTIONS: dict[str, Any] = MANY | {
 }
 
 
-def test_every_option_goes_through(client, cloud) -> None:
+def test_every_option_goes_through_and_none_is_its_default(client, cloud) -> None:
     known = edgegrasp_client.DetectOptions.__annotations__.keys()
     assert ALL_OPTIONS.keys() == known - {"robot"}  # which this server has none of: tests/robot
     detection = client.detect(cloud, **ALL_OPTIONS)
@@ -104,11 +104,7 @@ def test_every_option_goes_through(client, cloud) -> None:
     assert detection.counts["scored"] == 12
     alone = {name: client.detect(cloud, **{name: value}) for name, value in ALL_OPTIONS.items()}
     assert len(alone["top_k"].grasps) == 3
-
-
-def test_none_is_the_default_but_for_suppression(client, cloud) -> None:
-    options = dict.fromkeys(ALL_OPTIONS)
-    assert_same(client.detect(cloud, **options), client.detect(cloud))
+    assert_same(client.detect(cloud, **dict.fromkeys(ALL_OPTIONS)), client.detect(cloud))
 
 
 def test_models_and_readiness(client) -> None:
@@ -228,13 +224,14 @@ def test_requests_are_read_as_they_are_sent(client, cloud) -> None:
 
 
 async def test_an_asynchronous_source(dummy_server, cloud, transport: str) -> None:
+    names = [f"cloud {number}" for number in range(4)]
+
     async def clouds() -> AsyncIterator[StreamRequest]:
-        for number in range(4):
-            yield StreamRequest(cloud, request_id=f"cloud {number}")
+        for name in names:
+            yield StreamRequest(cloud, request_id=name)
 
     async with AsyncGraspClient(dummy_server.address(transport)) as client:
-        found = [answer.request_id async for answer in client.detect_stream(clouds())]
-    assert found == [f"cloud {number}" for number in range(4)]
+        assert [answer.request_id async for answer in client.detect_stream(clouds())] == names
 
 
 # What the tracker sends: the latest image, and what the last answer said.
@@ -306,35 +303,23 @@ def test_after_a_bad_answer_it_looks_for_others_too(bad: Detection) -> None:
     assert sent["grasps"][0]["id"] == 0  # the one to keep if it is there after all
 
 
-def followed(camera: Iterator[Any], at_work: Callable[[], Any] = bool) -> list[Any]:
-    """The images that a tracker sends to a server, which calls `at_work` for each."""
+def test_images_that_come_while_one_is_at_work_are_dropped_but_for_the_latest() -> None:
+    """And an error of the camera is raised."""
+    read, seen = threading.Event(), []
 
     def stream(requests: Any) -> Iterator[StreamAnswer]:
         for _ in requests:
-            at_work()
+            read.wait()
             yield StreamAnswer("", answer("started"))
-
-    client: Any = SimpleNamespace(detect_stream=stream)
-    return [image["cloud"][0, 0] for image, _ in GraspTracker().follow(client, camera)]
-
-
-def test_images_that_come_while_one_is_at_work_are_dropped_but_for_the_latest() -> None:
-    read = threading.Event()
 
     def camera() -> Iterator[dict[str, Any]]:
         for number in range(10):
             yield {"cloud": CLOUD + number}
         read.set()
-
-    seen = followed(camera(), read.wait)
-    assert seen[-1] == 9
-    assert len(seen) <= 2
-
-
-def test_an_error_of_the_camera_is_raised() -> None:
-    def camera() -> Iterator[dict[str, Any]]:
-        yield {"cloud": CLOUD}
         raise OSError("unplugged")
 
+    client: Any = SimpleNamespace(detect_stream=stream)
     with pytest.raises(OSError, match="unplugged"):
-        followed(camera())
+        seen.extend(image["cloud"][0, 0] for image, _ in GraspTracker().follow(client, camera()))
+    assert seen[-1] == 9
+    assert len(seen) <= 2

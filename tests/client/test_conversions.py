@@ -130,13 +130,7 @@ def test_an_isaac_file_says_what_the_format_asks_for() -> None:
     )
 
 
-def test_isaac_files_say_which_extra_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "yaml", None)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'edgegrasp\[yaml\]'"):
-        read_isaac_grasps("format: isaac_grasp")
-
-
-def test_an_isaac_file_of_the_grasp_editor_is_read() -> None:
+def test_an_isaac_file_of_the_grasp_editor_is_read_with_the_extra(monkeypatch) -> None:
     (read,) = read_isaac_grasps(
         """
 format: isaac_grasp
@@ -153,6 +147,9 @@ grasps:
     assert (read.name, read.confidence, read.cspace_position) == ("by hand", 1.0, {})
     np.testing.assert_allclose(read.T_object_gripper[:3, :3], np.diag([1, -1, -1]), atol=1e-12)
     np.testing.assert_allclose(read.T_object_gripper[:3, 3], [1, 2.5, -0.3])
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'edgegrasp\[yaml\]'"):
+        read_isaac_grasps("format: isaac_grasp")
 
 
 @pytest.mark.parametrize(

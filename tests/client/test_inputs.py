@@ -32,7 +32,7 @@ def depth_image(**changes: Any) -> Any:
     return {"depth": depth, "intrinsics": camera, "T_cloud_camera": np.eye(4)} | changes
 
 
-def test_arrays_beside_the_cloud_have_its_rows(client, cloud) -> None:
+def test_arrays_beside_the_cloud_have_its_rows(client, cloud, tmp_path) -> None:
     ids = np.arange(500)
     beside = {"normals": cloud, "colors": cloud.astype(np.float64), "segment_ids": ids}
     found = client.detect(cloud, view_ids=ids % 2, viewpoint=[[0, 0, 1], [1, 0, 1]], **beside)
@@ -40,6 +40,10 @@ def test_arrays_beside_the_cloud_have_its_rows(client, cloud) -> None:
     for name in (*beside, "view_ids"):
         with refusal(name, fix="500 points"):
             client.detect(cloud, **{name: (beside | {"view_ids": ids})[name][1:]})
+    np.savez(tmp_path / "cloud.npz", points=cloud, normals=cloud, segment_ids=ids)
+    assert client.detect(tmp_path / "cloud.npz").grasps
+    with refusal("normals"):  # they are sent already
+        client.detect(tmp_path / "cloud.npz", normals=cloud)
 
 
 def test_organised_clouds_may_have_holes(client, cloud) -> None:
@@ -65,12 +69,12 @@ def test_depth_images_are_sent_in_every_form(client) -> None:
     one = client.detect(depth_images=[depth_image()])
     assert one.counts["points"] == 600
     millimetres = np.round(depth_image()["depth"] * 1000).astype(np.uint16)
-    assert client.detect(depth_images=[depth_image(depth=millimetres)]).grasps
+    expected = client.detect(depth_images=[depth_image(depth=millimetres)])
+    assert expected.grasps
     nested = [[60.0, 0, 14.5], [0, 60.0, 9.5], [0, 0, 1]]
     for camera in ((60.0, 60.0, 14.5, 9.5), np.array(nested), np.ravel(nested)):
         found = client.detect(depth_images=[{"depth": millimetres, "intrinsics": camera}])
-        assert contacts(found) == contacts(client.detect(depth_images=[depth_image(
-            depth=millimetres)]))  # fmt: skip
+        assert contacts(found) == contacts(expected)
     views = [depth_image(), depth_image(T_cloud_camera=np.eye(4).tolist())]
     ids = np.arange(1200)
     assert client.detect(depth_images=views, segment_ids=ids).counts["points"] == 1200
@@ -126,14 +130,6 @@ def test_options_may_be_sequences_of_any_kind(client, cloud) -> None:
     given: Any = {"up": array("d", [0.0, 0.0, 1.0]), "objects": {"exclude": deque([9])}}
     plain: Any = {"up": [0.0, 0.0, 1.0], "objects": {"exclude": [9]}}
     assert contacts(client.detect(cloud, **given)) == contacts(client.detect(cloud, **plain))
-
-
-def test_a_file_and_its_own_normals_are_not_sent_twice(client, cloud, tmp_path) -> None:
-    path = tmp_path / "cloud.npz"
-    np.savez(path, points=cloud, normals=cloud, segment_ids=np.arange(500))
-    assert client.detect(path).grasps
-    with refusal("normals"):
-        client.detect(path, normals=cloud)
 
 
 SOME = np.zeros((40, 3), np.float32)
