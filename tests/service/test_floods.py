@@ -27,15 +27,15 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from tests.cloud_files import npy
 from tests.programs import run
 
-from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client import DeadlineError, GraspClient, InvalidRequestError
 from edgegrasp_service.front.http import PAGES
 from edgegrasp_service.server import HEALTH_PLACES
 
+from .conftest import PATIENCE
 from .test_stream import request
 
 ROOT = Path(__file__).parents[2]
-PATIENCE = 30
 MIB = 2**20
 HEAD = "POST /v1/grasps HTTP/1.1\r\nHost: x\r\nContent-Type: application/x-npy\r\n"
 PAGE = b"GET /docs/assets/swagger-ui-bundle.js HTTP/1.1\r\nHost: x\r\n\r\n"
@@ -80,6 +80,16 @@ async def check_health(address: str) -> None:
         check = health_pb2_grpc.HealthStub(channel).Check
         answer = await check(health_pb2.HealthCheckRequest(), timeout=PATIENCE)
         assert answer.status == health_pb2.HealthCheckResponse.SERVING
+
+
+@contextlib.contextmanager
+def connections(address: str, count: int, said: bytes = b"") -> Iterator[list[socket.socket]]:
+    """So many, on each of which this has been sent."""
+    with contextlib.ExitStack() as stack:
+        held = [stack.enter_context(connect(address)) for _ in range(count)]
+        for connection in held if said else ():
+            connection.sendall(said)
+        yield held
 
 
 def is_ended(connection: socket.socket) -> bool:
@@ -265,17 +275,14 @@ async def test_answers_that_nobody_takes_are_given_up(serve, transport: str) -> 
 async def test_connections_beyond_the_bound_end_the_oldest_idle_ones(serve) -> None:
     """Of HTTP: silent ones, and ones that ask for a page and read nothing."""
     running = await serve(max_connections=3)
-    url = running.server.http_url
-    held = [connect(url) for _ in range(3 * (3 + HEALTH_PLACES))]
-    for connection in held[3:]:
-        connection.sendall(PAGE)
-    for connection in held[: 2 * (3 + HEALTH_PLACES)]:  # they were ended, some of them reset
-        with contextlib.suppress(ConnectionResetError):
-            while await asyncio.to_thread(connection.recv, 2**20):
-                pass
-    assert (await running.http().get("/health/live")).status_code == 200
-    for connection in held:
-        connection.close()
+    with connections(running.server.http_url, 3 * (3 + HEALTH_PLACES)) as held:
+        for connection in held[3:]:
+            connection.sendall(PAGE)
+        for connection in held[: 2 * (3 + HEALTH_PLACES)]:  # they were ended, some of them reset
+            with contextlib.suppress(ConnectionResetError):
+                while await asyncio.to_thread(connection.recv, 2**20):
+                    pass
+        assert (await running.http().get("/health/live")).status_code == 200
 
 
 async def test_health_is_answered_while_every_connection_has_a_request(serve, cloud) -> None:
@@ -298,14 +305,10 @@ async def test_health_is_answered_while_every_connection_has_a_request(serve, cl
 async def test_silent_grpc_connections_are_closed_for_others(serve, cloud) -> None:
     """None of those others is refused before that."""
     running = await serve(max_connections=30)
-    held = [connect(running.server.grpc_address) for _ in range(90)]
-    for connection in held:
-        connection.sendall(http2_opening())
-    await check_health(running.server.grpc_address)
-    assert (await running.connect("grpc").detect(cloud)).fine
-    await running.until(lambda: sum(map(is_ended, held)) >= 60)
-    for connection in held:
-        connection.close()
+    with connections(running.server.grpc_address, 90, http2_opening()) as held:
+        await check_health(running.server.grpc_address)
+        assert (await running.connect("grpc").detect(cloud)).fine
+        await running.until(lambda: sum(map(is_ended, held)) >= 60)
 
 
 async def test_a_health_check_waits_for_no_other_calls(serve) -> None:
@@ -323,21 +326,16 @@ async def test_a_health_check_waits_for_no_other_calls(serve) -> None:
 
 async def test_answers_of_pages_are_given_up_too(serve) -> None:
     running = await serve(write_seconds=0.3, min_bytes_per_second=10**9)
-    with connect(running.server.http_url) as connection:
-        connection.sendall(PAGE)
+    with connections(running.server.http_url, 1, PAGE):
         await running.until(lambda: running.server.service.in_flight == 1)
         await running.until(lambda: running.server.service.in_flight == 0)
 
 
 async def test_pages_that_nobody_reads_keep_no_place_from_another_client(running) -> None:
-    held = [connect(running.server.http_url) for _ in range(2 * PAGES)]
-    for connection in held:
-        connection.sendall(PAGE)
-    await running.until(lambda: running.server.service.in_flight >= PAGES)
-    for path in ("/health/ready", "/openapi.json"):
-        assert (await running.http().get(path)).status_code == 200
-    for connection in held:
-        connection.close()
+    with connections(running.server.http_url, 2 * PAGES, PAGE):
+        await running.until(lambda: running.server.service.in_flight >= PAGES)
+        for path in ("/health/ready", "/openapi.json"):
+            assert (await running.http().get(path)).status_code == 200
 
 
 async def test_silent_health_checks_and_watchers_hold_up_nobody(running, monkeypatch) -> None:
@@ -355,6 +353,9 @@ async def test_silent_health_checks_and_watchers_hold_up_nobody(running, monkeyp
 
 
 async def test_errors_in_a_stream_that_is_left_open_hold_up_nobody(running, cloud) -> None:
+    call = running.channel().stream_stream("/edgegrasp.v1.GraspService/DetectGraspsStream")()
+    await call.write(b"\x08\x01" * 10**7)  # very many fields
+    assert await call.code() is grpc.StatusCode.INVALID_ARGUMENT
     stream = running.stub().DetectGraspsStream()
     for _ in range(2):
         await stream.write(request("", cloud[:0]))
@@ -382,12 +383,6 @@ async def test_silent_streams_give_their_places_to_others(serve, cloud, monkeypa
     await asyncio.wait(ended)
 
 
-async def test_a_message_of_a_stream_with_very_many_fields(running) -> None:
-    call = running.channel().stream_stream("/edgegrasp.v1.GraspService/DetectGraspsStream")()
-    await call.write(b"\x08\x01" * 10**7)
-    assert await call.code() is grpc.StatusCode.INVALID_ARGUMENT
-
-
 OUT_OF_DESCRIPTORS = """
 import resource, sys
 from benchmarks.serve_dummy import main
@@ -402,11 +397,9 @@ def test_without_file_descriptors_left_the_log_stays_short(start_dummy, tmp_path
         file.open("w") as log,
         start_dummy("--workers", "1", program=program, stderr=log) as server,
     ):
-        held = [connect(server.http_url) for _ in range(150)]
-        while "Too many open files" not in file.read_text():
-            time.sleep(0.05)
-        for connection in held:
-            connection.close()
+        with connections(server.http_url, 150):
+            while "Too many open files" not in file.read_text():
+                time.sleep(0.05)
         check_alive(server, cloud)
         assert server.stop() == 0
     lines = file.read_text().splitlines()
@@ -432,7 +425,7 @@ def test_a_cloud_far_too_dense(real_server, cloud) -> None:
         client.detect(cloud, num_approach_points=2, num_candidates=20)
 
 
-async def test_large_and_many_metadata_are_refused(serve, cloud: np.ndarray) -> None:
+async def test_large_and_many_metadata_and_compressed_messages_are_refused(serve, cloud) -> None:
     stub = (await serve(max_header_bytes=16_384)).stub()
     request = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes())
     for metadata in ((("x-large", "a" * 40_000),), tuple((f"x-{n}", "y") for n in range(100))):
@@ -442,16 +435,9 @@ async def test_large_and_many_metadata_are_refused(serve, cloud: np.ndarray) -> 
     detail = grasp_pb2.ErrorDetail.FromString(trailers["edgegrasp-error-bin"])
     assert (detail.kind, detail.field) == ("headers-too-large", "metadata")
     assert len((await stub.DetectGrasps(request)).grasps) == 10
-
-
-def test_compressed_messages_are_refused(dummy_server) -> None:
-    with grpc.insecure_channel(dummy_server.grpc_address) as channel:
-        stub, request = grasp_pb2_grpc.GraspServiceStub(channel), bytes(12 * 100_000)
-        with pytest.raises(grpc.RpcError) as caught:
-            stub.DetectGrasps(
-                grasp_pb2.DetectGraspsRequest(points=request), compression=grpc.Compression.Gzip
-            )
-        assert caught.value.code() is grpc.StatusCode.UNIMPLEMENTED
+    long = grasp_pb2.DetectGraspsRequest(points=bytes(12 * 100_000))
+    packed = stub.DetectGrasps(long, compression=grpc.Compression.Gzip)
+    assert await packed.code() is grpc.StatusCode.UNIMPLEMENTED
 
 
 def test_a_short_soak(tmp_path: Path) -> None:

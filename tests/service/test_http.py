@@ -23,26 +23,27 @@ def test_pages_work_without_internet(dummy_server) -> None:
                 assert http.get(page.url.join(link)).status_code == 200
 
 
-async def test_the_front_page_is_the_playground_or_that_of_the_api(serve) -> None:
+async def test_the_front_page_is_the_playground_or_that_of_the_api(serve, tmp_path) -> None:
     for playground, path, status in ((True, "/playground/", 200), (False, "/docs", 404)):
         http = (await serve(playground=playground)).http()
         front = await http.get("/", follow_redirects=True)
         assert front.url.path == path
         assert "default-src 'none'" in front.headers["content-security-policy"] or not playground
         assert (await http.get("/playground/")).status_code == status
-
-
-async def test_a_folder_of_samples_that_is_missing_is_named(serve, tmp_path) -> None:
     with pytest.raises(InvalidSettings, match=r"samples: got '.*none', which is no folder"):
         await serve(samples=tmp_path / "none")
 
 
-def test_head_is_get_without_the_body(dummy_server) -> None:
+def test_head_is_get_without_the_body_and_answers_say_what_a_browser_may_do(dummy_server) -> None:
     with httpx.Client(base_url=dummy_server.http_url) as http:
         for path in ("/health/live", "/health/ready", "/v1/models", "/docs", "/metrics"):
             answer = http.head(path)
             assert (answer.status_code, answer.content) == (200, b""), path
         assert http.head("/v1/grasps").status_code == 405
+        for path in ("/docs", "/playground/", "/v1/models", "/none", "/openapi.json"):
+            headers = http.get(path).headers
+            assert "frame-ancestors 'none'" in headers["content-security-policy"]
+            assert headers["x-content-type-options"] == "nosniff"
 
 
 def test_no_redirect_to_a_host_that_the_caller_names(dummy_server) -> None:
@@ -123,10 +124,3 @@ async def test_names_of_the_server(serve, host: str, given: dict[str, Any], stat
     for path in ("/v1/models", "/docs", "/metrics"):
         assert (await http.get(path, headers={"host": host})).status_code == status
     assert (await http.get("/health/live", headers={"host": host})).status_code == 200
-
-
-async def test_every_answer_says_what_a_browser_may_do_with_it(running) -> None:
-    for path in ("/docs", "/playground/", "/v1/models", "/none", "/openapi.json"):
-        headers = (await running.http().get(path)).headers
-        assert "frame-ancestors 'none'" in headers["content-security-policy"]
-        assert headers["x-content-type-options"] == "nosniff"

@@ -60,25 +60,20 @@ async def test_not_ready_until_loaded(begin, cloud) -> None:
     assert [(await watch.read()).status for watch in watches] == [Status.NOT_SERVING] * 2
 
 
-async def test_weights_that_cannot_be_loaded_end_the_server(begin) -> None:
-    running, _ = await begin(lambda stages: stages.fail("weights", "weights: truncated"))
-    with pytest.raises(EdgeGraspError, match="truncated"):
-        await asyncio.wait_for(running.serving, PATIENCE)
-
-
-async def test_a_server_is_stopped_while_it_loads(begin) -> None:
+async def test_a_server_ends_as_it_loads_where_it_has_to(begin) -> None:
+    """Stopped, without weights that can be loaded, or with a port that is taken."""
     running, _ = await begin(lambda stages: stages.shut("load"))
     running.stop.set()
     await asyncio.wait_for(running.serving, PATIENCE)
-
-
-@pytest.mark.parametrize("name", ["http_port", "grpc_port"])
-async def test_a_taken_port_is_named(begin, name: str) -> None:
+    running, _ = await begin(lambda stages: stages.fail("weights", "weights: truncated"))
+    with pytest.raises(EdgeGraspError, match="truncated"):
+        await asyncio.wait_for(running.serving, PATIENCE)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        running, _ = await begin(**{name: port})
-        with pytest.raises(AddressInUse, match=f"127.0.0.1:{port}"):
-            await running.serving
+        for name in ("http_port", "grpc_port"):
+            running, _ = await begin(**{name: port})
+            with pytest.raises(AddressInUse, match=f"127.0.0.1:{port}"):
+                await running.serving
 
 
 async def test_while_draining_both_transports_say_so(running, transport, cloud) -> None:

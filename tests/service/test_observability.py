@@ -156,7 +156,7 @@ def requests_total(found: dict[Any, float]) -> dict[tuple[str, str, str], float]
     }
 
 
-async def test_requests_are_counted_on_both_transports(running, cloud: np.ndarray) -> None:
+async def test_requests_and_results_of_streams_are_counted(running, cloud: np.ndarray) -> None:
     for transport in ("grpc", "rest"):
         client = running.ours(transport)
         await client.detect(cloud)
@@ -185,9 +185,6 @@ async def test_requests_are_counted_on_both_transports(running, cloud: np.ndarra
     assert [(one["name"], one["default"], "digest" in one, one["device"]) for one in info] == [
         ("dummy", "true", True, "cpu")
     ]
-
-
-async def test_streams_are_counted_by_result(running, cloud: np.ndarray) -> None:
     requests = [StreamRequest(points) for points in (cloud, cloud[:0], cloud)]
     answers = [answer async for answer in running.ours("grpc").detect_stream(requests)]
     assert len(answers) == 3

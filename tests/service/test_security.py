@@ -185,27 +185,20 @@ def test_what_an_operator_may_not_want_is_warned_of(given, warned, caplog, tmp_p
     assert all(said in message for said, message in zip(warned, caplog.messages, strict=True))
 
 
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        ("short\n", "got 5 letters as token 1"),
-        (f"{USER}\ntwo words of enough letters\n", "token 2"),
-        ("# none\n", "It holds no token"),
-        (b"\xff\xfe", "cannot be read"),
+def test_bad_files_are_named_and_a_comment_may_follow_a_token(tmp_path: Path) -> None:
+    settings = Settings(token_file=tmp_path / "tokens")
+    for text, sentence in (
         (None, "cannot be read"),
-    ],
-)
-def test_bad_files_are_named(tmp_path: Path, text: str | bytes | None, sentence: str) -> None:
-    path = tmp_path / "tokens"
-    if text is not None:
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(InvalidSettings) as caught:
-        Tokens(Settings(token_file=path))
-    assert sentence in str(caught.value)
-    assert "short" not in str(caught.value)
-
-
-def test_a_comment_may_follow_a_token(tmp_path: Path) -> None:
-    path = tmp_path / "tokens"
-    path.write_text(f"# all robots\n\nleft:{USER}  # of cell 1\n")
-    assert Tokens(Settings(token_file=path)).check(f"Bearer {USER}").name == "left"
+        (b"short\n", "got 5 letters as token 1"),
+        (f"{USER}\ntwo words of enough letters\n".encode(), "token 2"),
+        (b"# none\n", "It holds no token"),
+        (b"\xff\xfe", "cannot be read"),
+    ):
+        if text is not None:
+            settings.token_file.write_bytes(text)
+        with pytest.raises(InvalidSettings) as caught:
+            Tokens(settings)
+        assert sentence in str(caught.value)
+        assert "short" not in str(caught.value)
+    settings.token_file.write_text(f"# all robots\n\nleft:{USER}  # of cell 1\n")
+    assert Tokens(settings).check(f"Bearer {USER}").name == "left"

@@ -45,14 +45,11 @@ def test_a_mistake_is_told_with_its_source(monkeypatch, config, source) -> None:
         load_settings(config, **({"http_port": -1} if source == "a flag" else {}))
 
 
-def test_paths_in_a_file_are_relative_to_it(config: Path) -> None:
+def test_paths_in_a_file_are_relative_to_it_and_in_the_environment_json(monkeypatch, config):
     config.write_text('weights = ["mine", "/there/yours"]\ntoken_file = "tokens"\n')
     settings = load_settings(config)
     assert settings.weights == (config.parent / "mine", Path("/there/yours"))
     assert settings.token_file == config.parent / "tokens"
-
-
-def test_lists_in_the_environment_are_json(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EDGEGRASP_WEIGHTS", '["a", "b.safetensors"]')
     assert load_settings().weights == (Path("a"), Path("b.safetensors"))
     monkeypatch.setenv("EDGEGRASP_WEIGHTS", "folder")
@@ -98,19 +95,15 @@ def test_bad_files_are_named(config: Path, text: str | None, sentence: str) -> N
     assert "server.toml" in str(caught.value)
 
 
-@pytest.mark.parametrize("variable", ["EDGEGRASP_HTP_PORT", "EDGEGRASP_TOKEN"])
-def test_unknown_variables_are_named(monkeypatch: pytest.MonkeyPatch, variable: str) -> None:
-    monkeypatch.setenv(variable, TOKEN)
-    with pytest.raises(InvalidSettings) as caught:
-        load_settings()
-    name = variable.removeprefix("EDGEGRASP_").lower()
-    assert str(caught.value) == f"{name}: no such setting. It comes from the environment."
-
-
-def test_a_clients_variables_are_not_the_servers(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["htp_port", "token"])
+def test_unknown_variables_are_named_but_for_a_clients(monkeypatch, name: str) -> None:
     monkeypatch.setenv("EDGEGRASP_CLIENT_TOKEN", TOKEN)
     monkeypatch.setenv("EDGEGRASP_HOST", "")  # as a compose file leaves what is not set
     assert load_settings().host == "127.0.0.1"
+    monkeypatch.setenv(f"EDGEGRASP_{name.upper()}", TOKEN)
+    with pytest.raises(InvalidSettings) as caught:
+        load_settings()
+    assert str(caught.value) == f"{name}: no such setting. It comes from the environment."
 
 
 def test_the_settings_in_effect_are_printed(monkeypatch: pytest.MonkeyPatch) -> None:

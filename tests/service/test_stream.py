@@ -86,8 +86,8 @@ async def test_what_the_client_does_not_take_is_not_computed(serve, cloud) -> No
     await sending
 
 
-async def test_a_full_server_is_told_of_in_the_stream(serve, cloud) -> None:
-    running = await serve(max_queue_length=0)
+async def test_streams_are_bounded_and_told_that_the_server_is_full(serve, cloud) -> None:
+    running = await serve(max_queue_length=0, max_streams=1)
     stream = running.stub().DetectGraspsStream()
     running.stages.shut("evaluate")
     for name in ("taken", "refused"):
@@ -98,17 +98,13 @@ async def test_a_full_server_is_told_of_in_the_stream(serve, cloud) -> None:
     refused = await stream.read()
     assert refused.error.code == grpc.StatusCode.RESOURCE_EXHAUSTED.value[0]
     assert refused.error.detail.retry_after >= 1.0
-
-
-async def test_streams_are_bounded(serve, cloud) -> None:
-    running = await serve(max_streams=1)
-    first = running.stub().DetectGraspsStream()
-    await first.write(request("first", cloud))
-    assert (await first.read()).request_id == "first"
+    await running.until_idle()
+    await stream.write(request("first", cloud))
+    assert (await stream.read()).request_id == "first"
     second = running.stub().DetectGraspsStream()
     assert await second.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-    await first.done_writing()
-    assert await first.code() is grpc.StatusCode.OK
+    await stream.done_writing()
+    assert await stream.code() is grpc.StatusCode.OK
 
 
 async def test_a_stream_whose_client_left_ends(running, cloud) -> None:
