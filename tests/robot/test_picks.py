@@ -149,16 +149,20 @@ def test_what_is_out_of_reach_is_counted_and_comes_last(fr3):
     assert detection.grasps[0].object == 1  # of a lower score
 
 
-def test_a_lid_over_an_object_is_a_collision_of_the_arm(fr3):
-    lid = {"min": (0.4, -0.1, 0.2), "max": (0.6, 0.1, 0.22)}
-    detection = picks_of(
-        fr3,
-        np.eye(4),
-        boxes=BOXES[:1],
-        options={"collision": {"obstacles": [{"kind": "box", **lid}]}},
-    )
+def test_a_lid_over_an_object_and_a_hand_that_touches_something_are_collisions(fr3):
+    lid = {"kind": "box", "min": (0.4, -0.1, 0.2), "max": (0.6, 0.1, 0.22)}
+    under = {"collision": {"obstacles": [lid]}}
+    detection = picks_of(fr3, np.eye(4), boxes=BOXES[:1], options=under)
     assert detection.counts["arm_collision"] == 1
     assert "arm's reach" in detection.warnings[0]
+
+    def colliding(scene, detection):
+        grasps = [replace(grasp, collision_free=False) for grasp in detection.grasps]
+        return scene, replace(detection, grasps=grasps)
+
+    found = picks_of(fr3, changed=colliding)
+    assert not any(grasp.arm.reachable for grasp in found.grasps)
+    assert found.counts["hand_collision"] == len(BOXES)
 
 
 def test_the_arm_meets_the_cloud_as_its_depths_were_corrected(fr3):
@@ -228,13 +232,10 @@ def with_points(scene, points, number):
     )
 
 
-def test_no_time_gives_no_motion_and_says_so(fr3):
+def test_no_time_gives_no_motion_and_says_so(fr3, monkeypatch):
     found = picks_of(fr3, until=0.0)
     assert [grasp.arm for grasp in found.grasps] == [None] * len(BOXES)
     assert "time ran out" in found.warnings[-1]
-
-
-def test_out_of_time_is_within_reach_without_a_motion(fr3, monkeypatch):
     clock = count()
     monkeypatch.setattr("time.monotonic", lambda: next(clock))
     # It is asked before each grasp, and before a motion.
@@ -274,16 +275,6 @@ def test_strays_over_an_object_do_not_hold_it_down(fr3, share, motions):
     assert found.counts["with_trajectory"] == motions
 
 
-def test_a_colliding_hand_gets_no_motion(fr3):
-    def colliding(scene, detection):
-        grasps = [replace(grasp, collision_free=False) for grasp in detection.grasps]
-        return scene, replace(detection, grasps=grasps)
-
-    found = picks_of(fr3, changed=colliding)
-    assert not any(grasp.arm.reachable for grasp in found.grasps)
-    assert found.counts["hand_collision"] == len(BOXES)
-
-
 TRAY = {"min": [0.3, -0.5, 0.0], "max": [0.6, -0.3, 0.3]}
 START_IN_THE_TABLE = [0.0, 1.3, 0.0, -1.0, 0.0, 2.2, 0.8]
 START_IN_ITSELF = [0.0, -1.7, 0.0, -3.0, 0.0, 0.6, 0.0]
@@ -307,14 +298,11 @@ def test_a_robot_or_a_place_that_cannot_be_is_refused(fr3):
     for changed, field, value, fix in REFUSED:
         with refusal(f"options.{field}", value, fix):
             picks_of(fr3, **changed)
+    for pose in (np.full(16, np.nan), np.zeros(16), 2 * np.eye(4)):
+        robot = {"name": "fr3", "T_base_cloud": pose.ravel().tolist(), "joints": [0.0] * 7}
+        with refusal("options.robot.T_base_cloud."):
+            parse_options({"robot": robot})
     assert len(plans_of(picks_of(fr3))) == len(BOXES)  # nothing of it is left
-
-
-@pytest.mark.parametrize("pose", [np.full(16, np.nan), np.zeros(16), 2 * np.eye(4)])
-def test_a_pose_that_is_none_is_refused(pose):
-    robot = {"name": "fr3", "T_base_cloud": pose.ravel().tolist(), "joints": [0.0] * 7}
-    with refusal("options.robot.T_base_cloud."):
-        parse_options({"robot": robot})
 
 
 def placed(grasp, plan):
@@ -359,15 +347,12 @@ def test_what_stands_in_the_region_is_not_met(fr3):
     assert np.abs(plan.T_base_place[:2, 3] - (0.45, -0.4)).max() > HALF
 
 
-@pytest.mark.parametrize(
-    "region",
-    [
+def test_without_a_place_nothing_is_within_reach(fr3):
+    for region in (
         {"min": [0.3, -0.5, 0.0], "max": [0.33, -0.3, 0.3]},  # narrower than the object
         {"min": [1.5, -0.5, 0.0], "max": [1.8, -0.3, 0.3]},  # beyond the arm
-    ],
-)
-def test_without_a_place_nothing_is_within_reach(fr3, region):
-    detection = picks_of(fr3, place={"region": region})
-    assert detection.counts["no_place"] == len(BOXES)
-    assert detection.counts["reachable"] == 0
-    assert "arm's reach" in detection.warnings[0]
+    ):
+        detection = picks_of(fr3, place={"region": region})
+        assert detection.counts["no_place"] == len(BOXES)
+        assert detection.counts["reachable"] == 0
+        assert "arm's reach" in detection.warnings[0]

@@ -91,7 +91,10 @@ def test_the_client_reads_the_best_pick(robot, transport):
     assert catalogue.options.gripper.name == robot.gripper.name  # for which grasps are
 
 
-def test_reach_alone_and_what_is_out_of_reach(robot, transport):
+def test_reach_alone_what_is_out_of_reach_and_a_start_that_collides(robot, transport):
+    error = ask(robot, transport, joints=[0.0, 1.3, 0.0, -1.0, 0.0, 2.2, 0.8])[0].error
+    assert (error.kind, error.field) == ("start-collision", "options.robot.joints")
+    assert "the support" in error.value
     far = TURNED.copy()
     far[0, 3] += 3.0
     given, _ = ask(robot, transport, plan="reach", T_base_cloud=far)
@@ -122,12 +125,6 @@ def test_a_robot_that_is_not_here_is_refused(robot, settings, fix, monkeypatch):
         monkeypatch.setitem(sys.modules, "edgegrasp_robot", None)
     error = ask(robot, "http", settings, name="r2d2")[0].error
     assert (error.field, error.fix, error.status) == ("options.robot.name", fix, 400)
-
-
-def test_a_start_that_collides_is_refused_as_a_wrong_request(robot):
-    error = ask(robot, "grpc", joints=[0.0, 1.3, 0.0, -1.0, 0.0, 2.2, 0.8])[0].error
-    assert (error.kind, error.field) == ("start-collision", "options.robot.joints")
-    assert "the support" in error.value
 
 
 def test_a_server_lists_its_robots(start_dummy, robot):
