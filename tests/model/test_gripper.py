@@ -89,26 +89,20 @@ def choose(own: dict[str, object] | None = None, **fields: object) -> object:
     return choose_gripper(DetectOptions.model_validate(fields), PANDA, own or {})
 
 
-def test_a_gripper_is_chosen_by_nothing_a_name_or_fields() -> None:
+def test_a_gripper_is_chosen_by_nothing_a_known_name_or_fields() -> None:
     assert choose() is PANDA
     mine = load_gripper("wsg-50")
     assert choose(gripper="wsg-50") == mine
     assert choose({"panda": mine}, gripper="panda") is mine
     custom = choose(gripper=OWN_GRIPPER)
     assert (custom.name, custom.max_opening, custom.palm_z) == ("custom", 0.07, 0.05)
-
-
-@pytest.mark.parametrize(
-    ("fields", "field", "fix"),
-    [
+    for fields, field, fix in (
         ({"gripper": "hook"}, "options.gripper", "robotiq-2f-85"),
         ({"gripper": "../grippers/panda.toml"}, "options.gripper", "Use one of"),
         ({"collision": {"opening": 0.081}}, "options.collision.opening", "at most 0.08"),
-    ],
-)
-def test_an_unknown_gripper_or_opening_is_refused_by_field(fields, field, fix) -> None:
-    with refusal(field, fix=fix):
-        choose(**fields)
+    ):
+        with refusal(field, fix=fix):
+            choose(**fields)
 
 
 @by_name
@@ -129,18 +123,15 @@ def test_grasps_fit_the_gripper_that_was_asked_for(gripper: Gripper) -> None:
     assert warned == (gripper.name != "panda")
 
 
-def test_weights_trained_with_many_hands_warn_about_no_gripper() -> None:
+def test_weights_trained_with_many_hands_warn_about_no_gripper(catalogue: ModelCatalogue) -> None:
     of_one = detector()
     metadata = replace(of_one.metadata, training={"training_hands": 400})
     of_many = GraspDetector(of_one.network, metadata)
     found = of_many.detect(box_on_table(), DetectOptions(viewpoint=VIEW, gripper="wsg-50"))
     assert found.grasps
     assert not any("trained for" in warning for warning in found.warnings)
-
-
-def test_only_the_default_weights_were_trained_with_many_hands(catalogue: ModelCatalogue) -> None:
     options = DetectOptions(viewpoint=VIEW, support=None, gripper="wsg-50")
-    warned = [
+    warned = [  # only the default weights were
         row["name"]
         for row in catalogue.describe()
         if catalogue.get(row["name"]).detect(box_on_table(), options).warnings

@@ -138,17 +138,13 @@ def test_neither_single_precision_nor_recorded_gradients_change_a_score(architec
     single = scores(network, batch)  # by fused loops
     in_one_place = replace(batch, points=0 * batch.points, normals=0 * batch.normals)
     assert scores(network, in_one_place).isfinite().all()
+    empty = replace(scene, edges=np.empty((0, 2), dtype=np.int64))
+    assert scores(network, empty.batch(np.float32)).shape == (0,)
     network.double()
     exact = scores(network, scene.batch())
     torch.testing.assert_close(single.double(), exact, rtol=0, atol=0.01 * float(exact.std()))
     recorded = network(scene.batch()).detach()
     torch.testing.assert_close(recorded, exact, rtol=0, atol=1e-12)
-
-
-@architectures
-def test_a_batch_without_grasps_has_no_scores(architecture):
-    empty = replace(RandomScene.of_seed(1), edges=np.empty((0, 2), dtype=np.int64))
-    assert scores(build_network(TINY[architecture]), empty.batch(np.float32)).shape == (0,)
 
 
 # What a hand sees of the cloud in its own frame, and the network that scores it by that.
@@ -187,14 +183,10 @@ def test_the_order_of_the_points_and_what_follows_them_mean_nothing() -> None:
     assert hand_scores(nothing).isfinite().all()
 
 
-def test_an_older_network_reads_the_numbers_that_it_knows() -> None:
-    batch, older = look(2), replace(HAND, description_size=61)
-    fewer = replace(batch, description=batch.description[:, :61].contiguous())
-    assert torch.equal(hand_scores(batch, older), hand_scores(fewer, older))
-
-
 def test_a_hand_s_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it() -> None:
-    batch = look(0)
+    batch, older = look(0), replace(HAND, description_size=61)
+    fewer = replace(batch, description=batch.description[:, :61].contiguous())
+    assert torch.equal(hand_scores(batch, older), hand_scores(fewer, older))  # all that it knows
     together = hand_scores(batch, HAND)
     for rows in (slice(1), slice(3), slice(20, 37), slice(None, None, 2)):
         parts = batch.description[rows], batch.points[rows], batch.point_count[rows]
