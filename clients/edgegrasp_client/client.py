@@ -149,7 +149,7 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
             GraspClientError: The stream itself failed, so that no more answers come.
         """
         source = requests if isinstance(requests, AsyncIterable) else _from_thread(requests)
-        return self._transport.detect_stream(_named(source), self._seconds(timeout))
+        return self._transport.detect_stream(_sent(source, self._seconds(timeout)))
 
     async def models(self, *, timeout: float | None = None) -> list[Model]:
         """The weights that `model` can name."""
@@ -212,13 +212,14 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
             left = self._seconds(max(end - time.monotonic(), 0.0))
 
 
-async def _named(
-    requests: AsyncIterable[StreamRequest],
-) -> AsyncIterator[tuple[str, StreamRequest]]:
-    """The requests with their own names, or their numbers from 0."""
+async def _sent(
+    requests: AsyncIterable[StreamRequest], timeout: float
+) -> AsyncIterator[tuple[str, Request, float]]:
+    """The requests with their own names and timeouts, or their numbers from 0 and the stream's."""
     number = 0
-    async for request in requests:
-        yield request.request_id or str(number), request
+    async for each in requests:
+        seconds = timeout if each.timeout is None else each.timeout
+        yield each.request_id or str(number), each.request, seconds
         number += 1
 
 

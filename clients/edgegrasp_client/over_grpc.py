@@ -14,7 +14,6 @@ from edgegrasp_client.connection import Tls, read_pem, token_metadata
 from edgegrasp_client.errors import GraspClientError, error_of_kind, invalid
 from edgegrasp_client.requests import (
     Request,
-    StreamRequest,
     cloud_file,
     depth_image_fields,
     float32_points,
@@ -89,17 +88,16 @@ class GrpcTransport:
         raise invalid("address", "gRPC", "Outcomes are taken over REST: give http://host:port.")
 
     async def detect_stream(
-        self, requests: AsyncIterator[tuple[str, StreamRequest]], timeout: float
+        self, requests: AsyncIterator[tuple[str, Request, float]]
     ) -> AsyncGenerator[StreamAnswer, None]:
-        """An answer to each of the named requests."""
+        """An answer to each of the named requests with their timeouts."""
         failed: list[Exception] = []
 
         async def messages() -> AsyncIterator[bytes]:
             try:
-                async for name, request in requests:
-                    seconds = timeout if request.timeout is None else request.timeout
+                async for name, request, seconds in requests:
                     message = grasp_pb2.DetectGraspsStreamRequest(request_id=name, timeout=seconds)
-                    wire = _field(message, "request", *wire_of(request.request))
+                    wire = _field(message, "request", *wire_of(request))
                     yield b"".join([message.SerializeToString(), *wire])
             except Exception as error:  # gRPC would only log it
                 failed.append(error)

@@ -17,7 +17,6 @@ from edgegrasp_client.connection import HTTP_OVER_UNIX, Tls, read_pem, token_met
 from edgegrasp_client.errors import GraspClientError, error_of_kind, invalid
 from edgegrasp_client.requests import (
     Request,
-    StreamRequest,
     cloud_file,
     depth_image_fields,
     is_point_cloud2,
@@ -72,12 +71,11 @@ class RestTransport:
         await self._call(lambda _: None, call, timeout)
 
     async def detect_stream(
-        self, requests: AsyncIterator[tuple[str, StreamRequest]], timeout: float
+        self, requests: AsyncIterator[tuple[str, Request, float]]
     ) -> AsyncGenerator[StreamAnswer, None]:
-        """An answer to each of the named requests, one after the other."""
-        async for name, request in requests:
-            call, read = call_of(request.request), partial(read_json_as, Detection)
-            seconds = timeout if request.timeout is None else request.timeout
+        """An answer to each of the named requests with their timeouts, one after the other."""
+        async for name, request, seconds in requests:
+            call, read = call_of(request), partial(read_json_as, Detection)
             try:
                 yield StreamAnswer(name, await self._call(read, call, seconds))
             except GraspClientError as error:
