@@ -63,13 +63,10 @@ def commands() -> Iterator[tuple[str, list[str]]]:
                 yield name, words
 
 
-def test_files_and_folders_that_pages_link_to_exist() -> None:
+def test_files_and_variables_that_the_pages_name_exist() -> None:
     for page in (*ROOT.glob("*.md"), *DOCS.glob("*.md")):
         for name in re.findall(r"\]\((?!https?:)([^)#]+)[^)]*\)", page.read_text()):
             assert (page.parent / name).exists(), f"{page.name}: {name}"
-
-
-def test_variables_that_the_pages_name_exist() -> None:
     known = {f"EDGEGRASP_{name.upper()}" for name in Settings.model_fields}
     beside = [(ROOT / name).read_text() for name in ("Dockerfile", "docker/compose.yaml")]
     for text in (*PAGES.values(), *beside):

@@ -30,18 +30,15 @@ def tracked_files() -> list[Path]:
     return [path for path in paths if path.is_file()]
 
 
-def test_no_tracked_file_names_a_registry_or_a_path_of_one_machine() -> None:
+def test_tracked_files_are_small_and_name_no_registry_or_path_of_one_machine() -> None:
+    large = [path.name for path in tracked_files() if path.stat().st_size > 20 * 2**20]
+    assert large == []
     found = [
         f"{path.relative_to(ROOT)}: {match[0]}"
         for path in tracked_files()
         for match in FOREIGN.finditer(path.read_text("utf-8", errors="replace"))
     ]
     assert found == []
-
-
-def test_tracked_files_are_small_enough_for_a_clone() -> None:
-    large = [path.name for path in tracked_files() if path.stat().st_size > 20 * 2**20]
-    assert large == []
 
 
 def test_functions_fit_on_a_screen() -> None:

@@ -30,7 +30,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return next(folder.glob("*.tar.gz")), next(folder.glob("*.whl"))
 
 
-def test_sdist_and_wheel_hold_the_packages_and_no_caches(built: tuple[Path, Path]) -> None:
+def test_sdist_and_wheel_hold_the_packages_of_this_version_and_no_caches(built) -> None:
     with tarfile.open(built[0]) as sdist, zipfile.ZipFile(built[1]) as wheel:
         names = [name.partition("/")[2] for name in sdist.getnames()]
         ours = [name for name in wheel.namelist() if ".dist-info/" not in name]
@@ -42,6 +42,11 @@ def test_sdist_and_wheel_hold_the_packages_and_no_caches(built: tuple[Path, Path
     assert v1 <= {name.removeprefix("edgegrasp/v1/") for name in ours}
     packages = {name.partition("/")[0] for name in ours}
     assert packages == {Path(name).parent.name for name in ours if name.endswith("/py.typed")}
+    assert VERSION is not None
+    assert built[1].name == f"edgegrasp-{VERSION[1]}-py3-none-any.whl"
+    deployed = (ROOT / "docker/kubernetes/edgegrasp.yaml").read_text()
+    assert f"image: edgegrasp:{VERSION[1]}\n" in deployed
+    assert f"## {VERSION[1]}" in (ROOT / "CHANGELOG.md").read_text()
 
 
 def test_the_wheel_alone_serves(built: tuple[Path, Path], tmp_path: Path) -> None:
@@ -127,13 +132,3 @@ def test_the_base_install_alone_asks_a_server(built, dummy_server, tmp_path: Pat
     numpy, *names = ran.stdout.split()
     assert numpy.startswith("1.24.") or not lowest
     assert not {"scipy", "torch", "matplotlib", "typer"} & set(names)
-
-
-def test_the_version_is_that_of_the_project_file(built: tuple[Path, Path]) -> None:
-    assert VERSION is not None
-    assert built[1].name == f"edgegrasp-{VERSION[1]}-py3-none-any.whl"
-    assert (
-        f"image: edgegrasp:{VERSION[1]}\n"
-        in (ROOT / "docker/kubernetes/edgegrasp.yaml").read_text()
-    )
-    assert f"## {VERSION[1]}" in (ROOT / "CHANGELOG.md").read_text()

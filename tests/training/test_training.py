@@ -134,14 +134,6 @@ def test_a_run_may_start_where_another_ended(make_trainer, tmp_path, network) ->
     np.testing.assert_allclose(logit, first.evaluate().logit, atol=1e-4)
 
 
-def test_weights_of_another_network_are_no_start(make_trainer, tmp_path) -> None:
-    make_trainer(tmp_path / "balls", "balls", steps=1).run(ignore)
-    with pytest.raises(ValueError, match="same model"):
-        make_trainer(tmp_path / "on", "hands", start=tmp_path / "balls" / "tiny.safetensors")
-    with pytest.raises(ValueError, match="holds another model"):
-        make_trainer(tmp_path / "balls", "hands")
-
-
 @pytest.fixture(scope="module")
 def teacher(make_trainer, tmp_path_factory: pytest.TempPathFactory) -> Teacher:
     """A hand network that learned which grasps of the made-up views hold."""
@@ -196,11 +188,15 @@ def test_a_teacher_alone_labels_views_in_which_no_grasp_was_tried(
     assert run.evaluate().loss < 0.95 * before.loss
 
 
-def test_only_hands_teach_and_only_balls_are_taught(make_trainer, teacher, tmp_path):
-    metadata = CheckpointMetadata("tiny", NETWORKS["balls"], voxel_size=0.0045, gripper="panda")
-    save_checkpoint(tmp_path / "tiny.safetensors", build_network(NETWORKS["balls"]), metadata)
+def test_hands_go_on_with_hands_alone_and_teach_balls_alone(make_trainer, teacher, tmp_path):
+    make_trainer(tmp_path / "balls", "balls", steps=1).run(ignore)
+    balls = tmp_path / "balls" / "tiny.safetensors"
+    with pytest.raises(ValueError, match="same model"):
+        make_trainer(tmp_path / "on", "hands", start=balls)
+    with pytest.raises(ValueError, match="holds another model"):
+        make_trainer(tmp_path / "balls", "hands")
     with pytest.raises(ValueError, match="teacher: got a network of architecture 'edgegrasp'"):
-        Teacher(tmp_path / "tiny.safetensors", 0.04)
+        Teacher(balls, 0.04)
     with pytest.raises(ValueError, match="tiny learns from labels alone"):
         make_trainer(tmp_path / "run", "hands", teacher=teacher)
 

@@ -30,7 +30,7 @@ from edgegrasp_training.views import (
 from .conftest import NETWORKS, SAMPLE, made_up_view
 
 
-def test_a_view_comes_back_with_the_hand_that_tried_its_grasps(tmp_path) -> None:
+def test_a_view_comes_back_with_the_hand_that_tried_its_grasps_other_files_do_not(tmp_path) -> None:
     file, view = tmp_path / "pile_1-000001_0.npz", made_up_view(0)
     view.save(file)
     read = load_view(file)
@@ -43,12 +43,9 @@ def test_a_view_comes_back_with_the_hand_that_tried_its_grasps(tmp_path) -> None
     tried.save(file)
     np.testing.assert_array_equal(load_view(file).T_world_hand, hands)
     assert load_view(file).hand == load_gripper("robotiq-2f-140")
-
-
-def test_other_files_are_no_views(tmp_path) -> None:
-    np.savez(tmp_path / "scenes.npz", depth=np.zeros(3))
-    (tmp_path / "half.npz").write_bytes((tmp_path / "scenes.npz").read_bytes()[:99])
-    for file in tmp_path.iterdir():
+    np.savez(file, depth=np.zeros(3))
+    for content in (file.read_bytes(), file.read_bytes()[:99]):
+        file.write_bytes(content)
         with pytest.raises(ValueError, match="is no view"):
             load_view(file)
 
