@@ -134,8 +134,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     },
     "a robot that places by a pose": {"robot": ROBOT | {"place": {"T_base_object": POSE}}},
     "a robot that places in a region": {
-        "robot": ROBOT
-        | {"plan": "reach", "place": {"region": {"min": [0, 0, 0], "max": [1, 1, 1]}}}
+        "robot": ROBOT | {"plan": "reach", "place": {"region": {"min": [0] * 3, "max": [1] * 3}}}
     },
     "zeros and empty lists, which protobuf calls defaults": {
         "support": {"normal": [0, 0, 1], "offset": 0.0},
@@ -159,11 +158,9 @@ def through_message(fields: dict[str, Any]) -> DetectOptions:
 
 
 def through_query(fields: dict[str, Any]) -> DetectOptions:
-    texts = {
-        name: value if isinstance(value, str) else json.dumps(value)
-        for name, value in plain_options(fields).items()
-    }
-    return parse_options(options_of_texts(texts.items()))
+    given = plain_options(fields).items()
+    texts = [(name, v if isinstance(v, str) else json.dumps(v)) for name, v in given]
+    return parse_options(options_of_texts(texts))
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
