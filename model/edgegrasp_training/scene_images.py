@@ -55,7 +55,7 @@ ARMS = (  # of PyBullet's models and RoboPlan's
 SOFT_SHARE = 0.25  # of the objects, bent and crumpled as bags, clothes and blister packs are
 LEVEL = 0.85  # least z of a support's normal: its edges are labelled other
 WRONG = 0.02, 0.01  # metres, and share of the depth, by which a reading shows nothing real
-UNSEEN_WALLS = 0.35  # of the images, in which steep background has no readings, or few
+UNSEEN_WALLS = 0.25  # of the images, in which steep background has no readings, or few
 
 
 class SceneImage(NamedTuple):

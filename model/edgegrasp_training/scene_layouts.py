@@ -25,7 +25,6 @@ REACH = 0.9  # metres that it extends to either side
 APART = np.array([0.015, 0.015, 0.0])  # metres between objects that do not touch
 LONGEST_OBJECT = 0.36  # metres; a longer one is background
 EMPTY_SHARE, FEW_SHARE = 0.03, 0.2  # of the scenes that have no object; one to three
-PACKED_SHARE = 0.4  # of the bins, whose objects lie in level layers
 CROWDED_SHARE = 0.35  # of the tables and floors, with large background close to the objects
 
 
@@ -159,11 +158,10 @@ def _bin(scene: SceneMeshes) -> None:
         heights.put(points)
     fill = rng.uniform(-0.15, 1.5)
     around = rng.uniform(0.3, 1.0) * max(half)
-    how = "packed" if rng.random() < PACKED_SHARE else "heap"
     while fill > 0 and len(scene.centres) < 70:
         if heights.within(half).mean() > fill * depth * 0.9:
             break
-        put = _lay_objects(scene, heights, 3, how, around=around, ceiling=depth + 0.16)
+        put = _lay_objects(scene, heights, 3, "heap", around=around, ceiling=depth + 0.16)
         if not put and rng.random() < 0.3:
             break
     below = -0.013
@@ -521,15 +519,15 @@ def _lay_objects(
     scene: SceneMeshes,
     heights: HeightMap,  # of the surface so far; its origin is `origin` of the scene
     count: int,  # how many are tried
-    how: str,  # `packed`: in layers, as level as they can be
+    how: str,
     origin: Sequence[float] = (0.0, 0.0, 0.0),  # (3,) metres
     around: float = 0.25,  # metres, standard deviation of their places in a heap
     ceiling: float = np.inf,  # metres above which nothing reaches
 ) -> int:
-    """Put objects down: `spread` apart, `touching`, `packed` or in a `heap`; returns how many."""
+    """Put objects down: `spread` apart, `touching`, or in a `heap`; returns how many."""
     rng, put = scene.rng, 0
     pose = ("any", "lying") if how == "heap" else ("upright", "lying")
-    lying = 1.0 if how == "packed" else rng.random()
+    lying = rng.random()
     for _ in range(count):
         drawn = scene.any_of_pool()
         (points, triangles), samples = _turned(rng, drawn, pose[int(rng.random() < lying)])
@@ -539,14 +537,14 @@ def _lay_objects(
         best, offset = np.inf, None  # how low the object comes, and how it is shifted there
         for _ in range(1 if how == "heap" else 10):
             place = rng.uniform(-room, room)
-            if how in ("touching", "heap"):
+            if how != "spread":
                 place = np.clip(rng.normal(0.0, around, 2), -room, room)
             moved = samples + np.array([*place, 0.0])
             apart = [moved, moved + APART, moved - APART] if how == "spread" else [moved]
             below = np.concatenate(apart)
             rise = float((heights.height[heights.cells(below)] - below[:, 2]).max())
             lowest = rise + samples[:, 2].min()
-            if how in ("spread", "touching") and lowest > 0.004:
+            if how != "heap" and lowest > 0.004:
                 continue
             if rise + samples[:, 2].max() < ceiling and lowest < best:
                 best, offset = lowest, np.array([*place, rise])
