@@ -333,6 +333,7 @@ def test_the_server_keeps_to_its_document(start_dummy, tmp_path: Path) -> None:
         command += ["--header", f"Authorization: Bearer {token}"]
         # What the document allows may be shorter than any answer takes: a 504 is no fault.
         command += ["--header", "X-Request-Timeout: 60", "--request-timeout", "60"]
+        command += ["--suppress-health-check", "too_slow"]  # of a busy machine
         checks = ("--checks", ",".join(CHECKS))
         done = run(*command, *checks, *(LONG if long else SHORT), cwd=tmp_path)
         counted = re.search(r"(\d+) generated, (\d+) passed", done.stdout)
