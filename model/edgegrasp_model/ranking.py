@@ -70,7 +70,7 @@ def select(
 ) -> tuple[Int64, NDArray[np.int8]]:
     """Order the scored candidates, drop low scores and near duplicates, keep the first top_k.
 
-    The best good grasp of each object comes before the second of any. Returns the rows to return,
+    A good grasp of each object comes before the second of any. Returns the rows to return,
     best first, and codes (E,) of the outcomes.
     """
     hands = sample.candidates.T_cloud_hand

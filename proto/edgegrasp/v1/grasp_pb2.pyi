@@ -612,10 +612,10 @@ class DetectOptions(_message.Message):
     top_k: _builtins.int
     """Grasps returned at most."""
     order: _builtins.str
-    """Score: by score and, where scores are close, by how the hand lies, the best grasp of each object
-    first if it has 0.5 or more; highest: by height of the TCP along up among scores of 0.9 and
-    more, then the others by score; clearance: by clearance. One of "score", "highest",
-    "clearance".
+    """Score: by score and, where scores are close, by how the hand lies; first a grasp of each object
+    that has one of 0.5 or more, surrounded by other good ones; highest: by height of the TCP along
+    up among scores of 0.9 and more, then the others by score; clearance: by clearance. One of
+    "score", "highest", "clearance".
     """
     debug: _builtins.bool
     """Whether to return the processed cloud and every candidate."""
