@@ -333,7 +333,8 @@ class GraspDetector:
         with prepared.timed("network"):
             score = expit(logits / self.metadata.temperature)
             score *= object_probability(scene, candidates.contact_index)
-            free = ~collides(scene, candidates.T_cloud_hand, gripper, request)
+            hands = candidates.T_cloud_hand, candidates.opening
+            free = ~collides(scene, *hands, gripper, request)
             if given.T_cloud_hand is not None:
                 candidates = replace(candidates, T_cloud_hand=given.T_cloud_hand)
             grasps = grasps_in_cloud(scene, candidates, gripper, score, free)

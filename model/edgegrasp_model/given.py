@@ -127,7 +127,8 @@ def from_hand_poses(
     a, c = approach[found], view.row[contact[found]]
     edge = scene.cloud.points[c] - scene.cloud.points[a]
     depth = np.maximum(np.einsum("ed,ed->e", edge, pose[:, :3, 2]), 0.0)
-    return Given(Candidates(found, a, c, depth, pose), reason, given)
+    opening = 2 * np.abs(view.position[1, contact[found]])
+    return Given(Candidates(found, a, c, depth, opening, pose), reason, given)
 
 
 def _approach_points(view: HandView, contact: Int64, crop_radius: float) -> Int64:

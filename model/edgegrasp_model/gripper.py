@@ -56,10 +56,7 @@ class Gripper:
     @cached_property
     def max_tip_z(self) -> float:
         """Most forward position of the fingertips while closing, metres along z."""
-        if self.linkage is None:
-            return self.tip_z
-        upright = self.max_opening - 2 * self.linkage.reach  # the links point straight ahead there
-        return self.tip_z + float(self.tip_advance(upright))
+        return self.tip_z + float(self.furthest_advance(0.0))
 
     def between_fingers(self, position: Floats) -> Bools:
         """Which points (3, P), hand frame, lie between the pads as the open fingers close."""
@@ -76,6 +73,12 @@ class Gripper:
         outward = reach - (self.max_opening - np.clip(opening, 0.0, self.max_opening)) / 2
         advance: Floats = np.sqrt(radius**2 - outward**2) - np.sqrt(radius**2 - reach**2)
         return advance
+
+    def furthest_advance(self, opening: ArrayLike) -> Floats:
+        """The greatest `tip_advance` until it has closed to an opening (...)."""
+        reach = 0.0 if self.linkage is None else self.linkage.reach
+        upright = self.max_opening - 2 * reach  # the links point straight ahead there
+        return self.tip_advance(np.maximum(opening, upright))
 
     def contact_z_at(self, opening: ArrayLike) -> Float32:
         """Metres along z of a contact, inside the fingertips, by opening (...), metres."""

@@ -165,7 +165,7 @@ def _stance(around: Surroundings, candidates: Candidates, gripper: Gripper) -> l
     heights = [
         tips @ normal - support.offset,
         contact @ normal - support.offset,
-        support_clearance(pose, support, gripper),
+        support_clearance(pose, candidates.opening, support, gripper),
     ]
     return columns + [np.clip(h, -UNKNOWN_HEIGHT, UNKNOWN_HEIGHT) for h in heights]
 

@@ -73,10 +73,12 @@ def select(
     A good grasp of each object comes before the second of any. Returns the rows to return,
     best first, and codes (E,) of the outcomes.
     """
-    hands = sample.candidates.T_cloud_hand
+    candidates = sample.candidates
+    hands, contact = candidates.T_cloud_hand, candidates.contact_index
     T_cloud_tcp = hands @ gripper.T_hand_tcp
-    clearance = clearances(scene, hands, gripper) if options.order == "clearance" else None
-    contact = sample.candidates.contact_index
+    clearance = None
+    if options.order == "clearance":
+        clearance = clearances(scene, hands, candidates.opening, gripper)
     order, worth = ranked(
         scene, contact, hands, rating, sample.collision_free, gripper, options, clearance
     )
@@ -184,7 +186,7 @@ def grasps_in_cloud(
     width = 2 * (np.abs(met).max(axis=1) + np.float32(FINGER_CLEARANCE))
     widest = np.float32(gripper.max_opening)
     width = np.where(hidden, widest, np.minimum(width, widest))
-    clearance = clearances(scene, candidates.T_cloud_hand, gripper)
+    clearance = clearances(scene, candidates.T_cloud_hand, candidates.opening, gripper)
     number = scene.object_of_point[candidates.contact_index]
     return [
         Grasp(

@@ -273,5 +273,7 @@ def _candidates(view: LabelledView, cloud: Cloud, rows: Int64) -> Candidates:
     pose = view.T_world_hand[rows]
     edge = view.points[contact_index] - view.points[approach_index]  # (E, 3)
     depth = np.maximum(np.einsum("ed,ed->e", edge, pose[:, :3, 2]), 0.0)
+    outward = view.points[contact_index] - pose[:, :3, 3]
+    opening = 2 * np.abs(np.einsum("ed,ed->e", outward, pose[:, :3, 1]))
     pair = np.arange(len(rows), dtype=np.int64)
-    return Candidates(pair, approach_index, contact_index, depth, pose)
+    return Candidates(pair, approach_index, contact_index, depth, opening, pose)

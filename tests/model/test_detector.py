@@ -287,7 +287,7 @@ def test_a_palm_in_space_that_no_camera_saw_counts_as_colliding(camera, edge, bl
     plate = np.stack([np.full_like(y, -0.1), y, z], axis=-1).reshape(-1, 3).astype(np.float32)
     viewpoints = None if camera is None else np.array([camera], dtype=np.float32)
     behind, hand = scene_of(plate, viewpoints=viewpoints), np.eye(4, dtype=np.float32)[None]
-    assert collides(behind, hand, PANDA, Collision()).tolist() == [blocked]
+    assert collides(behind, hand, np.float32([0.04]), PANDA, Collision()).tolist() == [blocked]
 
 
 def test_hands_that_reach_out_of_the_image_come_last() -> None:

@@ -8,7 +8,7 @@ import pytest
 from tests.checks import refusal
 from tests.many_options import OWN_GRIPPER
 
-from edgegrasp_model.candidates.edge_grasps import TIP_MARGIN, support_clearance
+from edgegrasp_model.candidates.edge_grasps import CLOSED_FURTHER, TIP_MARGIN, support_clearance
 from edgegrasp_model.candidates.outline import MAX_INSERTION
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.errors import InvalidGripper
@@ -34,9 +34,11 @@ def test_a_gripper_stays_clear_of_the_support_as_it_closes(gripper: Gripper) -> 
     down = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)[None]
     down[0, 2, 3] = 0.5
     floor = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.0)
-    clearance = support_clearance(down, floor, gripper)[0]
-    lowest = min(0.5 - gripper.boxes(w)[:, 1, 2].max() for w in np.linspace(0, 0.08, 40))
-    assert clearance == pytest.approx(lowest, abs=1e-5)
+    for opening in (0.0, 0.03, 0.06, 0.085):
+        clearance = support_clearance(down, np.float32([opening]), floor, gripper)[0]
+        closed = np.linspace(max(opening - CLOSED_FURTHER, 0.0), gripper.max_opening, 80)
+        lowest = min(0.5 - gripper.boxes(w)[:, 1, 2].max() for w in closed)
+        assert clearance == pytest.approx(lowest, abs=2e-5)
 
 
 @pytest.mark.parametrize(

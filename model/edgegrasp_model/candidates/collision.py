@@ -31,6 +31,7 @@ TOUCH = 1e-6  # metres between the support plane and a hand that was retracted f
 def collides(
     scene: Scene,
     T_cloud_hand: Float32,  # (E, 4, 4), canonical frame
+    opening: Float32,  # (E,) metres between the fingers when they touch the object
     gripper: Gripper,  # fingers open to the maximum
     request: Collision,
 ) -> Bools:
@@ -55,7 +56,7 @@ def collides(
         hit[free] = any_point_on_way(hands, boxes, hands.turn @ (lift * UP))
     if scene.support is not None:
         normal = np.asarray(scene.support.normal)
-        height = support_clearance(T_cloud_hand, scene.support, gripper)
+        height = support_clearance(T_cloud_hand, opening, scene.support, gripper)
         rise = -T_cloud_hand[:, :3, 2] @ normal  # per metre of way back
         lowest = np.minimum(height, height + behind * rise)
         lowest = np.minimum(lowest, height + lift * (UP @ normal))
@@ -83,7 +84,7 @@ def closes_on_background(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) 
     return np.bincount(hand, minlength=len(T_cloud_hand)) >= MIN_FIXED
 
 
-def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
+def clearances(scene: Scene, T_cloud_hand: Float32, opening: Float32, gripper: Gripper) -> Float32:
     """Metres (E,) from open hands (E, 4, 4) at the grasp to the nearest point, support or obstacle.
 
     Canonical frame. Negative: the greatest depth at which something lies inside a box of the hand.
@@ -91,7 +92,8 @@ def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32
     boxes = gripper.open_boxes
     nearest = signed_distance_to_boxes(in_hands(scene.cloud.points, T_cloud_hand), boxes)
     if scene.support is not None:
-        nearest = np.minimum(nearest, support_clearance(T_cloud_hand, scene.support, gripper))
+        above = support_clearance(T_cloud_hand, opening, scene.support, gripper)
+        nearest = np.minimum(nearest, above)
     if scene.obstacles is not None:
         solid = SolidBoxes.of_hands(T_cloud_hand, boxes)
         for place in range(len(scene.obstacles)):

@@ -19,6 +19,7 @@ MIN_EDGE = 0.003  # metres between approach and contact point
 EDGE_MARGIN = 0.002  # metres an edge stays below half the opening
 MIN_DEPTH = 1e-4  # metres; a shallower edge has no approach direction
 TIP_MARGIN = 0.002  # metres a contact stays inside the fingertips when the hand retracts
+CLOSED_FURTHER = 0.01  # metres by which an object may be narrower than it seems
 WIDE = 0.75  # share of the opening from which an object counts as wide
 BESIDE_PADS = 0.004  # metres beside the finger pads in which points count
 CELLS = tuple(0.04 * 0.7**level for level in range(8))  # metres, of grids over points
@@ -86,6 +87,7 @@ class Candidates:
     approach_index: Int64  # (E,) p_a, rows of the cloud
     contact_index: Int64  # (E,) p_c, rows of the cloud
     depth: Float32  # (E,) d, metres the contact lies ahead of the approach point
+    opening: Float32  # (E,) metres between the fingers when they touch the object
     T_cloud_hand: Float32  # (E, 4, 4)
 
     def __len__(self) -> int:
@@ -100,7 +102,7 @@ class Candidates:
     def none() -> "Candidates":
         """No candidate."""
         rows, numbers = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
-        return Candidates(rows, rows, rows, numbers, np.empty((0, 4, 4), np.float32))
+        return Candidates(rows, rows, rows, numbers, numbers, np.empty((0, 4, 4), np.float32))
 
     @staticmethod
     def concatenate(parts: Sequence["Candidates"]) -> "Candidates":
@@ -126,7 +128,8 @@ def edge_grasps(
     pair = np.flatnonzero(~np.any(list(faults_of(edge, gripper).values()), axis=0))
     approach_index, contact_index = approach_index[pair], contact_index[pair]
     normal, depth = edge.normal[pair], edge.depth[pair]
-    contact_z = gripper.contact_z_at(2 * np.abs(edge.along[pair]))
+    opening = 2 * np.abs(edge.along[pair])
+    contact_z = gripper.contact_z_at(opening)
     z = edge.ahead[pair] / depth[:, None]
     y = normal - np.einsum("ed,ed->e", normal, z)[:, None] * z
     y = y / np.linalg.norm(y, axis=1, keepdims=True)
@@ -134,7 +137,7 @@ def edge_grasps(
     pose[:, :3, :3] = np.stack([np.cross(y, z), y, z], axis=2)
     pose[:, :3, 3] = cloud.points[approach_index] + (depth - contact_z)[:, None] * z
     pose[:, 3, 3] = 1.0
-    return Candidates(pair, approach_index, contact_index, depth, pose)
+    return Candidates(pair, approach_index, contact_index, depth, opening, pose)
 
 
 class EdgeMeasures(NamedTuple):
@@ -176,25 +179,36 @@ def retract(
     on a table are held by the tips. Returns the candidates, and a mask (E,) of those whose hand is
     `margin` metres above the plane now; the other hands are unchanged.
     """
-    clearance = support_clearance(candidates.T_cloud_hand, support, gripper) - margin
+    pose, opening = candidates.T_cloud_hand, candidates.opening
+    clearance = support_clearance(pose, opening, support, gripper) - margin
     rise = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
         back = np.where(clearance >= 0, 0.0, -clearance / rise)
     clear = (back >= 0) & (back <= gripper.tip_z - gripper.contact_z - TIP_MARGIN)
-    pose = candidates.T_cloud_hand.copy()
+    pose = pose.copy()
     pose[clear, :3, 3] += back[clear, None] * candidates.approach[clear]
     return replace(candidates, T_cloud_hand=pose), clear
 
 
-def support_clearance(T_cloud_hand: Float32, support: SupportPlane, gripper: Gripper) -> Float32:
-    """Height (E,), metres, of each hand's lowest corner over the support as it closes."""
-    boxes = gripper.boxes(gripper.max_opening, gripper.max_tip_z - gripper.tip_z)
+def support_clearance(
+    T_cloud_hand: Float32,  # (E, 4, 4)
+    opening: Float32,  # (E,) metres between the fingers when they touch the object
+    support: SupportPlane,
+    gripper: Gripper,
+) -> Float32:
+    """Height (E,), metres, of each hand's lowest corner over the support as it closes.
+
+    Fingers that swing forward are assumed to close CLOSED_FURTHER metres beyond that opening.
+    """
+    boxes = gripper.open_boxes
     middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2  # (B, 3) each
     x, y, z = support.normal
     rows = T_cloud_hand.astype(np.float64)
     along = x * rows[:, 0] + y * rows[:, 1] + z * rows[:, 2]  # (E, 4): of the axes, the origin
     normal_in_hand, origin_height = along[:, :3], along[:, 3] - support.offset
     corners = normal_in_hand @ middle.T - np.abs(normal_in_hand) @ half.T  # (E, B)
+    ahead = gripper.furthest_advance(opening - CLOSED_FURTHER)
+    corners[:, len(gripper.hand_boxes) :] += (normal_in_hand[:, 2] * ahead)[:, None]
     clearance: Float32 = origin_height + np.min(list(corners.T), axis=0)
     return clearance.astype(np.float32)
 
@@ -226,6 +240,6 @@ def centred_grasps(
     middle, width = (low + high) / 2, high - low
     moved = (width > WIDE * gripper.max_opening) & (width < gripper.max_opening)
     moved &= (np.abs(middle) > MIN_SHIFT) & (np.abs(middle) < MAX_SHIFT)
-    further = candidates.take(wide[moved])
+    further = replace(candidates.take(wide[moved]), opening=width[moved])
     further.T_cloud_hand[:, :3, 3] += middle[moved, None] * further.T_cloud_hand[:, :3, 1]
     return further

@@ -116,7 +116,7 @@ def outline_grasps(
     pose[:, :3, 3] = middle - gripper.contact_z_at(width)[:, None] * z
     pose[:, 3, 3] = 1.0
     depth = np.maximum(edge[2][row], 0.0)
-    hands = Candidates(pair[row], approach[row], contact, depth, pose)
+    hands = Candidates(pair[row], approach[row], contact, depth, width, pose)
     return _inserted(points, hands, support, gripper, margin)
 
 
@@ -132,7 +132,8 @@ def _inserted(
     room = np.full(len(candidates), np.inf, dtype=np.float32)  # metres of way above the support
     if support is not None:
         fall = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
-        height = support_clearance(candidates.T_cloud_hand, support, gripper) - margin
+        pose, opening = candidates.T_cloud_hand, candidates.opening
+        height = support_clearance(pose, opening, support, gripper) - margin
         room = np.where(fall > LEVEL, height / np.maximum(fall, LEVEL), room)
     enough = np.flatnonzero(room >= least)
     candidates = candidates.take(enough)

@@ -172,7 +172,9 @@ class Sampler:
         most = OVERSAMPLING * self.options.num_candidates
         row = passed[random_rows(len(passed), most, self._rng)]
         outcome[passed] = CODE[Outcome.NOT_CHECKED]
-        free = ~collides(self.scene, candidates.T_cloud_hand[row], self.gripper, rule)
+        checked = candidates.take(row)
+        hands = checked.T_cloud_hand, checked.opening
+        free = ~collides(self.scene, *hands, self.gripper, rule)
         outcome[row] = CODE[Outcome.NOT_SCORED]
         if rule.mode != "ignore":
             outcome[row[~free]] = CODE[Outcome.COLLISION]
