@@ -300,10 +300,31 @@ def _chain(path: Path, root: Element, file: RobotFile) -> list[Element]:
         fix = f"Name a link that carries {file.flange_frame!r}."
         raise InvalidRobot(f"{path.name}: base_frame: got {file.base_frame!r}. {fix}")
     between = above[: carrying.index(file.base_frame)]
+    for joint in between:
+        _check_joint(path, joint)
     joints = [joint for joint in between if joint.get("type") in MOVING]
     if not joints:
         raise InvalidRobot(f"{path.name}: flange_frame: no joint moves it. Name the last link.")
     return joints[::-1]
+
+
+def _check_joint(path: Path, joint: Element) -> None:
+    """Raise InvalidRobot for a joint of the arm that cannot be planned with."""
+    kind, limit = joint.get("type"), joint.find("limit")
+    said = f"{path.name}: urdf: joint {joint.get('name')}"
+    if joint.find("mimic") is not None or kind not in (*MOVING, "fixed"):
+        why = f"is {kind}" if joint.find("mimic") is None else "follows another one (mimic)"
+        fix = f"Name a base and a flange between which joints are independent: {', '.join(MOVING)}."
+        raise InvalidRobot(f"{said} {why}. {fix}")
+    if kind in ("revolute", "prismatic"):
+        ends = ["none" if limit is None else limit.get(end, "none") for end in ("lower", "upper")]
+        try:
+            usable = -np.inf < float(ends[0]) <= float(ends[1]) < np.inf
+        except ValueError:
+            usable = False
+        if not usable:
+            fix = "Give its <limit> both, lower below upper."
+            raise InvalidRobot(f"{said}: got limits {' and '.join(ends)}. {fix}")
 
 
 def _cut_beyond(root: Element, flange: str) -> set[str]:

@@ -85,6 +85,9 @@ def test_meshes_lie_beside_their_urdf_and_one_that_is_wrong_says_how(tmp_path, m
         ("tip.obj", "package://lost/a.stl", r"mesh of tip: there is no 'package://lost/a\.stl'"),
         ('<parent link="tip"/>', "", "joint end has no parent"),
         ('velocity="1"', 'velocity="0"', r"max_velocity: got \[0\.0\]"),
+        ('lower="-1" upper="1"', "", "joint turn: got limits none and none"),
+        ("<axis", '<mimic joint="other"/><axis', "joint turn follows another one"),
+        ('"revolute"', '"planar"', "joint turn is planar"),
     ):
         (tmp_path / "arm" / "r.urdf").write_text(URDF.replace(known, now))
         with pytest.raises(InvalidRobot, match=said):
