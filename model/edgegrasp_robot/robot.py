@@ -201,11 +201,15 @@ def _load(path: Path, file: RobotFile) -> Robot:
         link for link in links if not any(one.get("type") in MOVING for one in _above(root, link))
     ]
     model = Model(arm, as_text(root), links, standing, allowed)
-    for link in shaped:
-        for shape in link.findall("collision"):
+    scenes = [model.scene(file) for _ in range(3)]
+    for name, link in zip(links, shaped, strict=True):
+        shapes = link.findall("collision")
+        if len(scenes[0].getCollisionGeometryIDs(name)) < len(shapes):  # the parser goes on without
+            fix = "Correct its size or scale."
+            raise InvalidRobot(f"{path.name}: urdf: a <collision> of {name} is wrong. {fix}")
+        for shape in shapes:
             link.remove(shape)
     bare = replace(model, urdf=as_text(root), allowed=[]).scene(file)
-    scenes = [model.scene(file) for _ in range(3)]
     lower, upper = scenes[0].getPositionLimitVectors(GROUP)
     home = np.array(file.home) if file.home else np.clip(0.0, lower, upper)
     if ((home < lower) | (home > upper)).any():

@@ -88,6 +88,7 @@ def test_meshes_lie_beside_their_urdf_and_one_that_is_wrong_says_how(tmp_path, m
         ('lower="-1" upper="1"', "", "joint turn: got limits none and none"),
         ("<axis", '<mimic joint="other"/><axis', "joint turn follows another one"),
         ('"revolute"', '"planar"', "joint turn is planar"),
+        ('<mesh filename="tip.obj"/>', '<box size="-1 1 1"/>', "a <collision> of tip is wrong"),
     ):
         (tmp_path / "arm" / "r.urdf").write_text(URDF.replace(known, now))
         with pytest.raises(InvalidRobot, match=said):
