@@ -162,7 +162,7 @@ def load_robot(name_or_path: str | Path) -> Robot:
         raise InvalidRobot(f"{path.name}: {field}: {first['msg']}; see fr3.toml.") from None
     except (InvalidGripper, tomllib.TOMLDecodeError) as error:
         raise InvalidRobot(f"{path.name}: {error}") from None
-    except (RuntimeError, ValueError, ElementTree.ParseError, xacro.XacroException) as error:
+    except (RuntimeError, ValueError) as error:
         raise InvalidRobot(f"{path.name}: urdf: {error}") from None
 
 
@@ -170,10 +170,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     packages = [str(path.parent / folder) for folder in file.packages]
     packages.append(str(get_package_share_dir()))
     urdf = _located(path, "urdf", file.urdf, packages)
-    text = urdf.read_text("utf-8")
-    if "xacro:" in text:
-        text = xacro.process_file(str(urdf)).toxml()
-    root = ElementTree.fromstring(text)
+    root = _tree(path, "urdf", urdf)
     joints = _chain(path, root, file)
     joint_names = [str(joint.get("name")) for joint in joints]
     if not file.max_acceleration:
@@ -196,7 +193,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     shaped = [link for link in root.findall("link") if link.find("collision") is not None]
     links = [str(link.get("name")) for link in shaped]
     srdf = _located(path, "srdf", file.srdf, packages) if file.srdf else None
-    allowed = _allowed(srdf, links, beyond)
+    allowed = _allowed(_tree(path, "srdf", srdf) if srdf else None, links, beyond)
     standing = [
         link for link in links if not any(one.get("type") in MOVING for one in _above(root, link))
     ]
@@ -272,6 +269,22 @@ def _located(path: Path, field: str, name: str, packages: Sequence[str]) -> Path
             return place.absolute()
     fix = "Name a file beside this one, or add the folder of its package to `packages`"
     raise InvalidRobot(f"{path.name}: {field}: there is no {brief(name)}. {fix}.")
+
+
+def _tree(path: Path, field: str, file: Path) -> Element:
+    """The XML of a URDF or SRDF, xacro expanded with the defaults of its arguments."""
+    try:
+        text = file.read_text("utf-8")
+        root = ElementTree.fromstring(text)
+    except (ValueError, ElementTree.ParseError) as error:
+        raise InvalidRobot(f"{path.name}: {field}: {file.name} is no XML: {error}") from None
+    if "xacro:" not in text:
+        return root
+    try:
+        return ElementTree.fromstring(xacro.process_file(str(file)).toxml())
+    except (RuntimeError, xacro.XacroException) as error:
+        fix = "Run xacro yourself, with the arguments that it needs, and name what it writes."
+        raise InvalidRobot(f"{path.name}: {field}: {error}. {fix}") from None
 
 
 def _link(joint: Element, which: str) -> str:
@@ -404,10 +417,10 @@ def _check_meshes(urdf: Path, root: Element, packages: Sequence[str]) -> None:
             link.remove(visual)
 
 
-def _allowed(srdf: Path | None, links: Sequence[str], beyond: set[str]) -> list[tuple[str, str]]:
+def _allowed(srdf: Element | None, links: Sequence[str], beyond: set[str]) -> list[tuple[str, str]]:
     """Pairs of links that may touch; links beyond the flange count as the hand."""
     pairs = set()
-    for one in ElementTree.parse(srdf).getroot().findall("disable_collisions") if srdf else ():
+    for one in () if srdf is None else srdf.findall("disable_collisions"):
         names = [str(one.get(which)) for which in ("link1", "link2")]
         first, second = sorted(HAND if name in beyond else name for name in names)
         if first != second and {first, second} <= set(links):
