@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 from typer import Argument, Option, Typer
 
+from edgegrasp_model.errors import EdgeGraspError
+
 robot = Typer(help="Make and check robot files.", no_args_is_help=True)
 
 NO_OFFSET = """
@@ -14,6 +16,7 @@ NO_OFFSET = """
 position = [0.0, 0.0, 0.0]
 quaternion = [0.0, 0.0, 0.0, 1.0]
 """
+TO_EDIT = ("home", "max_velocity", "max_acceleration")  # fields that the command does not set
 Links = Annotated[str, Option(help="Link of the URDF.")]
 
 
@@ -44,8 +47,15 @@ def add(
     }
     lines = [f"{name} = {json.dumps(value)}\n" for name, value in fields.items()]
     output.write_text("".join([*lines, NO_OFFSET]))
-    print(f"{output}: now set T_flange_hand, and home, max_velocity, max_acceleration if need be.")
-    check(output)
+    try:
+        check(output)
+    except EdgeGraspError as error:
+        if not any(f": {field}: " in str(error) for field in TO_EDIT):
+            output.unlink()  # it needs other arguments, not an edit
+        raise
+    finally:
+        if output.exists():
+            print(f"{output}: now set T_flange_hand, and {', '.join(TO_EDIT)} if need be.")
 
 
 @robot.command()

@@ -17,8 +17,9 @@ UR5 = Path(str(get_package_models_dir())) / "ur_robot_model" / "ur5_gripper.urdf
 LINKS = ("--base", "base_link", "--flange", "tool0")
 
 
-def test_a_robot_file_of_a_urdf_loads(run, tmp_path: Path) -> None:
+def test_a_robot_file_of_a_urdf_loads(run, refused, tmp_path: Path) -> None:
     file = tmp_path / "mine.toml"
+    assert "got 'tool9'" in refused("robot", "add", UR5, *LINKS[:3], "tool9", "--output", file)
     shown = run("robot", "add", UR5, *LINKS, "--gripper", "robotiq-2f-85", "--output", file)
     assert "hand at home: 0.817 0.191" in shown
     assert load_robot(file).joint_names == load_robot("ur5").joint_names
