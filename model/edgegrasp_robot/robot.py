@@ -277,7 +277,7 @@ def _tree(path: Path, field: str, file: Path) -> Element:
         text = file.read_text("utf-8")
         root = ElementTree.fromstring(text)
     except (ValueError, ElementTree.ParseError) as error:
-        raise InvalidRobot(f"{path.name}: {field}: {file.name} is no XML: {error}") from None
+        raise InvalidRobot(f"{path.name}: {field}: {file.name} is not XML: {error}") from None
     if "xacro:" not in text:
         return root
     try:
