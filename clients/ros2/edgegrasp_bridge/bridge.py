@@ -134,7 +134,7 @@ class Inbox:
         Raises:
             ValueError: The mask is too old, or the image that it was made of has not come.
         """
-        sources = self._clouds or self._depths
+        sources = list(self._clouds or self._depths)  # others may come meanwhile
         if not sources:
             return Scene(joints=self._joints)
         source, mask = sources[-1], self._mask if mask_age > 0 else None
@@ -147,9 +147,9 @@ class Inbox:
             if not same:
                 raise ValueError("No image has the stamp of the mask. Copy the image's header.")
             source = same[-1]
-        if sources is self._clouds:
+        if self._clouds:
             return Scene(cloud=source, mask=mask, joints=self._joints)
-        latest = {each.header.frame_id: each for each in self._depths} if mask is None else {}
+        latest = {each.header.frame_id: each for each in sources} if mask is None else {}
         latest.pop(source.header.frame_id, None)
         others = tuple((each, self._camera_of(each)) for each in latest.values())
         camera = self._camera_of(source)

@@ -54,6 +54,10 @@ class EdgeGraspNode(Node):
         self._before = self.create_publisher(PoseArray, "pregrasps", 1)
         self._markers = self.create_publisher(MarkerArray, "grasp_markers", 1)
         inputs, actions = MutuallyExclusiveCallbackGroup(), ReentrantCallbackGroup()
+        # Apart from the inputs, so that they do not queue up while a detection runs.
+        self._news = self.create_guard_condition(
+            self._detect_newest, MutuallyExclusiveCallbackGroup()
+        )
         self._motions = [self.create_publisher(JointTrajectory, name, 1) for name in MOTIONS]
         for topic, (kind, field) in INPUTS.items():
             take = partial(self._take, field)
@@ -82,10 +86,13 @@ class EdgeGraspNode(Node):
         mask_age = self.get_parameter("mask_age").value
         new = self._inbox.take(field, message, mask_age)
         if new and self.get_parameter("on_message").value:
-            try:
-                self._detect(follow=self.get_parameter("follow").value)
-            except Exception as error:  # tf2's too: the node goes on with the next message
-                self.get_logger().warning(f"{type(error).__name__}: {error}")
+            self._news.trigger()
+
+    def _detect_newest(self) -> None:
+        try:
+            self._detect(follow=self.get_parameter("follow").value)
+        except Exception as error:  # tf2's too: the node goes on with the next message
+            self.get_logger().warning(f"{type(error).__name__}: {error}")
 
     def _detect(self, object_cloud: Any = None, follow: bool = False) -> Any:
         settings, options = self._read()
