@@ -66,7 +66,9 @@ def read_file(file_format: str, data: bytes, max_points: int) -> CloudInput:
 
 def pixels(file: Path) -> Array:
     """The values of an image file, .png or .npy: (H, W), or (H, W, C) of several channels."""
-    read = read_png if file.suffix.lower() == ".png" else read_npy
+    if (kind := file.suffix.lower()) not in (".png", ".npy"):
+        raise UnsupportedMediaType(file.name, repr(file.suffix), "Give a .png or .npy file.")
+    read = read_png if kind == ".png" else read_npy
     return read(file.read_bytes(), sys.maxsize, file.name)
 
 

@@ -305,6 +305,8 @@ def _depth_fields(depth: object, path: str) -> dict[str, Any]:
         try:
             if file.suffix.lower() == ".png":
                 return {"encoding": "png", "data": file.read_bytes()}
+            if file.suffix.lower() != ".npy":
+                raise ValueError("neither .png nor .npy")
             depth = np.load(file, allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
             raise invalid(path, f"{file} ({error})", fix) from None

@@ -162,6 +162,7 @@ def test_input_that_cannot_be_used_is_named(
         ((depth, "--intrinsics", "300"), "depth_images.0.intrinsics: got 300"),
         ((depth.removeprefix("--depth="),), "a depth image as `depth` with `intrinsics`"),
         ((file, mask), "768 values for a cloud of 500 rows"),
+        ((file, "--mask", unknown), "cloud.las: got '.las'. Give a .png or .npy file."),
     ):
         assert sentence in refused("detect", *flags)
 
