@@ -52,7 +52,7 @@ class Settings(BaseModel):
     """where detectors compute: cpu, cuda, cuda:N, or auto: the first GPU, else cpu"""
     max_body_bytes: int = Field(32 * MIB, ge=1024, le=1024 * MIB)
     """largest request body accepted"""
-    max_points: Count = 2_000_000
+    max_points: Count = 2_500_000
     """most points in a cloud, before downsampling"""
     max_voxels: Count = 200_000
     """most points in a cloud, after downsampling"""

@@ -83,8 +83,8 @@ CASES = {
         point_cloud2=ros(fields=[*ros()["fields"][:2], {**ros()["fields"][2], "datatype": 5}]),
     ),
     "PointCloud2 of too many points": Malformed(
-        "point_cloud2", "2000001 points", "2000000", kind="payload-too-large",
-        point_cloud2=ros(width=2_000_001),
+        "point_cloud2", "2500001 points", "2500000", kind="payload-too-large",
+        point_cloud2=ros(width=2_500_001),
     ),
     # Depth images.
     "depth image cut short": Malformed(
