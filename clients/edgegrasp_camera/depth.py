@@ -123,6 +123,10 @@ def fuse_depth_images(depths: Sequence[Array], views: Sequence[Any]) -> CloudInp
         pose = np.array(view.T_cloud_camera, dtype=np.float64)
         clouds.append(unproject(found, view.intrinsics, pose))
         cameras.append(tuple(pose[:3, 3].tolist()))
+    if all(np.isnan(cloud[..., 2]).all() for cloud in clouds):
+        raise InvalidRequest("depth_images", "no reading", "Send a depth above 0 somewhere.")
+    if len({*cameras}) < len(cameras):
+        doubts.append("depth_images: two cameras are in one place: send T_cloud_camera of each.")
     if len(views) == 1:
         return CloudInput(clouds[0], viewpoint=cameras[0], warnings=tuple(doubts))
     together = np.concatenate([cloud.reshape(1, -1, 3) for cloud in clouds], axis=1)

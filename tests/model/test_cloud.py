@@ -281,6 +281,8 @@ def test_views_are_fused_and_doubtful_intrinsics_get_a_warning() -> None:
     for some in (images[1:2], images[:2]):
         (warning,) = read_depth_images(some, MANY).warnings
         assert f"depth_images.{len(some) - 1}.intrinsics: cx 8 lies far from the" in warning
+    (warning,) = read_depth_images(images[2:] * 2, MANY).warnings
+    assert "two cameras are in one place" in warning
 
 
 # sensor_msgs/PointCloud2

@@ -94,6 +94,9 @@ CASES = {
         "depth_images.0.depth", "-0.5 m", "0 or NaN",
         depth_images=[image(data=np.full(80, -0.5, "<f4").tobytes())],
     ),
+    "depth images without a reading": Malformed(
+        "depth_images", "no reading", "above 0", depth_images=[image(data=bytes(320))] * 2
+    ),
     "no focal length": Malformed(
         "depth_images.0.intrinsics.fx", "0.0", "greater than 0", depth_images=[image(fx=0.0)]
     ),
