@@ -425,3 +425,6 @@ def test_the_offset_of_the_support_is_along_its_unit_normal() -> None:
     plane = {"normal": [0.0, 0.0, 1.0009], "offset": 1.0009 * 50.0}
     found = detector().detect(cloud, parse_options({"support": plane, "objects": "off"})).support
     assert found.offset == pytest.approx(50.0, abs=1e-4)
+    plane = {"normal": [0.0, 0.0, 1.0], "offset": 0.0}
+    far = detector().detect(cloud, parse_options({"support": plane, "objects": "off"})).warnings
+    assert any("plane lies 50 m below everything" in warning for warning in far)

@@ -117,6 +117,12 @@ def choose_support(
         around = np.inf if options.follows_only else BELOW_WORKSPACE * np.abs(request.normal)
         over = np.flatnonzero(inside_workspace(seen.points, options.workspace, around))
         some = over[thinned(len(over))]
+        below = float(request.heights(seen.points[some]).min(initial=np.inf))
+        if options.max_object_size < below < np.inf:
+            warnings.append(
+                f"the given support plane lies {below:.3g} m below everything that is seen: check "
+                "its frame, normal, and offset in metres."
+            )
         on = np.empty(0, np.int64) if shown is None else np.flatnonzero(shown.support > 0.5)
         part = seen.points[on[thinned(len(on))]]
         # Where a support was cut off, only flat tops may be classified as support.
