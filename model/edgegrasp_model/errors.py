@@ -33,6 +33,12 @@ def parse(schema: type[Schema], fields: object, name: str, known: Iterable[str] 
         raise InvalidRequest(field, "no base64", "Send base64 in JSON.")
     if kind == "union_tag_invalid":
         fix = f"Set its kind to one of {first['ctx']['expected_tags']}"
+    if kind == "model_type":
+        fix = f"Send an object as {first['ctx']['class_name']}"
+    if kind == "tuple_type":
+        fix = "Send a list"
+    if kind in ("too_short", "too_long"):  # "Tuple should have at least 3 items after validation"
+        fix = "Send" + fix.partition(" should have")[2].partition(" after")[0]
     if kind == "union_tag_not_found":
         fix = "Send an object that names its kind"
     raise InvalidRequest(field, value, f"{fix[:1].upper()}{fix[1:]}.")

@@ -219,7 +219,7 @@ class DepthImage(Strict):
     intrinsics: Annotated[
         Intrinsics,
         BeforeValidator(
-            lambda sent: intrinsics_of(sent)._asdict() if isinstance(sent, list) else sent,
+            lambda sent: sent if isinstance(sent, Mapping) else intrinsics_of(sent)._asdict(),
             json_schema_input_type=Intrinsics | list[float] | list[list[float]],
         ),
     ] = Field(description="by name, or fx, fy, cx, cy, or the 3 x 3 matrix")
@@ -265,6 +265,9 @@ def _depth(depth: object, max_points: int, field: str) -> Array:
     if isinstance(depth, list):
         rows: Array = _numbers(field, [depth], holes=True)[0]
         return rows.astype(np.float64)
+    if not isinstance(depth, Mapping):
+        fix = "Send a .png or .npy file (depth=@FILE), rows of metres, or an object as Depth."
+        raise InvalidRequest(field, brief(depth), fix)
     image = parse(Depth, depth, field)
     if image.encoding == "png":
         return read_png(image.data, max_points, f"{field}.data")

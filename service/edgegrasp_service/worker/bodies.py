@@ -24,7 +24,7 @@ from werkzeug.http import parse_options_header
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_camera.files import FILE_FORMATS
 from edgegrasp_model.errors import InvalidRequest, brief
-from edgegrasp_model.options import MAX_CANDIDATES, MAX_ROWS
+from edgegrasp_model.options import MAX_CANDIDATES, MAX_ROWS, DetectOptions
 from edgegrasp_model.request_cloud import (
     CAMERA,
     GIVEN,
@@ -120,6 +120,8 @@ def _refuse_unknown(fields: Iterable[str], known: tuple[str, ...], kind: str) ->
         if name not in known:
             *names, last = known
             fix = f"Send {', '.join(names)} and {last} only."
+            if name in DetectOptions.model_fields:
+                fix = "Send it in `options`."
             raise InvalidRequest(name, f"an unknown {kind}", fix)
 
 

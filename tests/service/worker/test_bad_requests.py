@@ -82,6 +82,10 @@ CASES = {
         "point_cloud2.fields", "z of type 5", "float32",
         point_cloud2=ros(fields=[*ros()["fields"][:2], {**ros()["fields"][2], "datatype": 5}]),
     ),
+    "PointCloud2 without z": Malformed(
+        "point_cloud2.fields", "'x'", "Send at least 3 items.",
+        point_cloud2=ros(fields=ros()["fields"][:2]),
+    ),
     "PointCloud2 of too many points": Malformed(
         "point_cloud2", "2500001 points", "2500000", kind="payload-too-large",
         point_cloud2=ros(width=2_500_001),
@@ -192,6 +196,14 @@ def test_malformed(name: str, transport: str) -> None:
 JSON_CASES = {
     "no rows": ({"points": [0.0, 0.0, 0.0]}, "cloud", "shape (3,)", "(N, 3)"),
     "unknown field": ({"points": [], "pints": []}, "pints", "unknown", "points,"),
+    "option beside the options": ({"points": [], "at": [1, 2]}, "at", "unknown", "`options`"),
+    "word for a direction": (
+        {"points": [], "options": {"approach_direction": "side"}}, "options.approach_direction",
+        "'side'", "an object as ApproachDirection",
+    ),
+    "text for a viewpoint": (
+        {"points": [], "options": {"viewpoint": "0 0 1"}}, "options.viewpoint", "'0 0 1'", "a list"
+    ),
     "true for a seed": (
         {"points": [], "options": {"seed": True}}, "options.seed", "True", "number"
     ),
@@ -288,6 +300,20 @@ def test_bad_forms(body: bytes, field: str) -> None:
     assert (error.status // 100, error.field) == (4, field)
     assert field != "depth" or ".png" in error.fix
     assert problem("http", body, "multipart/form-data").field == "body"
+
+
+@pytest.mark.parametrize(
+    ("depth", "camera", "field", "fix"),
+    [
+        (b"depth.png", b"60,60,2,2", "depth", "depth=@FILE"),
+        (b"[[0.5]]", b"60 60 2 2", "intrinsics", "fx, fy, cx, cy"),
+    ],
+)
+def test_slips_in_the_form_of_a_camera(depth, camera, field, fix) -> None:
+    body = form(part("depth", depth), part("intrinsics", camera))
+    error = problem("http", body, "multipart/form-data; boundary=b")
+    assert error.field == f"depth_images.0.{field}"
+    assert fix in error.fix
 
 
 def test_a_good_form() -> None:
