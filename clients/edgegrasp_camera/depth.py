@@ -124,9 +124,11 @@ def fuse_depth_images(depths: Sequence[Array], views: Sequence[Any]) -> CloudInp
         clouds.append(unproject(found, view.intrinsics, pose))
         cameras.append(tuple(pose[:3, 3].tolist()))
     if all(np.isnan(cloud[..., 2]).all() for cloud in clouds):
-        raise InvalidRequest("depth_images", "no reading", "Send a depth above 0 somewhere.")
+        fix = "Send a depth above 0 in at least one pixel."
+        raise InvalidRequest("depth_images", "no reading", fix)
     if len({*cameras}) < len(cameras):
-        doubts.append("depth_images: two cameras are in one place: send T_cloud_camera of each.")
+        why = "two have the same camera position"
+        doubts.append(f"depth_images: {why}: send T_cloud_camera with each.")
     if len(views) == 1:
         return CloudInput(clouds[0], viewpoint=cameras[0], warnings=tuple(doubts))
     together = np.concatenate([cloud.reshape(1, -1, 3) for cloud in clouds], axis=1)

@@ -282,7 +282,7 @@ def test_views_are_fused_and_doubtful_intrinsics_get_a_warning() -> None:
         (warning,) = read_depth_images(some, MANY).warnings
         assert f"depth_images.{len(some) - 1}.intrinsics: cx 8 lies far from the" in warning
     (warning,) = read_depth_images(images[2:] * 2, MANY).warnings
-    assert "two cameras are in one place" in warning
+    assert "two have the same camera position" in warning
 
 
 # sensor_msgs/PointCloud2
