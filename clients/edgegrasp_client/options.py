@@ -44,13 +44,13 @@ class OrientedBox(TypedDict):
 
 
 class HandPart(TypedDict):
-    """Boxes of the hand or of one finger, hand frame."""
+    """Boxes of the hand or of one finger, in the hand frame."""
 
     boxes: Sequence[Sequence[Numbers]]
 
 
 class Linkage(TypedDict):
-    """A linkage that carries each finger along an arc: its tips come forward as it closes."""
+    """A linkage that carries each finger along an arc; the tips move forward as they close."""
 
     radius: float
     reach: float
@@ -72,7 +72,7 @@ class Indices(TypedDict):
 
 
 class Mask(TypedDict):
-    """Points by a truth value for each row of the cloud as it was sent."""
+    """Points by a boolean for each row of the cloud as it was sent."""
 
     kind: Literal["mask"]
     mask: Sequence[bool] | NDArray[Any]
@@ -86,7 +86,7 @@ class ObjectChoice(TypedDict, total=False):
 
 
 class PlaceRegion(TypedDict):
-    """An axis-aligned box in the arm's base frame; an object is put on its bottom."""
+    """An axis-aligned box in the arm's base frame; the object is put on its bottom."""
 
     min: Numbers
     max: Numbers
@@ -142,7 +142,7 @@ class SupportPlane(TypedDict):
 
 
 class Suppression(TypedDict, total=False):
-    """Drop a grasp that is nearer to a better one than both distances."""
+    """Drops a grasp that is nearer to a better one than both distances."""
 
     translation: float
     rotation: float
@@ -175,7 +175,7 @@ class Collision(TypedDict, total=False):
 
 
 class GripperGeometry(TypedDict):
-    """A parallel-jaw gripper; the fields of a gripper file. z toward the object, y closing."""
+    """A parallel-jaw gripper, as in a gripper file; z towards the object, y the closing axis."""
 
     name: NotRequired[str]
     max_opening: float

@@ -47,7 +47,7 @@ class DepthImage(TypedDict):
     intrinsics: Intrinsics | Sequence[float] | Array
     # (4, 4) camera to cloud, metres; left out: the cloud's frame is the camera's.
     T_cloud_camera: NotRequired[Array | Sequence[Sequence[float]]]
-    # Metres that one unit of the depth is worth; None: 0.001 of whole numbers, 1 of floats.
+    # Metres that one unit of the depth is worth; None: 0.001 for integers, 1 for floats.
     depth_scale: NotRequired[float | None]
 
 

@@ -106,7 +106,7 @@ def ordered(low: tuple[float, ...], high: tuple[float, ...]) -> None:
 class Workspace(Strict):
     """An axis-aligned box in the cloud's frame, where grasps may be.
 
-    Points outside stay: as obstacles, and as what the network sees.
+    Points outside remain as obstacles, and the network still sees them.
     """
 
     min: Vector = Field(description="lower corner, metres")
@@ -175,11 +175,11 @@ def _byte_for_each(value: object) -> bytes:
     elif isinstance(value, (str, bytes)):
         sent = base64.b64decode(value, validate=True) if isinstance(value, str) else value
         return np.frombuffer(sent, np.uint8).astype(bool).tobytes()
-    raise ValueError("must be true and false, one for each row, or base64 of a byte for each")
+    raise ValueError("must be a boolean for each row, or base64 of one byte for each row")
 
 
 class Mask(Strict):
-    """Points by a truth value for each row of the cloud as it was sent."""
+    """Points by a boolean for each row of the cloud as it was sent."""
 
     kind: Literal["mask"] = "mask"
     mask: Annotated[
@@ -215,7 +215,7 @@ class Region(Strict):
     """Points in any of `include` and in none of `exclude`.
 
     Shapes see each voxel of the processed cloud as its mean point. Rows (indices, mask, segments)
-    hold a voxel where they hold at least half of the points in it.
+    contain a voxel if they contain at least half of its points.
     """
 
     include: tuple[Shape, ...] = Field(
@@ -241,8 +241,8 @@ class ApproachDirection(Strict):
     """Directions in which the hand may move: those in any cone or in the preset.
 
     `top-down` is within 30 degrees of straight down, `side` within 30 degrees of the horizontal,
-    both by `up`. Where no approach direction is asked for, every hand is allowed that does not
-    come from more than 6 degrees below the horizontal.
+    both relative to `up`. Without this option, every hand is allowed that does not come from more
+    than 6 degrees below the horizontal.
     """
 
     cones: tuple[Cone, ...] = Field(
@@ -281,35 +281,36 @@ class RansacPlane(Strict):
     """The largest plane in the cloud that is nearly level.
 
     Found from the request's seed, within the workspace. Its points are removed before anything
-    else; the plane stays as an obstacle. None found: a warning, and no support plane.
+    else; the plane stays as an obstacle. If none is found, there is a warning and no support plane.
     """
 
     kind: Literal["ransac"] = "ransac"
     distance: Annotated[float, Field(gt=0.0, le=0.1), numeric] = Field(
-        default=0.005, description="least distance within which points belong to the plane, metres"
+        default=0.005,
+        description="points within this distance belong to the plane, metres; noise may raise it",
     )
     max_tilt: Annotated[float, Field(ge=0.0, le=1.6), numeric] = Field(
         default=0.35,
-        description="greatest angle between its normal and up, radians; a quarter turn: any plane",
+        description="greatest angle between its normal and up, radians; π/2: any plane",
     )
     min_share: Annotated[float, Field(gt=0.0, le=1.0), numeric] = Field(
-        default=0.1, description="least share of the seen surface that lies in it"
+        default=0.1, description="least share of the visible surface that must lie in it"
     )
 
 
 class AutoPlane(Strict):
     """The plane of the points near objects that are classified as support.
 
-    Where `up` is sent, it lies within 30 degrees of the level. None is seen: a warning, and
-    one is assumed under a cloud that was cut off above it, else none. Up is then `up`, +z if no
-    camera is the origin, or what the lower edge of the cloud shows.
+    If `up` is sent, the plane is level to within 30 degrees. If no plane is seen, there is a
+    warning, and one is assumed only under a cloud that was cut off above it. Its normal is then
+    `up`, or +z if no camera is at the origin, else estimated from the lower edge of the cloud.
     """
 
     kind: Literal["auto"] = "auto"
 
 
 class HandPart(Strict):
-    """Boxes of the hand or of one finger, hand frame."""
+    """Boxes of the hand or of one finger, in the hand frame."""
 
     boxes: Boxes = Field(min_length=1, max_length=16, description="[min corner, max corner] each")
 
@@ -321,14 +322,14 @@ class HandPart(Strict):
 
 
 class Linkage(Strict):
-    """A linkage that carries each finger along an arc: its tips come forward as it closes."""
+    """A linkage that carries each finger along an arc; the tips move forward as they close."""
 
     radius: HandLength = Field(description="length of the link that carries a finger, metres")
     reach: NearHand = Field(description="outward part (y) of that link in the open gripper, metres")
 
 
 class GripperGeometry(Strict):
-    """A parallel-jaw gripper; the fields of a gripper file. z toward the object, y closing."""
+    """A parallel-jaw gripper, as in a gripper file; z towards the object, y the closing axis."""
 
     name: str = Field(default="custom", max_length=100, description="shown in results")
     max_opening: HandLength = Field(description="metres between the open fingers' inner faces")
@@ -338,7 +339,9 @@ class GripperGeometry(Strict):
     )
     tcp_z: NearHand = Field(description="origin of the TCP frame, metres along z")
     hand: HandPart = Field(description="the hand without its fingers")
-    finger: HandPart = Field(description="one finger, its inner face at y = 0; mirrored")
+    finger: HandPart = Field(
+        description="one finger, its inner face at y = 0; mirrored for the other"
+    )
     swing: Linkage | None = Field(
         default=None, description="how the fingers swing; null: they close in a straight line"
     )
@@ -346,13 +349,13 @@ class GripperGeometry(Strict):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if any(low[1] < 0 for low, _ in self.finger.boxes):
-            raise ValueError("finger.boxes lie outside of the inner face: no y below 0")
+            raise ValueError("finger.boxes must lie outside the inner face: no y below 0")
         if abs(max(high[2] for _, high in self.finger.boxes) - self.tip_z) > SAME:
             raise ValueError("tip_z must be the highest z of finger.boxes")
         if self.pad is None:
             raise ValueError(
-                "one of finger.boxes must hold the contact: its y from 0, its x on both sides of "
-                "0, contact_z within its z"
+                "one of finger.boxes must contain the contact: y from 0, x on both sides of 0, "
+                "contact_z within its z"
             )
         if self.swing is not None:
             reach, radius = self.swing.reach, self.swing.radius
@@ -389,14 +392,14 @@ class GripperGeometry(Strict):
 
 
 class Suppression(Strict):
-    """Drop a grasp that is nearer to a better one than both distances."""
+    """Drops a grasp that is nearer to a better one than both distances."""
 
     translation: Number = Field(default=0.01, ge=0.0, le=1.0, description="metres between TCPs")
     rotation: Number = Field(
         default=0.5,
         ge=0.0,
         le=3.2,
-        description="radians between hands, the 180 degree flip about the approach ignored",
+        description="radians between hands, ignoring a turn by 180 degrees about the approach",
     )
 
 
@@ -405,8 +408,8 @@ class Collision(Strict):
 
     mode: CollisionMode = Field(
         default="avoid",
-        description="grasps whose hand collides are left out, ranked by half their score, or not "
-        "checked for",
+        description="avoid: grasps whose hand collides are left out; penalise: they are ranked by "
+        "half their score; ignore: collisions are not checked",
     )
     margin: Number = Field(
         default=0.0,
@@ -439,7 +442,7 @@ class ObjectChoice(Strict):
         default=(), max_length=4096, description="numbers of objects; empty: all"
     )
     exclude: tuple[Row, ...] = Field(
-        default=(), max_length=4096, description="numbers of objects that are left out"
+        default=(), max_length=4096, description="numbers of objects to leave out"
     )
 
 
@@ -477,7 +480,7 @@ RigidPose = Annotated[
 
 
 class PlaceRegion(Workspace):
-    """An axis-aligned box in the arm's base frame; an object is put on its bottom."""
+    """An axis-aligned box in the arm's base frame; the object is put on its bottom."""
 
 
 class Place(Strict):
@@ -509,20 +512,20 @@ class RobotArm(Strict):
         description="pose of the cloud's frame in the arm's base frame: a 4 x 4 matrix, row by row"
     )
     joints: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=16)] = Field(
-        description="present joints of the arm, radians or metres, in the order of the robot file"
+        description="the arm's joints now, radians or metres, in the order of the robot file"
     )
     plan: Literal["reach", "motion"] = Field(
         default="motion",
-        description="reach: joints before and at each grasp; motion: a timed trajectory too",
+        description="reach: joints at each pregrasp and grasp; motion: also a timed trajectory",
     )
     place: Place | None = Field(
         default=None,
-        description="where to put the object: a grasp is within reach only if that is too; null: "
-        "the motion ends with the object lifted",
+        description="where to put the object; a grasp is within reach only if this place is too; "
+        "null: the motion ends with the object lifted",
     )
     avoid_unseen: StrictBool = Field(
         default=False,
-        description="whether unseen space behind a surface is an obstacle of the arm",
+        description="whether unseen space behind a surface is an obstacle for the arm",
     )
 
 
@@ -566,8 +569,8 @@ class Previous(Strict):
     )
     search: StrictBool = Field(
         default=True,
-        description="whether to detect other grasps too; false: only these are moved and scored "
-        "again, which takes a fraction of the time; send the `support` of that answer",
+        description="whether to detect other grasps too; false: these are only moved and scored "
+        "again, in a fraction of the time; then also send the `support` of that answer",
     )
 
     @property
@@ -635,7 +638,7 @@ class DetectOptions(Strict):
         | None
     ) = Field(
         default=None,
-        description="name of a gripper, or a gripper; null: the one the weights were trained for",
+        description="gripper, by name or geometry; null: the one the weights were trained for",
     )
     num_approach_points: Annotated[int, Field(ge=1, le=MAX_APPROACH_POINTS), numeric] | None = (
         Field(
@@ -663,8 +666,8 @@ class DetectOptions(Strict):
         | None
     ) = Field(
         default=None,
-        description="camera position, metres; orients the normals. Several positions: "
-        "`view_ids` beside the cloud says which one saw each point",
+        description="camera position, metres; normals are oriented towards it. If there are "
+        "several, `view_ids` beside the cloud says which one saw each point",
     )
     up: Direction | None = Field(
         default=None,
@@ -683,8 +686,9 @@ class DetectOptions(Strict):
     )
     objects: Literal["auto", "off"] | ObjectChoice = Field(
         default="auto",
-        description="objects to grasp: those recognised, some of them by number, or everything; "
-        "all else is an obstacle. If segment_ids are sent, those above 0 are the objects",
+        description="objects to grasp: those recognised (auto), some of them by number, or "
+        "everything above the support (off); all else is an obstacle. If segment_ids are sent, "
+        "those above 0 are the objects",
     )
     at: Pixel | None = Field(
         default=None,
@@ -698,11 +702,11 @@ class DetectOptions(Strict):
         default=0.4,
         gt=0.0,
         le=10.0,
-        description="longest side of an object, metres; longer ones are obstacles",
+        description="longest side of an object, metres; larger ones are obstacles",
     )
     workspace: Workspace | None = Field(
         default=None,
-        description="where grasps may be; points outside stay as obstacles; null: everywhere",
+        description="where grasps may be; points outside remain obstacles; null: everywhere",
     )
     approach_region: Region | None = Field(
         default=None, description="where approach points may lie; null: everywhere"
@@ -711,7 +715,7 @@ class DetectOptions(Strict):
         default=None, description="where contact points may lie; null: everywhere"
     )
     approach_direction: ApproachDirection | None = Field(
-        default=None, description="directions in which the hand may move; null: not from below"
+        default=None, description="directions in which the hand may move; null: all but from below"
     )
     collision: Annotated[
         Collision,
@@ -737,15 +741,15 @@ class DetectOptions(Strict):
     )
     order: Literal["score", "highest", "clearance"] = Field(
         default="score",
-        description="score: by score and, where scores are close, by how the hand lies; first a "
-        "grasp of each object that has one of 0.5 or more, surrounded by other good ones; "
-        "highest: by height of the TCP along up among scores of 0.9 and more, then the "
-        "others by score; clearance: by clearance",
+        description="score: first, for each object with a grasp of 0.5 or more, one surrounded by "
+        "other good ones; then by score, and by the pose of the hand where scores are close. "
+        "highest: scores of 0.9 or more by height of the TCP along up, then the others by score. "
+        "clearance: by clearance",
     )
     previous: Previous | None = Field(
         default=None,
         description="grasps and objects of an earlier answer, which keep their ids, numbers and "
-        "order; empty for the first image; null: no tracking",
+        "order; an empty object for the first image; null: no tracking",
     )
     debug: StrictBool = Field(
         default=False, description="whether to return the processed cloud and every candidate"

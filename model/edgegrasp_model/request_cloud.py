@@ -152,7 +152,7 @@ def _numbers(field: str, values: list[Any], holes: bool) -> Array:
         if type(number) not in allowed or (type(number) is int and abs(number) >= 2**63)
     )
     row = values[bad * len(values) // len(numbers)]
-    raise InvalidRequest(field, brief(row), "Send numbers only, whole ones of 64 bits.")
+    raise InvalidRequest(field, brief(row), "Send numbers only; integers must fit in 64 bits.")
 
 
 # What requests hold besides arrays, checked
@@ -231,7 +231,7 @@ class DepthImage(Strict):
     )
     depth_scale: Annotated[float, Field(gt=0.0, le=1.0), numeric] | None = Field(
         default=None,
-        description="metres for one unit of depth; null: 0.001 of whole numbers, 1 of floats",
+        description="metres for one unit of depth; null: 0.001 for integers, 1 for floats",
     )
     depth: SkipValidation[list[list[float]] | Depth] = Field(
         description="rows of metres, or an object as Depth"

@@ -30,60 +30,60 @@ class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     host: str = "127.0.0.1"
-    """address both transports bind to; unix:FOLDER: sockets http.sock and grpc.sock"""
+    """address for HTTP and gRPC; unix:FOLDER: sockets http.sock and grpc.sock in a folder"""
     allowed_hosts: tuple[str, ...] = Field(
         (),
-        description="names accepted in the Host header; *: any; empty: any if tokens are set, else "
+        description="names accepted in the Host header; *: any; none: any if tokens are set, else "
         "addresses and names without a dot",
     )
     http_port: Port = 8000
-    """0: any free port"""
+    """port for HTTP; 0: any free port"""
     grpc_port: Port = 50051
-    """0: any free port"""
+    """port for gRPC; 0: any free port"""
     weights: tuple[Path, ...] = ()
     """weights files or folders of them, besides those that ship"""
     grippers: tuple[Path, ...] = ()
-    """gripper files (.toml), named by their stem"""
+    """gripper files (.toml); a gripper has the name of its file"""
     robots: tuple[Path, ...] = ()
     """robot files (.toml), or names of those that ship; needs the extra robot"""
     default_model: str = ""
-    """weights used when a request names none"""
+    """weights used when a request does not name any; none: edgegrasp-plus"""
     device: str = Field("cpu", pattern=r"^(auto|cpu|cuda(:\d+)?)$")
-    """where detectors compute: cpu, cuda, cuda:N, or auto: the first GPU, else cpu"""
+    """where networks run: cpu, cuda, cuda:N, or auto (the first GPU, else cpu)"""
     max_body_bytes: int = Field(32 * MIB, ge=1024, le=1024 * MIB)
     """largest request body accepted"""
     max_points: Count = 2_500_000
-    """most points in a cloud, before downsampling"""
+    """maximum number of points in a cloud, before downsampling"""
     max_voxels: Count = 200_000
-    """most points in a cloud, after downsampling"""
+    """maximum number of points in a cloud, after downsampling"""
     workers: int = Field(0, ge=0, le=1024)
     """worker processes; 0: one per core"""
     max_worker_bytes: int = Field(3 * 1024 * MIB, ge=64 * MIB)
     """memory that a worker may use for a request"""
     max_queue_length: int = Field(32, ge=0, le=65536)
-    """most requests waiting, beside those being processed"""
+    """maximum number of waiting requests, besides those being processed"""
     max_held_bytes: Size = 512 * MIB
-    """most bytes of request bodies held in memory"""
+    """maximum bytes of bodies and answers in memory"""
     max_streams: Count = Field(16, le=1024)
-    """most gRPC streams open at a time"""
+    """maximum number of open gRPC streams"""
     max_stream_requests: Count = Field(4, le=1024)
-    """most unanswered requests read from a stream"""
+    """maximum number of unanswered requests read from a stream"""
     max_connections: Count = Field(512, le=65536)
-    """most connections open at a time, of HTTP and of gRPC each"""
+    """maximum number of open connections, for HTTP and gRPC each"""
     max_request_seconds: float = Field(120.0, gt=0.0, le=86400.0)
     """longest processing time of a request, whatever its deadline"""
     read_seconds: Timeout = 10.0
-    """time for a body to arrive, plus its size at min_bytes_per_second"""
+    """time for a body to arrive, plus its size / min_bytes_per_second"""
     write_seconds: Timeout = 10.0
-    """time for a client to take an answer, plus its size at min_bytes_per_second"""
+    """time for a client to take an answer, plus its size / min_bytes_per_second"""
     min_bytes_per_second: Count = 50_000
-    """least speed of bodies and answers"""
+    """minimum transfer rate of bodies and answers"""
     record_folder: Path | None = None
-    """folder to record requests and answers in"""
+    """folder for recorded requests and answers; none: nothing is recorded"""
     record_bytes: Size = 1024 * MIB
-    """most recorded; the oldest are deleted"""
+    """maximum bytes of recordings; the oldest are deleted"""
     outcomes_file: Path | None = None
-    """file that /v1/outcomes appends to, up to 64 MiB; none: no such path"""
+    """file that /v1/outcomes appends to, up to 64 MiB; none: outcomes are refused"""
     max_header_bytes: int = Field(32768, ge=4096, le=MIB)
     """largest HTTP header or gRPC metadata accepted"""
     tls_certificate: Path | None = None
@@ -91,19 +91,19 @@ class Settings(BaseModel):
     tls_key: Path | None = None
     """PEM file: key of the certificate"""
     tls_client_ca: Path | None = None
-    """PEM file: CAs of clients, which must then show a certificate"""
+    """PEM file: CAs of clients, which then need a certificate"""
     token_file: Path | None = None
-    """bearer tokens, one per line; requests must carry one; none: no need"""
+    """bearer tokens, one per line, of which a request needs one; none: no token is needed"""
     admin_token_file: Path | None = None
-    """tokens that also permit reloading weights, one per line; none: SIGHUP only"""
+    """tokens that also permit reloading weights, one per line; none: only SIGHUP reloads"""
     grace_seconds: Wait = 10.0
-    """seconds for requests in progress when stopping"""
+    """time for requests in progress to finish when stopping"""
     playground: bool = True
     """whether / shows the playground instead of /docs"""
     samples: Path | None = None
-    """folder with samples.json: scenes offered by the playground, public"""
+    """folder with samples.json: scenes that the playground offers to everyone"""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
-    """least severe records logged"""
+    """minimum severity that is logged"""
 
     @model_validator(mode="after")
     def _check_tls(self) -> Self:

@@ -3,9 +3,9 @@
 isort:skip_file
 Grasp detection as a service: point clouds in, scored 6-DoF grasps out.
 
-Units are metres, radians and seconds. Unless said otherwise, positions and directions are in
+Units are metres, radians and seconds. Unless stated otherwise, positions and directions are in
 the frame of the cloud that the caller sent. Matrices are row-major, and `T_cloud_hand` maps
-hand coordinates to cloud coordinates. Field names are those of the JSON over HTTP.
+hand coordinates to cloud coordinates. Fields have the same names in JSON over HTTP.
 
 Errors carry an `ErrorDetail` in the trailing metadata under `edgegrasp-error-bin`.
 """
@@ -119,7 +119,7 @@ class DetectGraspsStreamRequest(_message.Message):
     REQUEST_FIELD_NUMBER: _builtins.int
     TIMEOUT_FIELD_NUMBER: _builtins.int
     request_id: _builtins.str
-    """The caller's name for it; the answer has it too."""
+    """The caller's name for the request; the answer has it too."""
     timeout: _builtins.float
     """Deadline, seconds after its arrival at the server."""
     @_builtins.property
@@ -205,7 +205,7 @@ Global___StreamError: _TypeAlias = StreamError  # noqa: Y015
 
 @_typing.final
 class ScoreGraspsRequest(_message.Message):
-    """As DetectGraspsRequest, and either edges or hand poses."""
+    """As DetectGraspsRequest, with either edges or hand poses."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -374,8 +374,8 @@ Global___EncodedCloud: _TypeAlias = EncodedCloud  # noqa: Y015
 
 @_typing.final
 class PointCloud2(_message.Message):
-    """The layout of sensor_msgs/PointCloud2, metres. Fields x, y, z; normal_x, normal_y, normal_z and
-    rgb or rgba where there are any. Of height 2 or more it is organised, with NaN holes.
+    """The layout of sensor_msgs/PointCloud2, metres. Fields x, y, z, optionally normal_x, normal_y,
+    normal_z and rgb or rgba. With a height of 2 or more it is organised, with NaN holes.
     """
 
     DESCRIPTOR: _descriptor.Descriptor
@@ -461,7 +461,7 @@ class DepthImage(_message.Message):
     T_CLOUD_CAMERA_FIELD_NUMBER: _builtins.int
     DEPTH_SCALE_FIELD_NUMBER: _builtins.int
     depth_scale: _builtins.float
-    """Metres for one unit of depth. Absent: 0.001 of integers, 1 of floats."""
+    """Metres for one unit of depth. Absent: 0.001 for integers, 1 for floats."""
     @_builtins.property
     def depth(self) -> Global___Depth:
         """Distance along z at each pixel."""
@@ -470,7 +470,7 @@ class DepthImage(_message.Message):
     def intrinsics(self) -> Global___Intrinsics: ...
     @_builtins.property
     def T_cloud_camera(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """16 numbers, 4 x 4 row-major: maps camera coordinates to cloud coordinates, metres. None: the
+        """16 numbers, 4 x 4 row-major: maps camera coordinates to cloud coordinates, metres. Empty: the
         cloud's frame is the camera's.
         """
 
@@ -505,8 +505,8 @@ class Depth(_message.Message):
     height: _builtins.int
     width: _builtins.int
     encoding: _builtins.str
-    """As in sensor_msgs/Image: "32FC1" or "64FC1", metres; "16UC1", millimetres. Or "png": the file
-    of a 16-bit greyscale image, millimetres, which knows its height and width.
+    """As in sensor_msgs/Image: "32FC1" or "64FC1", metres; "16UC1", millimetres. Or "png": a 16-bit
+    greyscale file, millimetres, which has its own height and width.
     """
     data: _builtins.bytes
     """Packed little-endian pixels, or the file; base64 in JSON."""
@@ -602,31 +602,32 @@ class DetectOptions(_message.Message):
     seed: _builtins.int
     """Seed of every random choice."""
     objects: _builtins.str
-    """Objects to grasp: those recognised, some of them by number, or everything; all else is an
-    obstacle. If segment_ids are sent, those above 0 are the objects. One of "auto", "off".
+    """Objects to grasp: those recognised (auto), some of them by number, or everything above the
+    support (off); all else is an obstacle. If segment_ids are sent, those above 0 are the objects.
+    One of "auto", "off".
     """
     max_object_size: _builtins.float
-    """Longest side of an object, metres; longer ones are obstacles."""
+    """Longest side of an object, metres; larger ones are obstacles."""
     min_score: _builtins.float
     """Lowest score returned; 0: all."""
     top_k: _builtins.int
     """Grasps returned at most."""
     order: _builtins.str
-    """Score: by score and, where scores are close, by how the hand lies; first a grasp of each object
-    that has one of 0.5 or more, surrounded by other good ones; highest: by height of the TCP along
-    up among scores of 0.9 and more, then the others by score; clearance: by clearance. One of
+    """Score: first, for each object with a grasp of 0.5 or more, one surrounded by other good ones;
+    then by score, and by the pose of the hand where scores are close. highest: scores of 0.9 or
+    more by height of the TCP along up, then the others by score. clearance: by clearance. One of
     "score", "highest", "clearance".
     """
     debug: _builtins.bool
     """Whether to return the processed cloud and every candidate."""
     @_builtins.property
     def gripper(self) -> Global___GripperChoice:
-        """Name of a gripper, or a gripper; absent: the one the weights were trained for."""
+        """Gripper, by name or geometry; absent: the one the weights were trained for."""
 
     @_builtins.property
     def viewpoint(self) -> _containers.RepeatedCompositeFieldContainer[Global___Vector]:
-        """Camera position, metres; orients the normals. Several positions: `view_ids` beside the cloud
-        says which one saw each point.
+        """Camera position, metres; normals are oriented towards it. If there are several, `view_ids`
+        beside the cloud says which one saw each point.
         """
 
     @_builtins.property
@@ -649,7 +650,7 @@ class DetectOptions(_message.Message):
 
     @_builtins.property
     def workspace(self) -> Global___Workspace:
-        """Where grasps may be; points outside stay as obstacles; absent: everywhere."""
+        """Where grasps may be; points outside remain obstacles; absent: everywhere."""
 
     @_builtins.property
     def approach_region(self) -> Global___Region:
@@ -661,7 +662,7 @@ class DetectOptions(_message.Message):
 
     @_builtins.property
     def approach_direction(self) -> Global___ApproachDirection:
-        """Directions in which the hand may move; absent: not from below."""
+        """Directions in which the hand may move; absent: all but from below."""
 
     @_builtins.property
     def collision(self) -> Global___Collision:
@@ -677,8 +678,8 @@ class DetectOptions(_message.Message):
 
     @_builtins.property
     def previous(self) -> Global___Previous:
-        """Grasps and objects of an earlier answer, which keep their ids, numbers and order; empty for the
-        first image; absent: no tracking.
+        """Grasps and objects of an earlier answer, which keep their ids, numbers and order; an empty
+        message for the first image; absent: no tracking.
         """
 
     @_builtins.property
@@ -768,7 +769,7 @@ Global___DetectOptions: _TypeAlias = DetectOptions  # noqa: Y015
 
 @_typing.final
 class GripperGeometry(_message.Message):
-    """A parallel-jaw gripper; the fields of a gripper file. z toward the object, y closing."""
+    """A parallel-jaw gripper, as in a gripper file; z towards the object, y the closing axis."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -796,7 +797,7 @@ class GripperGeometry(_message.Message):
 
     @_builtins.property
     def finger(self) -> Global___HandPart:
-        """One finger, its inner face at y = 0; mirrored."""
+        """One finger, its inner face at y = 0; mirrored for the other."""
 
     @_builtins.property
     def swing(self) -> Global___Swing:
@@ -912,11 +913,11 @@ class RansacPlane(_message.Message):
     MAX_TILT_FIELD_NUMBER: _builtins.int
     MIN_SHARE_FIELD_NUMBER: _builtins.int
     distance: _builtins.float
-    """Least distance within which points belong to the plane, metres."""
+    """Points within this distance belong to the plane, metres; noise may raise it."""
     max_tilt: _builtins.float
-    """Greatest angle between its normal and up, radians; a quarter turn: any plane."""
+    """Greatest angle between its normal and up, radians; π/2: any plane."""
     min_share: _builtins.float
-    """Least share of the seen surface that lies in it."""
+    """Least share of the visible surface that must lie in it."""
     def __init__(
         self,
         *,
@@ -974,7 +975,7 @@ class ObjectChoice(_message.Message):
 
     @_builtins.property
     def exclude(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
-        """Numbers of objects that are left out."""
+        """Numbers of objects to leave out."""
 
     def __init__(
         self,
@@ -1094,8 +1095,8 @@ class Collision(_message.Message):
     RETREAT_DIRECTION_FIELD_NUMBER: _builtins.int
     OBSTACLES_FIELD_NUMBER: _builtins.int
     mode: _builtins.str
-    """Grasps whose hand collides are left out, ranked by half their score, or not checked for. One of
-    "avoid", "penalise", "ignore".
+    """Avoid: grasps whose hand collides are left out; penalise: they are ranked by half their score;
+    ignore: collisions are not checked. One of "avoid", "penalise", "ignore".
     """
     margin: _builtins.float
     """Metres by which the hand's boxes are grown on every side."""
@@ -1168,23 +1169,23 @@ class RobotArm(_message.Message):
     name: _builtins.str
     """One of the server's robots."""
     plan: _builtins.str
-    """Reach: joints before and at each grasp; motion: a timed trajectory too. One of "reach",
+    """Reach: joints at each pregrasp and grasp; motion: also a timed trajectory. One of "reach",
     "motion".
     """
     avoid_unseen: _builtins.bool
-    """Whether unseen space behind a surface is an obstacle of the arm."""
+    """Whether unseen space behind a surface is an obstacle for the arm."""
     @_builtins.property
     def T_base_cloud(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """Pose of the cloud's frame in the arm's base frame: a 4 x 4 matrix, row by row."""
 
     @_builtins.property
     def joints(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """Present joints of the arm, radians or metres, in the order of the robot file."""
+        """The arm's joints now, radians or metres, in the order of the robot file."""
 
     @_builtins.property
     def place(self) -> Global___Place:
-        """Where to put the object: a grasp is within reach only if that is too; absent: the motion ends
-        with the object lifted.
+        """Where to put the object; a grasp is within reach only if this place is too; absent: the motion
+        ends with the object lifted.
         """
 
     def __init__(
@@ -1252,7 +1253,7 @@ Global___Place: _TypeAlias = Place  # noqa: Y015
 
 @_typing.final
 class PlaceRegion(_message.Message):
-    """An axis-aligned box in the arm's base frame; an object is put on its bottom."""
+    """An axis-aligned box in the arm's base frame; the object is put on its bottom."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1282,7 +1283,7 @@ Global___PlaceRegion: _TypeAlias = PlaceRegion  # noqa: Y015
 
 @_typing.final
 class Suppression(_message.Message):
-    """Drop a grasp that is nearer to a better one than both distances."""
+    """Drops a grasp that is nearer to a better one than both distances."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1292,7 +1293,7 @@ class Suppression(_message.Message):
     translation: _builtins.float
     """Metres between TCPs."""
     rotation: _builtins.float
-    """Radians between hands, the 180 degree flip about the approach ignored."""
+    """Radians between hands, ignoring a turn by 180 degrees about the approach."""
     disabled: _builtins.bool
     """True: null in JSON."""
     def __init__(
@@ -1333,8 +1334,8 @@ class Previous(_message.Message):
     next_id: _builtins.int
     """As in that answer."""
     search: _builtins.bool
-    """Whether to detect other grasps too; false: only these are moved and scored again, which takes a
-    fraction of the time; send the `support` of that answer.
+    """Whether to detect other grasps too; false: these are only moved and scored again, in a fraction
+    of the time; then also send the `support` of that answer.
     """
     @_builtins.property
     def grasps(self) -> _containers.RepeatedCompositeFieldContainer[Global___PreviousGrasp]:
@@ -1374,7 +1375,7 @@ Global___Previous: _TypeAlias = Previous  # noqa: Y015
 
 @_typing.final
 class HandPart(_message.Message):
-    """Boxes of the hand or of one finger, hand frame."""
+    """Boxes of the hand or of one finger, in the hand frame."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1398,7 +1399,7 @@ Global___HandPart: _TypeAlias = HandPart  # noqa: Y015
 
 @_typing.final
 class Swing(_message.Message):
-    """A linkage that carries each finger along an arc: its tips come forward as it closes."""
+    """A linkage that carries each finger along an arc; the tips move forward as they close."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1515,7 +1516,7 @@ Global___Indices: _TypeAlias = Indices  # noqa: Y015
 
 @_typing.final
 class Mask(_message.Message):
-    """Points by a truth value for each row of the cloud as it was sent."""
+    """Points by a boolean for each row of the cloud as it was sent."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1901,7 +1902,7 @@ class GripperChoice(_message.Message):
     NAME_FIELD_NUMBER: _builtins.int
     GEOMETRY_FIELD_NUMBER: _builtins.int
     name: _builtins.str
-    """One that ships with the server, or that it was started with."""
+    """A gripper that ships with the server, or one that it was started with."""
     @_builtins.property
     def geometry(self) -> Global___GripperGeometry: ...
     def __init__(
@@ -2025,7 +2026,7 @@ class DetectGraspsResponse(_message.Message):
 
     @_builtins.property
     def debug(self) -> Global___DebugInfo:
-        """Set if options.debug is set."""
+        """Present if options.debug is set."""
 
     @_builtins.property
     def support(self) -> Global___FoundSupport:
@@ -2033,7 +2034,7 @@ class DetectGraspsResponse(_message.Message):
 
     @_builtins.property
     def up(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """3 floats: unit, away from gravity, as it was used; cloud frame."""
+        """3 floats: the unit vector away from gravity that was used; cloud frame."""
 
     @_builtins.property
     def objects(self) -> _containers.RepeatedCompositeFieldContainer[Global___DetectedObject]:
@@ -2045,7 +2046,7 @@ class DetectGraspsResponse(_message.Message):
 
     @_builtins.property
     def tracking(self) -> Global___Tracking:
-        """Set if options.previous is set."""
+        """Present if options.previous is set."""
 
     def __init__(
         self,
@@ -2079,11 +2080,11 @@ class Tracking(_message.Message):
     FIRST_FIELD_NUMBER: _builtins.int
     NEXT_ID_FIELD_NUMBER: _builtins.int
     first: _builtins.str
-    """State of the first grasp: "started": there was none; "kept": it is the first again, moved with
-    its object; "replaced": another one is better by a margin; "lost": it is not there any more.
+    """State of the first grasp: "started": there was none before; "kept": it is the previous first,
+    moved with its object; "replaced": another is better by a margin; "lost": it no longer exists.
     """
     next_id: _builtins.int
-    """Above all ids of grasps and numbers of objects so far."""
+    """Greater than all ids of grasps and numbers of objects so far."""
     def __init__(
         self,
         *,
@@ -2140,9 +2141,9 @@ class FoundSupport(_message.Message):
     offset: _builtins.float
     """Metres."""
     residual: _builtins.float
-    """Metres, median distance of its points; absent (null in JSON): none of it is seen."""
+    """Median distance of its points from it, metres; absent (null in JSON): none of it is seen."""
     share: _builtins.float
-    """Share of the seen surface that lies in it."""
+    """Share of the visible surface that lies in it."""
     @_builtins.property
     def normal(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """3 floats: unit, away from the table."""
@@ -2181,14 +2182,14 @@ class DetectedObject(_message.Message):
     REASON_FIELD_NUMBER: _builtins.int
     SURFACE_FIELD_NUMBER: _builtins.int
     number: _builtins.int
-    """As in Grasp.object; the segment, if segment_ids were sent."""
+    """As in Grasp.object; if segment_ids were sent, the number of the segment."""
     points: _builtins.int
     """Number of its voxels in the processed cloud."""
     best_score: _builtins.float
     """Best score of the returned grasps on it; absent (null in JSON): none."""
     confidence: _builtins.float
-    """Probability that it is an object, a factor of its grasps' scores; absent (null in JSON): the
-    caller gave it.
+    """Probability that it is an object, by which its grasps' scores were multiplied; absent (null in
+    JSON): the caller defined the object.
     """
     reason: _builtins.str
     """Why it has no grasp of a score of 0.5 or more: too-wide, too-flat, blocked or hidden; absent
@@ -2301,9 +2302,7 @@ class Grasp(_message.Message):
 
     @_builtins.property
     def arm(self) -> Global___ArmPlan:
-        """Joints and motion of the robot's arm; absent (null in JSON): no robot was given, or time ran
-        out.
-        """
+        """Joints and motion of the arm; absent (null in JSON): no robot was given, or time ran out."""
 
     def __init__(
         self,
@@ -2486,7 +2485,7 @@ class DebugInfo(_message.Message):
 
     @_builtins.property
     def score(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """E floats; NaN (null in JSON): not scored."""
+        """E floats; NaN (null in JSON) if not scored."""
 
     @_builtins.property
     def outcome(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
@@ -2498,7 +2497,7 @@ class DebugInfo(_message.Message):
 
     @_builtins.property
     def labels(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
-        """Of each row of the cloud as sent, images row by row: the number of its object; -1: an
+        """For each row of the cloud as sent, images row by row: the number of its object; -1: an
         obstacle; -2: the support; -3: no reading, cut off or below the support.
         """
 
@@ -2616,7 +2615,7 @@ class Evaluation(_message.Message):
     GRASP_FIELD_NUMBER: _builtins.int
     REASON_FIELD_NUMBER: _builtins.int
     reason: _builtins.str
-    """Why it defines none, in a word; null in JSON if it defines one."""
+    """Why it defines no grasp, in a word; absent (null in JSON) if it defines one."""
     @_builtins.property
     def grasp(self) -> Global___Grasp:
         """Absent (null in JSON) if it defines no grasp."""
@@ -2733,15 +2732,15 @@ class Robot(_message.Message):
     """Link that T_base_cloud refers to."""
     @_builtins.property
     def joint_names(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
-        """J, in the order of options.robot.joints."""
+        """J: names, in the order of options.robot.joints."""
 
     @_builtins.property
     def home(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """J, joints without a collision of the arm with itself."""
+        """J: joints at which the arm does not touch itself."""
 
     @_builtins.property
     def lower(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """J, limits of the joints."""
+        """J each: limits of the joints."""
 
     @_builtins.property
     def upper(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
@@ -2751,8 +2750,8 @@ class Robot(_message.Message):
     def max_acceleration(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
     @_builtins.property
     def frames(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """(J + 1) * 16: the frame of each joint at position 0 in that of the joint before, the first in
-        the base frame, the last is the hand's in the last joint's; 4 x 4 row-major matrices.
+        """J + 1 matrices of 16 numbers, 4 x 4 row-major: the frame of each joint at position 0 in the
+        previous joint's frame (of the first: in the base frame), then the hand's in the last joint's.
         """
 
     @_builtins.property
@@ -2851,15 +2850,15 @@ class Model(_message.Message):
     crop_radius: _builtins.float
     """Radius of the ball around an approach point that the network sees, metres."""
     voxel_size: _builtins.float
-    """Edge of the voxels that the cloud is reduced to, metres."""
+    """Edge of the voxels that the cloud is downsampled to, metres."""
     gripper: _builtins.str
     """Gripper the weights were trained for."""
     default: _builtins.bool
-    """Whether an empty options.model means these weights."""
+    """Whether these weights are used if options.model is empty."""
     hand_description: _builtins.bool
     """Whether the network also sees the hand-frame description of each candidate."""
     device: _builtins.str
-    """Where it computes: "cpu", or a GPU such as "cuda:0"."""
+    """Where the network runs: "cpu", or a GPU such as "cuda:0"."""
     def __init__(
         self,
         *,

@@ -82,17 +82,17 @@ class GraspServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def DetectGraspsStream(self, request_iterator, context):
-        """Finds grasps in one cloud after the other. Answers come in the order of the requests, one for
-        each; the error of a request is its answer, and the stream goes on. The server reads ahead a
-        few requests only: a client that sends faster waits. While the server stops, it answers what
-        it has read and ends the stream with UNAVAILABLE.
+        """Finds grasps in one cloud after the other. Each request gets one answer, in order; an error is
+        the answer to its request, and the stream goes on. The server reads only a few requests ahead,
+        so a client that sends faster has to wait. When the server stops, it answers what it has read
+        and ends the stream with UNAVAILABLE.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ScoreGrasps(self, request, context):
-        """Scores edges or hand poses that the caller gives, in their order; errors as DetectGrasps.
+        """Scores the caller's edges or hand poses, in their order; errors as in DetectGrasps.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -113,8 +113,8 @@ class GraspServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def ReloadModels(self, request, context):
-        """Loads weights anew, from where the server had them, and reads its tokens anew. The old weights
-        answer until the new ones are warm, and all that came before. Needs an admin token.
+        """Loads weights, tokens and certificates again from the same files. The old weights answer all
+        requests that arrive before the new ones are warmed up. Needs an admin token.
         FAILED_PRECONDITION  new weights cannot be used; the old ones still serve
         UNAUTHENTICATED      no token, or none that the server knows
         PERMISSION_DENIED    a token for detection only, or a server without admin tokens

@@ -3,9 +3,9 @@
 isort:skip_file
 Grasp detection as a service: point clouds in, scored 6-DoF grasps out.
 
-Units are metres, radians and seconds. Unless said otherwise, positions and directions are in
+Units are metres, radians and seconds. Unless stated otherwise, positions and directions are in
 the frame of the cloud that the caller sent. Matrices are row-major, and `T_cloud_hand` maps
-hand coordinates to cloud coordinates. Field names are those of the JSON over HTTP.
+hand coordinates to cloud coordinates. Fields have the same names in JSON over HTTP.
 
 Errors carry an `ErrorDetail` in the trailing metadata under `edgegrasp-error-bin`.
 """
@@ -47,20 +47,20 @@ class GraspServiceStub:
       UNAVAILABLE         weights are still loading, or the server is stopping: try again
     """
     DetectGraspsStream: _grpc.StreamStreamMultiCallable[_grasp_pb2.DetectGraspsStreamRequest, _grasp_pb2.DetectGraspsStreamResponse]
-    """Finds grasps in one cloud after the other. Answers come in the order of the requests, one for
-    each; the error of a request is its answer, and the stream goes on. The server reads ahead a
-    few requests only: a client that sends faster waits. While the server stops, it answers what
-    it has read and ends the stream with UNAVAILABLE.
+    """Finds grasps in one cloud after the other. Each request gets one answer, in order; an error is
+    the answer to its request, and the stream goes on. The server reads only a few requests ahead,
+    so a client that sends faster has to wait. When the server stops, it answers what it has read
+    and ends the stream with UNAVAILABLE.
     """
     ScoreGrasps: _grpc.UnaryUnaryMultiCallable[_grasp_pb2.ScoreGraspsRequest, _grasp_pb2.ScoreGraspsResponse]
-    """Scores edges or hand poses that the caller gives, in their order; errors as DetectGrasps."""
+    """Scores the caller's edges or hand poses, in their order; errors as in DetectGrasps."""
     ListModels: _grpc.UnaryUnaryMultiCallable[_grasp_pb2.ListModelsRequest, _grasp_pb2.ListModelsResponse]
     """Lists the weights that options.model can name."""
     ListRobots: _grpc.UnaryUnaryMultiCallable[_grasp_pb2.ListRobotsRequest, _grasp_pb2.ListRobotsResponse]
     """Lists the robots that options.robot can name."""
     ReloadModels: _grpc.UnaryUnaryMultiCallable[_grasp_pb2.ReloadModelsRequest, _grasp_pb2.ReloadModelsResponse]
-    """Loads weights anew, from where the server had them, and reads its tokens anew. The old weights
-    answer until the new ones are warm, and all that came before. Needs an admin token.
+    """Loads weights, tokens and certificates again from the same files. The old weights answer all
+    requests that arrive before the new ones are warmed up. Needs an admin token.
       FAILED_PRECONDITION  new weights cannot be used; the old ones still serve
       UNAUTHENTICATED      no token, or none that the server knows
       PERMISSION_DENIED    a token for detection only, or a server without admin tokens
@@ -79,20 +79,20 @@ class GraspServiceAsyncStub(GraspServiceStub):
       UNAVAILABLE         weights are still loading, or the server is stopping: try again
     """
     DetectGraspsStream: _aio.StreamStreamMultiCallable[_grasp_pb2.DetectGraspsStreamRequest, _grasp_pb2.DetectGraspsStreamResponse]  # type: ignore[assignment]
-    """Finds grasps in one cloud after the other. Answers come in the order of the requests, one for
-    each; the error of a request is its answer, and the stream goes on. The server reads ahead a
-    few requests only: a client that sends faster waits. While the server stops, it answers what
-    it has read and ends the stream with UNAVAILABLE.
+    """Finds grasps in one cloud after the other. Each request gets one answer, in order; an error is
+    the answer to its request, and the stream goes on. The server reads only a few requests ahead,
+    so a client that sends faster has to wait. When the server stops, it answers what it has read
+    and ends the stream with UNAVAILABLE.
     """
     ScoreGrasps: _aio.UnaryUnaryMultiCallable[_grasp_pb2.ScoreGraspsRequest, _grasp_pb2.ScoreGraspsResponse]  # type: ignore[assignment]
-    """Scores edges or hand poses that the caller gives, in their order; errors as DetectGrasps."""
+    """Scores the caller's edges or hand poses, in their order; errors as in DetectGrasps."""
     ListModels: _aio.UnaryUnaryMultiCallable[_grasp_pb2.ListModelsRequest, _grasp_pb2.ListModelsResponse]  # type: ignore[assignment]
     """Lists the weights that options.model can name."""
     ListRobots: _aio.UnaryUnaryMultiCallable[_grasp_pb2.ListRobotsRequest, _grasp_pb2.ListRobotsResponse]  # type: ignore[assignment]
     """Lists the robots that options.robot can name."""
     ReloadModels: _aio.UnaryUnaryMultiCallable[_grasp_pb2.ReloadModelsRequest, _grasp_pb2.ReloadModelsResponse]  # type: ignore[assignment]
-    """Loads weights anew, from where the server had them, and reads its tokens anew. The old weights
-    answer until the new ones are warm, and all that came before. Needs an admin token.
+    """Loads weights, tokens and certificates again from the same files. The old weights answer all
+    requests that arrive before the new ones are warmed up. Needs an admin token.
       FAILED_PRECONDITION  new weights cannot be used; the old ones still serve
       UNAUTHENTICATED      no token, or none that the server knows
       PERMISSION_DENIED    a token for detection only, or a server without admin tokens
@@ -120,10 +120,10 @@ class GraspServiceServicer(metaclass=_abc_1.ABCMeta):
         request_iterator: _MaybeAsyncIterator[_grasp_pb2.DetectGraspsStreamRequest],
         context: _ServicerContext,
     ) -> _typing.Union[_abc.Iterator[_grasp_pb2.DetectGraspsStreamResponse], _abc.AsyncIterator[_grasp_pb2.DetectGraspsStreamResponse]]:
-        """Finds grasps in one cloud after the other. Answers come in the order of the requests, one for
-        each; the error of a request is its answer, and the stream goes on. The server reads ahead a
-        few requests only: a client that sends faster waits. While the server stops, it answers what
-        it has read and ends the stream with UNAVAILABLE.
+        """Finds grasps in one cloud after the other. Each request gets one answer, in order; an error is
+        the answer to its request, and the stream goes on. The server reads only a few requests ahead,
+        so a client that sends faster has to wait. When the server stops, it answers what it has read
+        and ends the stream with UNAVAILABLE.
         """
 
     @_abc_1.abstractmethod
@@ -132,7 +132,7 @@ class GraspServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _grasp_pb2.ScoreGraspsRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_grasp_pb2.ScoreGraspsResponse, _abc.Awaitable[_grasp_pb2.ScoreGraspsResponse]]:
-        """Scores edges or hand poses that the caller gives, in their order; errors as DetectGrasps."""
+        """Scores the caller's edges or hand poses, in their order; errors as in DetectGrasps."""
 
     @_abc_1.abstractmethod
     def ListModels(
@@ -156,8 +156,8 @@ class GraspServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _grasp_pb2.ReloadModelsRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_grasp_pb2.ReloadModelsResponse, _abc.Awaitable[_grasp_pb2.ReloadModelsResponse]]:
-        """Loads weights anew, from where the server had them, and reads its tokens anew. The old weights
-        answer until the new ones are warm, and all that came before. Needs an admin token.
+        """Loads weights, tokens and certificates again from the same files. The old weights answer all
+        requests that arrive before the new ones are warmed up. Needs an admin token.
           FAILED_PRECONDITION  new weights cannot be used; the old ones still serve
           UNAUTHENTICATED      no token, or none that the server knows
           PERMISSION_DENIED    a token for detection only, or a server without admin tokens
