@@ -169,7 +169,7 @@ def _read_npz(data: bytes, max_points: int) -> CloudInput:
 
 def _unzipped(archive: zipfile.ZipFile, info: zipfile.ZipInfo, max_points: int) -> bytes:
     if info.compress_type not in UNZIPPED:
-        raise ValueError("compressed in another way than numpy does")
+        raise ValueError("compressed by a method that numpy does not use")
     # Six doubles per point and a header: more than any cloud of max_points needs.
     if info.file_size > 48 * max_points + 65536:
         value = f"an array of {info.file_size} bytes once unpacked"
@@ -280,11 +280,11 @@ def _read_ply(data: bytes, max_points: int) -> CloudInput:
     encoding = next((line[1] for line in lines if line[:1] == ["format"]), "")
     elements = [row for row, line in enumerate(lines) if line[:1] == ["element"]]
     if not elements or encoding not in PLY_ORDERS or lines[elements[0]][1] != "vertex":
-        raise ValueError("no format that is read, or the first element is no vertex")
+        raise ValueError("an unknown format, or a first element other than vertex")
     properties = lines[elements[0] + 1 : [*elements, None][1]]
     fields = [line[1:] for line in properties if line[:1] == ["property"]]
     if any(len(field) != 2 or field[0] not in PLY_TYPES for field in fields):
-        raise ValueError("a property of a vertex is no single number")
+        raise ValueError("a vertex property that is not a single number")
     record = _record(
         ((PLY_FIELDS.get(name, ""), PLY_TYPES[kind], 1) for kind, name in fields),
         PLY_ORDERS[encoding],

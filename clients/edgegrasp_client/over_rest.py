@@ -180,7 +180,7 @@ def _base64(value: object) -> str:
         value = value.tobytes()
     if isinstance(value, bytes):
         return base64.b64encode(value).decode("ascii")
-    raise TypeError(f"a {type(value).__name__} is no JSON value")
+    raise TypeError(f"a {type(value).__name__} is not a JSON value")
 
 
 def _described(problem: Mapping[str, Any], response: httpx.Response) -> GraspClientError:

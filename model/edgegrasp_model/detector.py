@@ -401,13 +401,13 @@ def _with_viewpoint(
         return options
     if seen_from_origin(sent.points, options.up):
         warnings.append(
-            "viewpoint is not given: the camera is assumed at the origin, in front of which "
-            "the whole cloud lies; send the camera's position where it is another."
+            "viewpoint is not given: the camera is assumed at the origin, as the whole cloud lies "
+            "in front of it; if the camera is elsewhere, send its position."
         )
         return options.model_copy(update={"viewpoint": (0.0, 0.0, 0.0)})
     if sent.normals is None:
         warnings.append(
-            "viewpoint is not given: normals are turned upward; send the camera's position."
+            "viewpoint is not given: normals are oriented upward; send the camera's position."
         )
     return options
 

@@ -30,7 +30,7 @@ def parse(schema: type[Schema], fields: object, name: str, known: Iterable[str] 
         raise InvalidRequest(field, "an unknown field", f"Remove it{there}.")
     value = "nothing" if kind == "missing" else brief(first["input"])
     if value.startswith(("'", "b'")) and field.endswith(".data"):
-        raise InvalidRequest(field, "no base64", "Send base64 in JSON.")
+        raise InvalidRequest(field, "invalid base64", "Send base64 in JSON.")
     if kind == "union_tag_invalid":
         fix = f"Set its kind to one of {first['ctx']['expected_tags']}"
     if kind == "model_type":

@@ -57,7 +57,7 @@ def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
         fix = f"{robot.joint_names[row]} moves between {low:g} and {high:g}: send where it is."
         raise InvalidRequest(f"options.robot.joints.{row}", f"{joints[row]:g}", fix)
     if options.collision.mode == "ignore":
-        fix = "Send avoid or penalise: an arm needs hands that touch nothing."
+        fix = "Send avoid or penalise: an arm needs hands without a collision."
         raise InvalidRequest("options.collision.mode", "'ignore' beside a robot", fix)
     if options.gripper not in (None, robot.gripper.name):
         fix = f"Leave it out: the robot {robot.name!r} has a {robot.gripper.name!r}."
@@ -391,11 +391,11 @@ def _told(
         warnings.append(NO_REACH)
     if asked.plan == "motion" and moving < within:
         warnings.append(
-            f"{within - moving} grasps within reach have no trajectory: none was found in time "
-            "that touches nothing."
+            f"{within - moving} grasps within reach have no trajectory: no collision-free one was "
+            "found in time."
         )
     if 2 in tiers:
-        warnings.append("time ran out before the arm was asked for every grasp.")
+        warnings.append("time ran out before the arm was planned for every grasp.")
     names = ["on_arm", "hand_collision", "out_of_reach", "arm_collision", "reachable"]
     if asked.place is not None:
         names.insert(-1, "no_place")

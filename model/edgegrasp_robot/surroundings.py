@@ -140,7 +140,7 @@ def surrounded(
             again = robot.model.scene(robot)
             with _standing_in([again], robot, obstacles):
                 pair = touching(again, robot.model, joints, names)
-            fix = "Send the joints as they are, T_base_cloud and obstacles in the right frame."
+            fix = "Send the actual joints and T_base_cloud, and obstacles in the cloud's frame."
             raise StartCollision("options.robot.joints", f"a start where {pair} touch", fix)
         yield around
 

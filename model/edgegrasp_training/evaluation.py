@@ -160,7 +160,7 @@ def read_outcomes(path: Path, digest: str) -> tuple[Float64, Float64]:
                 scores.append(float(outcome["score"]))
                 held.append(float(outcome["held"]))
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path}, line {number}: {error!r}. It is no outcome.") from None
+            raise ValueError(f"{path}, line {number}: {error!r}. It is not an outcome.") from None
     if not scores:
         weights = digest[:12]
         raise ValueError(f"{path}: no outcome of the weights {weights}. Name those that scored.")

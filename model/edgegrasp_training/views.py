@@ -125,7 +125,7 @@ def load_view(path: Path) -> LabelledView:
                 object_digests=tuple(map(str, arrays.get("object_digests", ()))),
             )
     except (KeyError, EOFError, BadZipFile) as error:
-        raise ValueError(f"data: {path} is no view of generate-data ({error}). Remove it") from None
+        raise ValueError(f"data: {path} is not a view ({error}). Remove it") from None
 
 
 def different(paths: Iterable[Path], name: Literal["engine", "gripper"]) -> set[str]:

@@ -64,7 +64,7 @@ class HarmfulRequest(InvalidRequest):
 
     def __init__(self) -> None:
         fix = "Send another cloud or other options; this request is refused for 10 minutes."
-        super().__init__("request", "one that ended the process that worked on it", fix)
+        super().__init__("request", "one that crashed a worker", fix)
 
 
 class DiskFull(EdgeGraspError):  # noqa: N818
@@ -83,9 +83,9 @@ class AddressInUse(EdgeGraspError):  # noqa: N818
     """A port or socket cannot be bound."""
 
     def __init__(self, transport: str, place: str, why: str) -> None:
-        port = f"another: --{transport.lower()}-port"
-        other = port if ":" in place else "a folder that exists: --host"
-        fix = f"Stop what listens there, or name {other}"
+        port = f"another port: --{transport.lower()}-port"
+        other = port if ":" in place else "another folder that exists: --host"
+        fix = f"Stop what listens there, or choose {other}"
         super().__init__(f"{transport}: cannot listen on {place} ({why}). {fix}.")
 
 
@@ -142,8 +142,8 @@ def report(error: Exception) -> Problem:
 
 def no_message(data: bytes) -> InvalidRequest:
     """The error for bytes that protobuf cannot read."""
-    value = f"{len(data)} bytes that are no message of this method"
-    return InvalidRequest("request", value, "Send a message as the .proto file has it.")
+    value = f"{len(data)} bytes that are not a message of this method"
+    return InvalidRequest("request", value, "Send a message as the .proto file defines it.")
 
 
 def problem_document(problem: Problem) -> bytes:

@@ -62,7 +62,7 @@ class Tokens:
         if found is None:
             raise Unauthenticated(HEADER, "a token that this server does not know", TOKEN_FIX)
         if admin and not found.is_admin:
-            raise PermissionDenied(HEADER, "a token that is good for detection only", ADMIN_FIX)
+            raise PermissionDenied(HEADER, "a token that permits detection only", ADMIN_FIX)
         return found
 
 
@@ -87,7 +87,7 @@ def _read_tokens(setting: str, path: Path | None) -> list[Token]:
         is_admin = setting.startswith("admin")
         tokens.append(Token(name or f"{setting} {number}", _digest(text), is_admin))
     if not tokens:
-        raise InvalidSettings(f"{setting}: got {str(path)!r}. It holds no token; write one a line.")
+        raise InvalidSettings(f"{setting}: got {str(path)!r}. It has no token; write one per line.")
     return tokens
 
 
@@ -151,4 +151,4 @@ class _RenewableContext(ssl.SSLContext):
 
 def _refuse_encrypted_key() -> str:
     """Called for an encrypted key, instead of a prompt on the terminal."""
-    raise ValueError("the key is encrypted, and nobody is there to ask")
+    raise ValueError("the key is encrypted; store it without a passphrase")

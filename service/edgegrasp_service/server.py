@@ -229,7 +229,7 @@ def warn(settings: Settings) -> None:
     if not local and settings.tls_certificate is None:
         logger.warning("%s: others can reach this server, and nothing is encrypted", settings.host)
     if not local and not (Tokens(settings).required or settings.tls_client_ca):
-        logger.warning("%s: others can reach this server, and it asks nobody who", settings.host)
+        logger.warning("%s: others can reach this server without a token", settings.host)
     for folder in settings.weights:
         if folder.is_dir() and not any(folder.glob("*.safetensors")):
             logger.warning("weights: %s holds no weights (*.safetensors)", folder)

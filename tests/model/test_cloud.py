@@ -61,7 +61,7 @@ def test_holes_of_an_organised_cloud_are_dropped_with_all_that_belongs_to_them()
         (GOOD * 1000, "cloud", "millimetres"),
         (GOOD + 2000, "cloud", "2000 m from the origin"),
         (GOOD[:5], "cloud", "5 points"),
-        (np.full((2, 3, 3), np.nan), "cloud", "holes only"),
+        (np.full((2, 3, 3), np.nan), "cloud", "no finite points"),
         (GOOD.reshape(3, 4, 3).astype(int), "cloud", "dtype"),
         (CloudInput(GOOD, normals=GOOD[:11]), "normals", "shape (11, 3)"),
         (CloudInput(GOOD, normals=GOOD.tolist()), "normals", "a list"),

@@ -541,7 +541,7 @@ def test_parts_of_a_table_that_was_cut_off_show_the_scale_and_one_cut_away_is_mi
 def test_the_flat_top_of_an_object_is_no_table_by_which_depths_are_scaled() -> None:
     top = np.random.default_rng(8).uniform((-0.07, -0.07, 0.07), (0.07, 0.07, 0.07), (2000, 3))
     left, warnings = built(top)
-    assert "are taken as they are" in warnings[0]
+    assert "are used as sent" in warnings[0]
     np.testing.assert_allclose(left[:, 2], 0.07, atol=0.001)
     with refusal("options.viewpoint"):  # which scaling needs
         select_points(

@@ -308,7 +308,7 @@ def test_messages_that_cannot_be_used(client, sent, make_cloud, make_image, came
     flat = make_cloud(cloud)
     flat.fields[0].name = "intensity"
     for scene, cluster, message in (
-        (Scene(), None, "No cloud and no depth image has come yet"),
+        (Scene(), None, "No cloud and no depth image has arrived yet"),
         (Scene(depth=image), None, "no CameraInfo yet"),
         (Scene(depth=image, camera=empty), None, "p and k are 0"),
         (Scene(depth=make_image(DEPTH, "bayer"), camera=camera), None, "encoding: got 'bayer'"),
@@ -367,7 +367,7 @@ def test_an_arm_is_where_it_is_before_the_first_scene(planning, make_cloud, clou
 
 @pytest.mark.parametrize(
     ("name", "joints", "message"),
-    [("other", {}, "robots are arm"), ("arm", {"a": 0.1}, "joint_states: none has come of 'b'")],
+    [("other", {}, "robots are arm"), ("arm", {"a": 0.1}, "joint_states: no position of 'b'")],
 )
 def test_an_arm_that_is_not_known_is_not_planned_for(
     planning, make_cloud, cloud, name, joints, message

@@ -46,7 +46,7 @@ def test_a_view_comes_back_with_the_hand_that_tried_its_grasps_other_files_do_no
     np.savez(file, depth=np.zeros(3))
     for content in (file.read_bytes(), file.read_bytes()[:99]):
         file.write_bytes(content)
-        with pytest.raises(ValueError, match="is no view"):
+        with pytest.raises(ValueError, match="is not a view"):
             load_view(file)
 
 

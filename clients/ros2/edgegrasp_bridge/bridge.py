@@ -198,7 +198,7 @@ def detect(
     if scene.header is None and object_cloud is not None:
         scene, object_cloud = scene._replace(cloud=object_cloud), None
     if scene.header is None:
-        raise ValueError("No cloud and no depth image has come yet.")
+        raise ValueError("No cloud and no depth image has arrived yet.")
     frame_id, stamp = scene.header.frame_id, scene.header.stamp
     asked = _from_frames(scene, settings, lookup) | dict(tracker.options() if tracker else options)
     if scene.mask is not None and object_cloud is None:
@@ -380,7 +380,7 @@ def _robot(
     joints = [scene.joints.get(name) for name in robot.joint_names]
     if None in joints and "joints" not in given:
         missing = robot.joint_names[joints.index(None)]
-        raise ValueError(f"joint_states: none has come of {missing!r}.")
+        raise ValueError(f"joint_states: no position of {missing!r} has arrived.")
     T_base_cloud = lookup(robot.base_frame, scene.header.frame_id, scene.header.stamp)
     return {"joints": joints, "T_base_cloud": T_base_cloud.ravel().tolist(), **given}
 

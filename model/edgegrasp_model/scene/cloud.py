@@ -84,7 +84,7 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
             row = kept if step == 1 else kept // narrow * (step * columns) + kept % narrow * step
             points = points.take(kept, axis=0)
             if len(points) == 0:
-                raise InvalidRequest("cloud", "holes only", "Send finite points among the holes.")
+                raise InvalidRequest("cloud", "no finite points", "Send an image with readings.")
         points = points.reshape(-1, 3)
     valid, low, high = _valid_points(points)
     row = np.arange(len(valid)) if row is None else row
@@ -165,7 +165,7 @@ def _beside(
         ids = array.reshape(-1)[row]
         for end in (int(ids.min(initial=0)), int(ids.max(initial=0))):
             if not -(2**31) <= end < 2**31:
-                raise InvalidRequest(field, f"the number {end}", "Send numbers of 32 bits.")
+                raise InvalidRequest(field, f"the number {end}", "Send 32-bit numbers.")
         return ids.astype(np.int64)
     values = np.ascontiguousarray(array.reshape(-1, width)[row], dtype=np.float32)
     if not np.isfinite(values).all():

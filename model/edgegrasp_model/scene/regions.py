@@ -33,7 +33,7 @@ def check_regions(cloud: CheckedCloud, options: DetectOptions) -> None:
     if options.at is not None:
         if cloud.image_size is None:
             fix = "Send near: x, y, z; or one depth image, or an organised cloud."
-            raise InvalidRequest("options.at", "a pixel of a cloud that is no image", fix)
+            raise InvalidRequest("options.at", "a pixel of a cloud that is not an image", fix)
         (column, row), (height, width) = options.at, cloud.image_size
         if column > width - 0.5 or row > height - 0.5:
             value = f"{column:g}, {row:g} of an image of {width} x {height} pixels"
@@ -87,7 +87,7 @@ def chosen_objects(
         else:
             wanted = wanted[:0]
             shown = ", ".join(f"{value:g}" for value in target)
-            warnings.append(f"{name}: no object that grasps may be for is at {shown}.")
+            warnings.append(f"{name}: there is no object to grasp at {shown}.")
     return np.where((number >= 0) & ~np.isin(number, wanted), FIXED, number)
 
 
@@ -97,7 +97,7 @@ def numbers_chosen(found: Int64, choice: ObjectChoice | str, warnings: list[str]
         return found
     if unknown := sorted({*choice.include, *choice.exclude} - {*found.tolist()}):
         here = ", ".join(map(str, found[:10])) or "none"
-        warnings.append(f"objects: no object is numbered {unknown[0]}; there are: {here}.")
+        warnings.append(f"objects: there is no object {unknown[0]}; there are: {here}.")
     wanted = found[np.isin(found, choice.include)] if choice.include else found
     return wanted[~np.isin(wanted, choice.exclude)]
 

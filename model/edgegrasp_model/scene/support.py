@@ -141,7 +141,7 @@ def choose_support(
             if found is None and (found := _assumed(seen, shown, objects, options)) is not None:
                 warnings.append(
                     "no support plane is seen: one is assumed under the lowest points. Send "
-                    "support, and null if there is none."
+                    "support (null if there is none)."
                 )
         if found is None:
             warnings.append(
@@ -369,11 +369,11 @@ def correct_depth_scale(
         scale = depth_scale(points[rows], viewpoint, plane)
         if scale is None:
             warnings.append(
-                f"{which} are taken as they are: no support plane is seen within "
+                f"{which} are used as sent: no support plane is seen within "
                 f"options.support.max_depth_error ({plane.max_depth_error:g}) of its place."
             )
         elif round(scale, 3) != 1.0:
-            warnings.append(f"{which} were multiplied by {scale:.3f}, as the support plane shows.")
+            warnings.append(f"{which} were multiplied by {scale:.3f} to fit the support plane.")
             points[rows] = viewpoint + scale * (points[rows] - viewpoint)
     return replace(sent, points=points)
 

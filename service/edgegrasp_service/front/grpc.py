@@ -319,7 +319,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
             return None if data is EOF else kind.FromString(data)
         except TimeoutError:
             value = f"nothing whole in {SMALL_READ_SECONDS:g} s"
-            raise RequestTimeout("request", value, "Send it at once.") from None
+            raise RequestTimeout("request", value, "Send it without delay.") from None
         except DecodeError:
             raise no_message(data) from None
 

@@ -240,7 +240,7 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
         if settings.samples is not None:
             if not settings.samples.is_dir():
                 raise InvalidSettings(
-                    f"samples: got {str(settings.samples)!r}, which is no folder."
+                    f"samples: got {str(settings.samples)!r}, which is not a folder."
                 )
             routes.append(Mount(f"{PLAYGROUND}samples", StaticFiles(directory=settings.samples)))
         routes.append(_file(PLAYGROUND, PLAYGROUND_FILES / "index.html"))

@@ -145,7 +145,7 @@ def read_json(field: str, text: bytes) -> Any:
     except (ValueError, RecursionError) as error:
         is_array = field in ("depth", *PER_POINT)  # perhaps an image of another format
         fix = "Send an .npy or .png file, or JSON." if is_array else "Send a JSON object."
-        raise InvalidRequest(field, f"no valid JSON ({error})", fix) from None
+        raise InvalidRequest(field, f"invalid JSON ({error})", fix) from None
 
 
 # Forms

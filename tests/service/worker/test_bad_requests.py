@@ -220,7 +220,7 @@ JSON_CASES = {
     "option twice": (
         b'{"points": [], "options": {"seed": 1, "seed": 2}}', "body", "the key 'seed'", "once"
     ),
-    "empty": (b"", "body", "no valid JSON", "object"),
+    "empty": (b"", "body", "invalid JSON", "object"),
     "deep": (b"[" * 10_000, "body", "", ""),
     "half a character": (b'{"\\ud800": 1}', "\\ud800", "unknown", "only"),
     "more lists than points have": (
