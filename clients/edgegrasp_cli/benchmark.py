@@ -36,9 +36,9 @@ class Cluster(BaseModel, use_attribute_docstrings=True):
     """The flags that choose the engine, the processes and the cluster."""
 
     engine: str | None = None
-    """pybullet or mujoco; else the protocol's, or the one that is installed"""
+    """pybullet or mujoco; default: the protocol's, or the one that is installed"""
     workers: int | None = None
-    """Processes; else one for each core. Same results"""
+    """Processes, which do not change results; default: one per core"""
     ray: str | None = None
     """Address of a Ray cluster to run on; local: this machine"""
 
@@ -47,23 +47,23 @@ class BenchmarkFlags(Cluster, PlannerFlags):
     """The flags of `edgegrasp benchmark`."""
 
     scene: str | None = None
-    """packed, pile, bin, bin-full, bin-deep, table or shelf; else the protocol's, or pile"""
+    """packed, pile, bin, bin-full, bin-deep, table or shelf; default: the protocol's, or pile"""
     protocol: str = "edgegrasp"
     """edgegrasp, giga, vgn, bin, table, shelf, ur5-pile, or a .toml file like them"""
     rounds: int | None = None
-    """Rounds for each seed; else the protocol's"""
+    """Rounds for each seed; default: the protocol's"""
     seed: tuple[int, ...] = ()
     """Seed of scenes, views and noise; may be repeated"""
     objects: Path | None = None
-    """Folder of SCENE/SPLIT/*.urdf, *.obj or *.stl; else the built-in objects"""
+    """Folder of SCENE/SPLIT/*.urdf, *.obj or *.stl; default: the built-in objects"""
     split: str = "test"
-    """Which of its objects: test or train"""
+    """Objects of this folder to use: test or train"""
     gripper: str | None = None
-    """Hand to grasp with: a gripper's name or .toml file; else the Panda"""
+    """Hand to grasp with: a gripper's name or .toml file; default: the Panda"""
     output: Path | None = None
-    """Folder for manifest, attempts, figures, report. The same again resumes"""
+    """Folder for manifest, attempts, figures and report; an existing one is resumed"""
     report: bool = True
-    """Write report.html, which takes a while"""
+    """Whether to write report.html, which takes a while"""
     gate: Path | None = None
     """summary.json of a result that this one must not fall below"""
 

@@ -158,16 +158,16 @@ Scene = RecordedScene | SimulatedScene
 @takes_flags()
 def benchmark_tracking(
     scenes: Annotated[
-        list[Path] | None, Option(help="Folder of recorded still scenes, .npz; else simulated.")
+        list[Path] | None, Option(help="Folder of recorded still scenes, .npz; default: simulated.")
     ] = None,
     objects: Annotated[
-        Path | None, Option(help="Folder of packed/test/*.urdf; else the built-in objects.")
+        Path | None, Option(help="Folder of packed/test/*.urdf; default: built-in objects.")
     ] = None,
     motion: Annotated[
-        list[str] | None, Option(help=f"{', '.join(MOTIONS)}; may be repeated; else all.")
+        list[str] | None, Option(help=f"{', '.join(MOTIONS)}; may be repeated; default: all.")
     ] = None,
     rounds: Annotated[int, Option(min=1, help="Simulated scenes for each motion.")] = 20,
-    seconds: Annotated[float | None, Option(min=0.1, help="In place of each motion's own.")] = None,
+    seconds: Annotated[float | None, Option(min=0.1, help="Default: each motion's own.")] = None,
     output: Annotated[Path, Option(help="Folder for results.json and jitter.svg.")] = Path(
         "results/tracking"
     ),

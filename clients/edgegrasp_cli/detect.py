@@ -35,7 +35,7 @@ class DetectorFlags(Connection):
     """The flags that choose a server, or a detector in this process."""
 
     server: str | None = None
-    """host:port (gRPC) or http://host:port; else in this process"""
+    """host:port (gRPC) or http://host:port; without it, in this process"""
     weights: tuple[Path, ...] = ()
     """Weights file or folder besides those that ship, without a server"""
     grippers: tuple[Path, ...] = ()
@@ -52,9 +52,9 @@ class DetectFlags(DetectorFlags):
     intrinsics: tuple[str, ...] = ()
     """Camera of --depth: fx,fy,cx,cy in pixels, or its 3 x 3 matrix as JSON"""
     pose: tuple[str, ...] = ()
-    """Camera of each --depth: 4 x 4 JSON, to the cloud's frame"""
+    """Pose of the camera of each --depth in the cloud's frame: 4 x 4 matrix as JSON"""
     depth_scale: float | None = None
-    """Metres for one unit of --depth (0.001; of floats 1)"""
+    """Metres for one unit of --depth (0.001; for floats 1)"""
     color: Path | None = None
     """Colours of the same pixels: .png or .npy"""
     mask: Path | None = None
@@ -62,15 +62,15 @@ class DetectFlags(DetectorFlags):
     picture: Path | None = None
     """Picture of the best grasps to write, .png or .jpg"""
     robot: str | None = None
-    """The server's robot of that name; else one that ships, or a file"""
+    """Robot of the server by name; without --server, one that ships, or a file"""
     joints: str | None = None
     """The robot's joints now: j1,j2,… in radians"""
     base: str | None = None
     """T_base_cloud, its 16 numbers row by row, or the 4 x 4 matrix as JSON"""
     place: str | None = None
-    """Where to put the object: {"region": {"min": …, "max": …}} or T_base_object, base frame"""
+    """Where to put the object, base frame: {"region": {"min": …, "max": …}} or T_base_object"""
     avoid_unseen: bool = False
-    """The robot's arm avoids what no camera saw behind a surface"""
+    """The arm avoids the space behind surfaces that no camera saw"""
     trajectory: Path | None = None
     """JSON file to write the arm's motion to the best pick to"""
 
@@ -82,13 +82,13 @@ def detect(
     ] = None,
     as_document: Annotated[bool, Option("--json", help="Print JSON, as the HTTP API.")] = False,
     options_file: Annotated[
-        Path | None, Option("--options", help="JSON file with options; flags beside it win.")
+        Path | None, Option("--options", help="JSON file with options; flags override it.")
     ] = None,
     *,
     asked: DetectFlags,
     options: dict[str, Any],
 ) -> None:
-    """Find grasps in a point cloud file or a depth image, by a server or in this process.
+    """Find grasps in a point cloud file or a depth image, on a server or in this process.
 
     Options are written as in query parameters of the HTTP API: numbers, words, x,y,z, or JSON.
 

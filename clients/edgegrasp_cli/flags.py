@@ -26,7 +26,7 @@ class Connection(BaseModel, use_attribute_docstrings=True):
     timeout: float = 60.0
     """Seconds to wait for a server"""
     token_file: Path | None = None
-    """File with the server's token; else EDGEGRASP_CLIENT_TOKEN"""
+    """File with the server's token; default: EDGEGRASP_CLIENT_TOKEN"""
     tls: bool = False
     """TLS over gRPC, trusting this machine's authorities"""
     tls_ca: Path | None = None
@@ -61,9 +61,9 @@ class PlannerFlags(Connection):
     timeout: float = 300.0
     """Seconds to wait for a server"""
     planner: str = "server"
-    """server, in-process, an installed one, or module:callable"""
+    """server, in-process, name of an installed planner, or module:callable"""
     server: str | None = None
-    """host:port (gRPC) or http://host:port; else one is started"""
+    """host:port (gRPC) or http://host:port; without it, one is started"""
     weights: tuple[Path, ...] = ()
     """Weights besides those that ship"""
     model: str = ""

@@ -54,9 +54,9 @@ Arm = Annotated[
 
 @takes_flags()
 def mcp(
-    folder: Annotated[Path, Option(help="Agents can name files below this folder.")] = Path(),
+    folder: Annotated[Path, Option(help="Folder whose files agents may read.")] = Path(),
     http: Annotated[
-        str | None, Option(help="HOST:PORT to serve HTTP at, under /mcp; else stdin and stdout.")
+        str | None, Option(help="HOST:PORT to serve /mcp at; default: stdin and stdout.")
     ] = None,
     *,
     asked: Server,
@@ -67,7 +67,7 @@ def mcp(
     it.
     """
     if not folder.is_dir():
-        raise ValueError(f"--folder: {folder} is no folder. Name one with clouds or images.")
+        raise ValueError(f"--folder: {folder} is not a folder. Name one with clouds or images.")
     host, _, port = (http or "0").rpartition(":")
     if not (port.isdecimal() and int(port) < 2**16):
         raise ValueError(f"--http: got {http!r}. Give HOST:PORT, such as 127.0.0.1:8090.")
@@ -232,7 +232,7 @@ class _Tools:
         if not path.is_relative_to(self._folder):
             raise ValueError(f"{name} is not below the folder. Name a file below it.")
         if not path.is_file():  # reading a pipe would block
-            raise ValueError(f"{name} is no file.")
+            raise ValueError(f"{name} is not a file.")
         return path
 
 

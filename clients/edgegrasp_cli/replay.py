@@ -28,11 +28,9 @@ def attempt(
     round: Annotated[int, Option(help="Number of the round, from 0.")] = 0,  # noqa: A002
     number: Annotated[int, Option("--attempt", help="Number of the attempt in it, from 0.")] = 0,
     seed: Annotated[
-        int | None, Option(help="Seed of the round; else the benchmark's first.")
+        int | None, Option(help="Seed of the round; default: the benchmark's first.")
     ] = None,
-    objects: Annotated[
-        Path | None, Option(help="Object folder, if it is elsewhere by now.")
-    ] = None,
+    objects: Annotated[Path | None, Option(help="Object folder, if it has moved.")] = None,
     picture: Annotated[
         Path | None, Option(help="PNG to write: the cloud seen, and the gripper.")
     ] = None,

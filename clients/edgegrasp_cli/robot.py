@@ -9,7 +9,7 @@ from typer import Argument, Option, Typer
 
 from edgegrasp_model.errors import EdgeGraspError
 
-robot = Typer(help="Make and check robot files.", no_args_is_help=True)
+robot = Typer(help="Make and check robot files.", no_args_is_help=True, add_completion=False)
 
 NO_OFFSET = """
 [T_flange_hand]
@@ -55,13 +55,13 @@ def add(
         raise
     finally:
         if output.exists():
-            print(f"{output}: now set T_flange_hand, and {', '.join(TO_EDIT)} if need be.")
+            print(f"{output}: now set T_flange_hand, and {', '.join(TO_EDIT)} if needed.")
 
 
 @robot.command()
 def check(
     file: Annotated[Path, Argument(help="Robot file, .toml, or a name of one that ships.")],
-    picture: Annotated[Path | None, Option(help="Picture of it at its home, .png.")] = None,
+    picture: Annotated[Path | None, Option(help="PNG to write: the arm at its home.")] = None,
 ) -> None:
     """Load a robot file, print its facts, and draw the arm at its home.
 

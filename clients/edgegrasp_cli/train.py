@@ -20,7 +20,7 @@ class DataFlags(GenerationOptions, Cluster):
     """The flags of `edgegrasp generate-data`."""
 
     objects: Path | None = None
-    """Folder packed/train, pile/train; else the built-in objects"""
+    """Folder with packed/train and pile/train; default: the built-in objects"""
 
 
 @takes_flags()
@@ -31,7 +31,7 @@ def generate_data(
 ) -> None:
     """Make labelled edge grasps: views of random clutter, grasps tried in simulation.
 
-    Views that are there already are kept, so that the same command continues where it stopped.
+    Existing views are kept, so that the same command continues where it stopped.
     """
     from edgegrasp_sim.engine import choose_engine
     from edgegrasp_training.generation import generate, missing_scenes
@@ -64,9 +64,9 @@ class TrainFlags(TrainingOptions, use_attribute_docstrings=True):
     start_from: Path | None = None
     """Weights of the same model to start from; use a lower --learning-rate"""
     outcomes: Path | None = None
-    """File of a server's /v1/outcomes: only recalibrate --start-from on it"""
+    """Outcomes file of a server: recalibrate --start-from on it, without training"""
     validation_share: float = 0.1
-    """Share of the scenes kept apart"""
+    """Share of the scenes kept for validation"""
     device: str = "cpu"
     """cpu or cuda"""
 
@@ -81,8 +81,8 @@ def train(
 ) -> None:
     """Train weights on labelled views.
 
-    The run folder gets log.csv, the weights with the least validation loss, and when training is
-    done a model card. Running the same command again continues from the last state.
+    The run folder gets log.csv, the weights with the least validation loss, and a model card when
+    training is done. The same command run again continues from the last state.
     """
     from edgegrasp_model.detector import choose_device
     from edgegrasp_training.evaluation import recalibrate
@@ -93,7 +93,7 @@ def train(
 
     if asked.outcomes is not None:
         if asked.start_from is None or data:
-            raise ValueError("--outcomes: name the weights that scored by --start-from, no data.")
+            raise ValueError("--outcomes: name the weights with --start-from, and give no data.")
         print(recalibrate(asked.start_from, asked.outcomes, asked.run))
         return
     if not data:

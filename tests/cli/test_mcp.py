@@ -116,7 +116,7 @@ async def test_a_camera_pose_puts_answers_into_the_base_frame(dummy_server, fold
 
 def test_no_folder_and_an_address_without_a_port_are_named(refused) -> None:
     done = run(sys.executable, *PROGRAM, "--folder", "/nonexistent", code=1)
-    assert "/nonexistent is no folder" in done.stderr
+    assert "/nonexistent is not a folder" in done.stderr
     for http in ("somewhere", "127.0.0.1:", "127.0.0.1:99999"):
         assert f"--http: got '{http}'. Give HOST:PORT" in refused("mcp", "--http", http)
 
