@@ -328,7 +328,7 @@ def test_a_server_with_tokens_is_asked_with_one(start_dummy, open_page, tmp_path
     (tmp_path / "tokens").write_text("a-token-of-this-test\n")
     with start_dummy("--token-file", str(tmp_path / "tokens")) as server:
         page = open_page(server.http_url)
-        page.get_by_text("This server asks for a token.").wait_for()
+        page.get_by_text("This server needs a token.").wait_for()
         page.locator("#token").fill("a-token-of-this-test")
         page.locator("#token").press("Enter")
         assert len(shown(page)) == 10

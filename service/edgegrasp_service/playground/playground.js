@@ -7,7 +7,7 @@ import { View, colorOf, partsOf } from "./view.js";
 const API = new URL("..", import.meta.url).href.replace(/\/$/, ""); // the server's own address
 const MOST_REJECTED = 300; // shown; more would hide the cloud
 const REASONS = {
-  direction: "moves in a way not allowed", support: "goes below the support", "not-checked": "left out, not checked",
+  direction: "direction not allowed", support: "below the support", "not-checked": "left out, not checked",
   collision: "collides", "not-scored": "left out, not scored", "low-score": "scores too low",
   suppressed: "near a better one", "beyond-top-k": "beyond top_k",
 };
@@ -27,7 +27,7 @@ function picture() {
   try {
     return new View($("stage"), { picked: choose, edited: readShape, drawn: takeDrawn, aimed: takePoint, object: (number) => aim({ objects: { include: [number] } }) });
   } catch (error) {
-    say("The picture needs WebGL, which this browser does not have or has switched off.", true);
+    say("The picture needs WebGL, which this browser lacks or has switched off.", true);
     throw error;
   }
 }
@@ -156,7 +156,7 @@ async function ask() {
   try {
     asked = options();
   } catch (error) {
-    return say(error instanceof SyntaxError ? "More options: no valid JSON." : error.message, true);
+    return say(error instanceof SyntaxError ? "More options: invalid JSON." : error.message, true);
   }
   state.busy?.abort();
   const stop = (state.busy = new AbortController());
@@ -200,7 +200,7 @@ async function call(path, { headers = {}, ...rest } = {}) {
   if (answer.status === 401) {
     $("token_row").hidden = false;
     $("token").focus();
-    throw new Error(token ? "The server does not know this token." : "This server asks for a token.");
+    throw new Error(token ? "The server does not know this token." : "This server needs a token.");
   }
   const body = await answer.json();
   if (!answer.ok) throw Object.assign(new Error(body.detail ?? `${answer.status}`), { kind: body.type });
@@ -407,7 +407,7 @@ function aim(target) {
 /** Ask for the grasps of the object that is seen at a point, cloud frame. */
 function takePoint(point) {
   press(null);
-  if (!point) return say("No point there; click one of the cloud.", true);
+  if (!point) return say("There is no point here; click on one of the cloud.", true);
   const [x, y, z] = point;
   const { camera, image } = state.scene;
   if (image) return aim({ at: [Math.round((camera.fx * x) / z + camera.cx), Math.round((camera.fy * y) / z + camera.cy)] });
@@ -453,9 +453,9 @@ function typeShape(name) {
 function takeDrawn(points) {
   const name = state.drawing;
   press(null);
-  if (!points.length) return say("No points in there; draw around some.", true);
+  if (!points.length) return say("There are no points inside; draw around some.", true);
   setShape(name, view.boxAround(points, name === "region"));
-  say(`A box around ${points.length.toLocaleString("en")} points; move or size it, then ask again.`);
+  say(`A box around ${points.length.toLocaleString("en")} points; move or resize it, then ask again.`);
 }
 
 /** Show which of the drawing and editing buttons is at work. */
@@ -486,7 +486,7 @@ $("pick").addEventListener("click", ({ target }) => {
   if (!state.scene) return;
   const on = target.getAttribute("aria-pressed") !== "true";
   press(on ? target : null);
-  if (on) say("Click a point of the object that is meant.");
+  if (on) say("Click on a point of the object to grasp.");
 });
 $("play").addEventListener("click", () => view.playArm(state.answer.grasps[state.chosen].arm.trajectory));
 $("robot").addEventListener("change", () => {
@@ -512,12 +512,12 @@ document.addEventListener("click", ({ target, detail }) => {
     const around = view.boxAround([view.target ?? view.middle], draw === "region");
     setShape(draw, { ...around, half_extents: [0.05, 0.05, 0.05] });
     $(`${draw}_center`).focus();
-    say("A box of 10 cm; type where and how large, then ask again.");
+    say("A box of 10 cm: type its centre and size, then ask again.");
   } else if (draw && state.scene) {
     state.drawing = draw;
     press(target);
     view.startDrawing();
-    say("Drag a rectangle around what is meant.");
+    say("Drag a rectangle around the points to enclose.");
   } else if (edit) {
     const on = target.getAttribute("aria-pressed") !== "true";
     press(on ? target : null);
@@ -553,7 +553,7 @@ function copyText(text) {
 function typed(id, count) {
   const found = numbers($(id).value, count);
   if (found || !$(id).value.trim()) return found;
-  throw new Error(`${$(id).labels[0].textContent.trim()}: ${count} numbers are needed, with commas between them.`);
+  throw new Error(`${$(id).labels[0].textContent.trim()}: ${count} numbers are needed, separated by commas.`);
 }
 
 function numbers(text, count) {
