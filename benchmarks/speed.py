@@ -218,7 +218,7 @@ def camera_table(results: dict[str, Any]) -> str:
         if of:
             spread = f", {min(of):.0f} to {max(of):.0f} in {len(of)} real scenes"
             rows.append((size, f"{statistics.median(of):.0f} ms{spread if len(of) > 1 else ''}"))
-    head = "`edgegrasp-plus`, what a camera sends to ranked grasps", "one thread"
+    head = "`edgegrasp-plus`, from image to ranked grasps", "one thread"
     return "\n".join(views.table(head, rows))
 
 
@@ -228,23 +228,24 @@ def table(results: dict[str, Any]) -> str:
     for name, scenes in results["shipped"].items():
         for scene, of in scenes.items():
             times = (f"{1000 * of[key]:.0f} ms" for key in ("seconds_1", "seconds_2"))
-            rows.append((f"`{name}`, cloud to ranked grasps", scene, *times))
-    lines = views.table(("the table given", "scene", "one thread", "two threads"), rows)
+            rows.append((f"`{name}`", scene, *times))
+    head = "from cloud to ranked grasps, support plane given", "scene", "one thread", "two threads"
+    lines = views.table(head, rows)
     machine, server = results["machine"], results["server"]
     rows = []
     for kind, engines in results["simulator"].items():
         for engine, of in engines.items():
             cells = (f"{of[name]:.0f}" for name in ("labels_per_second", "rounds_per_minute"))
             rows.append((engine, kind, *cells))
-    head = "simulator", "scene", "labels a second and core", "rounds a minute and core"
+    head = "simulator", "scene", "labels per second and core", "rounds per minute and core"
     text = (
-        f"Processor seconds on one thread of an {machine['processor']} with "
-        f"{machine['capability']} ({machine['gflops']:.0f} GFLOP/s in float32), on two "
-        f"threads seconds of the clock; medians of {RUNS} interleaved runs, 32 approach "
-        f"points, at most 2,000 candidates, one view. "
+        f"Processor time on one thread of an {machine['processor']} with "
+        f"{machine['capability']} ({machine['gflops']:.0f} GFLOP/s in float32), wall-clock "
+        f"time on two; medians of {RUNS} interleaved runs, 32 approach points, at most 2,000 "
+        f"candidates, one view. "
         f"The server is ready after {server['ready_seconds']:.1f} s and takes "
         f"{server['rest_mb']:.0f} MB at rest, {server['used_mb']:.0f} MB after ten "
-        f"requests. A label or a round of the simulator includes its scene and images."
+        f"requests. The time of a label or a round includes its scene and images."
     )
     return "\n".join([*lines, "", *views.table(head, rows), "", text])
 
