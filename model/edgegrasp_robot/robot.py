@@ -235,7 +235,11 @@ def _kinematics(
     found = [joint.find("axis") for joint in joints]
     axes = np.array([(1, 0, 0) if one is None else one.get("xyz", "").split() for one in found])
     axes = axes.astype(np.float64)
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    lengths = np.linalg.norm(axes, axis=1, keepdims=True)
+    if not lengths.all():
+        still = joints[int(lengths.argmin())].get("name")
+        raise ValueError(f"joint {still}: got axis 0 0 0. Give its direction.")
+    axes /= lengths
     return {
         "frames": np.ravel(frames).tolist(),
         "axes": np.ravel(axes).tolist(),

@@ -87,6 +87,7 @@ def test_meshes_lie_beside_their_urdf_and_one_that_is_wrong_says_how(tmp_path, m
         ('velocity="1"', 'velocity="0"', r"max_velocity: got \[0\.0\]"),
         ('lower="-1" upper="1"', "", "joint turn: got limits none and none"),
         ("<axis", '<mimic joint="other"/><axis', "joint turn follows another one"),
+        ('xyz="0 0 1"', 'xyz="0 0 0"', "joint turn: got axis 0 0 0"),
         ('"revolute"', '"planar"', "joint turn is planar"),
         ('<mesh filename="tip.obj"/>', '<box size="-1 1 1"/>', "a <collision> of tip is wrong"),
         ("<link", "<<link", "urdf: r.urdf is not XML"),
