@@ -214,7 +214,7 @@ def _near_points(points: Floats) -> Int64:
         raise InvalidRequest(
             "cloud",
             f"an extent of {bulk:.4g} m, which suggests millimetres",
-            "Send metres: divide by 1000.",
+            "Send metres: divide by 1000, or send a depth image with depth_scale 0.001.",
         )
     return np.flatnonzero(distance <= MAX_EXTENT / 2)
 
