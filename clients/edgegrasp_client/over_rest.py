@@ -37,7 +37,7 @@ class RestTransport:
     """Posts over connections that are kept open; raises GraspClientErrors."""
 
     def __init__(self, address: str, token: str | None, tls: Tls | None) -> None:
-        transport = None
+        self._address, transport = address, None
         if tls is not None and not address.startswith("https:"):
             raise invalid("tls", f"a Tls for {address}", "Give an https:// address.")
         if address.startswith(HTTP_OVER_UNIX):
@@ -100,7 +100,7 @@ class RestTransport:
         except httpx.TimeoutException as error:
             raise errors.DeadlineError(f"No answer in time ({type(error).__name__}).") from None
         except (httpx.HTTPError, RuntimeError) as error:  # the latter of a closed client
-            why = f"No connection: {error or type(error).__name__}"
+            why = f"No connection to {self._address}: {error or type(error).__name__}"
             raise errors.ServerUnavailableError(why) from None
         try:
             body = response.json()
