@@ -4,6 +4,8 @@ import importlib
 import sys
 from typing import Annotated, Any
 
+if sys.version_info < (3, 11):
+    sys.exit("edgegrasp: the commands need Python 3.11 or newer; 3.10 runs the Python client only.")
 try:
     import typer
     from typer.core import TyperCommand, TyperGroup
