@@ -1,6 +1,7 @@
 """The program `edgegrasp`: a table of commands, whose modules are imported when they run."""
 
 import importlib
+import os
 import sys
 from typing import Annotated, Any
 
@@ -50,6 +51,8 @@ class LazyGroup(TyperGroup):
             name = ctx.invoked_subcommand
             if isinstance(error, ModuleNotFoundError):
                 sys.exit(_missing(name, error))
+            if name is None or isinstance(error, BrokenPipeError):
+                raise
             own = type(error).__module__.startswith("edgegrasp_")
             if own or isinstance(error, (ValueError, OSError)):
                 sys.exit(f"edgegrasp {name}: {error}")
@@ -103,5 +106,14 @@ def _common(
 
 
 def main() -> None:
-    """Run the program."""
-    app()
+    """Run the program; a full disk ends it with a message, a closed pipe without one."""
+    try:
+        try:
+            app()
+        finally:
+            if sys.stdout is not None:  # it was closed from the start
+                sys.stdout.flush()  # Python would at exit, with a traceback
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        quiet = isinstance(error, BrokenPipeError)
+        sys.exit(1 if quiet else f"edgegrasp: standard output: {error}")

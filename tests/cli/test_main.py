@@ -3,6 +3,7 @@
 import importlib.metadata
 import json
 import os
+import shlex
 import signal
 import sys
 from pathlib import Path
@@ -64,6 +65,16 @@ def test_version_short_help_completion_and_an_unknown_command(run) -> None:
     asked |= {"_EDGEGRASP_COMPLETE": "complete_bash"}
     done = CliRunner().invoke(main.app, [], prog_name="edgegrasp", env=asked)
     assert "--viewpoint" in done.output.split()
+
+
+def test_a_full_disk_is_named_and_a_closed_pipe_is_not() -> None:
+    for words in (["--version"], ["--help"]):
+        shown = shlex.join([*EDGEGRASP, *words])
+        full = run_program("bash", "-c", f"{shown} > /dev/full", code=1).stderr
+        assert "No space left on device\n" in full
+        assert full.count("\n") == 1
+        closed = f"set -o pipefail; {{ sleep 0.1; {shown}; }} | true"
+        assert run_program("bash", "-c", closed, code=1).stderr == ""
 
 
 @pytest.mark.parametrize(
