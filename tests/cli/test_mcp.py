@@ -139,7 +139,7 @@ MASKED_CLOUD = {"point_cloud_file": "cloud.npy", "mask_file": "mask.png"}
     [
         (CLOUD, {"point_cloud_file": "none.npy"}, "none.npy"),
         (CLOUD, {"point_cloud_file": "../outside.npy"}, "not below"),
-        (CLOUD, {"point_cloud_file": "pipe.npy"}, "no file"),
+        (CLOUD, {"point_cloud_file": "pipe.npy"}, "not a file"),
         (CLOUD, {"object": "bottle"}, "object"),
         (CLOUD, {"num_grasps": -3}, "greater than or equal to 1"),
         (CLOUD, {"robot": {"name": "r2d2", "joints": [0.0]}}, "options.robot.name"),

@@ -131,7 +131,7 @@ def test_one_of_the_objects_by_number_by_pixel_or_by_place(catalogue) -> None:
     with refusal("options.at"):
         objects(at=(WIDTH, 0))
     image = image.reshape(-1, 3)[np.isfinite(image).all(axis=2).ravel()]
-    with refusal("options.at", "no image"):
+    with refusal("options.at", "not an image"):
         objects(at=(u, v))
 
 

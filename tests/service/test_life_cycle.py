@@ -199,7 +199,7 @@ async def test_sockets_of_a_folder(serve, transport: str, cloud: np.ndarray) -> 
                 await serve(host=f"unix:{folder}")
             running.stop.set()
             await running.serving
-    with pytest.raises(AddressInUse, match="name a folder that exists: --host"):
+    with pytest.raises(AddressInUse, match="choose another folder that exists: --host"):
         await serve(host=f"unix:{folder}")  # gone
 
 

@@ -191,7 +191,7 @@ def test_bad_files_are_named_and_a_comment_may_follow_a_token(tmp_path: Path) ->
         (None, "cannot be read"),
         (b"short\n", "got 5 letters as token 1"),
         (f"{USER}\ntwo words of enough letters\n".encode(), "token 2"),
-        (b"# none\n", "It holds no token"),
+        (b"# none\n", "It has no token"),
         (b"\xff\xfe", "cannot be read"),
     ):
         if text is not None:

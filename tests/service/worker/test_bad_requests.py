@@ -329,7 +329,7 @@ def test_a_good_form() -> None:
         (grasp_pb2.DetectGraspsRequest(points=bytes(11)), "points", "11 bytes"),
         (grasp_pb2.DetectGraspsRequest(points=bytes(12), normals=b"a"), "normals", "1 bytes"),
         (grasp_pb2.DetectGraspsRequest(), "cloud", "nothing"),
-        (b"\xff\xff\xff", "request", "3 bytes that are no message"),
+        (b"\xff\xff\xff", "request", "3 bytes that are not a message"),
     ],
 )
 def test_bad_messages(body: Any, field: str, value: str) -> None:
