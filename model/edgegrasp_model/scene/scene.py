@@ -54,6 +54,7 @@ REACH = 0.25  # metres around an object in which a hand at it may collide
 FOLLOWED_REACH = 0.16  # the same if only known grasps are checked
 PLAN_CELL = 0.05  # metres
 CLOSE = 0.06  # metres; no camera measures closer
+SPARE = 0.0015  # metres that hands stay above a support plane that was found, not given
 CUT_OUT = 0.95  # confidence of clusters where a cloud was cut off above its support
 
 
@@ -287,7 +288,7 @@ def build_scene(
         approach_allowed=approach,
         contact_allowed=contact,
         object_of_point=number,
-        support=None if support is None else plane_in_frame(support.plane, frame),
+        support=None if support is None else _plane_under_hands(support, options, frame),
         at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, sent.points),
         viewpoints=None if viewpoints is None else frame.points(viewpoints).astype(np.float32),
         confidence=selected.confidence,
@@ -295,6 +296,16 @@ def build_scene(
         P_image_cloud=_projection(sent, viewpoints, frame),
         corrected=selected.corrected,
     )
+
+
+def _plane_under_hands(
+    support: Support, options: DetectOptions, frame: CanonicalFrame
+) -> SupportPlane:
+    """The plane that hands stay above: one that was found is right within about SPARE."""
+    plane = plane_in_frame(support.plane, frame)
+    if isinstance(options.support, SupportPlane):
+        return plane
+    return plane.model_copy(update={"offset": plane.offset + SPARE})
 
 
 def _projection(
