@@ -493,6 +493,24 @@ def test_the_floor_of_a_bin_counts_and_not_the_table_beside_it(seed: int) -> Non
     assert found.share == pytest.approx(8000 / len(points), abs=0.01)  # of all points
 
 
+@pytest.mark.parametrize("below", [0.25, 0.9])  # the median is over the lid, or under it
+def test_a_lid_that_a_quarter_of_the_objects_lie_below_is_no_support(below: float) -> None:
+    """The top of one object of a heap that fills the view is classified as support."""
+    rng = np.random.default_rng(0)
+    lid = rng.uniform((-0.2, 0.0, 0.1), (0.2, 0.2, 0.1), (2000, 3))
+    height = np.where(rng.random(4000) < below, 0.04, 0.14)
+    heap = np.column_stack([rng.uniform((-0.2, -0.2), (0.2, 0.0), (4000, 2)), height])
+    points = np.concatenate([lid, heap])
+    points = (points + rng.normal(0, 0.001, points.shape)).astype(np.float32)
+    number = np.repeat([FIXED, 0], [len(lid), len(heap)])
+    up, of_object = np.array([0.0, 0.0, 1.0]), (number == 0).astype(np.float32)
+    shown = Segmentation(number, of_object, 1 - of_object, np.ones(1), up)
+    seen, inside = Seen(points, np.array([0.0, 0.0, 0.8])), np.ones(len(points), dtype=bool)
+    warnings: list[str] = []
+    assert choose_support(seen, inside, shown, number == 0, parse_options({}), warnings) is None
+    assert "no support plane is seen" in warnings[0]
+
+
 def seen_wrong(points: np.ndarray, factor: float, camera: np.ndarray = CAMERA) -> np.ndarray:
     """The points as a camera sees them whose depths are wrong by a factor."""
     return (camera + factor * (points - camera)).astype(np.float32)

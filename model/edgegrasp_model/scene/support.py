@@ -21,6 +21,7 @@ GIVEN_MARGIN = 0.005  # metres over a plane that is given
 DEVIATIONS = 4.0  # of its own points that still belong to it
 BOW = 0.025  # metres by which a bowed support may rise over its plane
 TILT = math.radians(30)  # between the plane and a given `up`
+MOST_BELOW = 0.1  # of the points of objects that may lie below what they stand on
 NEAR_OBJECTS, FAR_WEIGHT = 0.15, 0.1  # metres around an object; what points count elsewhere
 CLOSE, CLOSER = 0.08, (0.008, 0.005, 0.004)  # metres around an object; from the plane there
 FEWEST = 60  # points that a plane is fitted to, and by which its residual is measured
@@ -167,17 +168,22 @@ def _fitted(
     weight = np.where(np.isfinite(apart), 1.0, FAR_WEIGHT)
     up = shown.up if up is None else up
     plane = fit_plane(part, weight, rng, up)
-    if plane is not None and len(held) and np.median(plane.heights(around)) < -MOST_MARGIN:
+    if plane is not None and _objects_below(plane, around):
         # This plane is the top of something larger, and the objects stand below it.
         weight[plane.heights(part.points) > -MOST_MARGIN] = 0.0
         plane = fit_plane(part, weight, rng, up)
-    if plane is None:
+    if plane is None or _objects_below(plane, around):
         return None
     found = measured(part, _close_to(plane, part.points[apart < CLOSE]), THICK, True)
     places = found.frame.points(part.points)
     if _area(places[np.abs(places[:, 2]) < MOST_MARGIN]) <= LEAST_AREA:
         return None
     return replace(found, share=found.share * len(on) / len(seen.points))  # of all that is seen
+
+
+def _objects_below(plane: SupportPlane, around: Float32) -> bool:
+    """Whether too many points of objects (N, 3) lie below a plane for these to stand on it."""
+    return len(around) > 0 and bool((plane.heights(around) < -MOST_MARGIN).mean() > MOST_BELOW)
 
 
 def _assumed(
