@@ -117,10 +117,10 @@ def outline_grasps(
     pose[:, 3, 3] = 1.0
     depth = np.maximum(edge[2][row], 0.0)
     hands = Candidates(pair[row], approach[row], contact, depth, width, pose)
-    return _inserted(points, hands, support, gripper, margin)
+    return inserted(points, hands, support, gripper, margin)
 
 
-def _inserted(
+def inserted(
     points: Float32,
     candidates: Candidates,
     support: SupportPlane | None,
