@@ -231,8 +231,7 @@ def test_debug_returns_the_cloud_and_every_candidate_with_what_became_of_it() ->
 
 
 def test_a_catalogue_finds_weights_by_their_file_name(tmp_path: Path) -> None:
-    metadata = replace(detector().metadata, name="mine")
-    save_checkpoint(tmp_path / "mine.safetensors", detector().network, metadata)
+    save_checkpoint(tmp_path / "mine.safetensors", detector().network, detector().metadata)
     catalogue = ModelCatalogue.load([tmp_path], default="mine")
     assert {"mine", "edgegrasp-plus"} <= {row["name"] for row in catalogue.describe()}
     assert catalogue.get("").metadata.name == "mine"

@@ -50,7 +50,7 @@ def save_checkpoint(path: Path, network: nn.Module, metadata: CheckpointMetadata
 def load_checkpoint(
     path: Path, device: torch.device | str = "cpu"
 ) -> tuple[nn.Module, CheckpointMetadata]:
-    """Load a checkpoint, the network in evaluation mode; raises InvalidCheckpoint."""
+    """Load a checkpoint under its file's name, in evaluation mode; raises InvalidCheckpoint."""
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
             text = (file.metadata() or {}).get(_METADATA_KEY)
@@ -61,7 +61,7 @@ def load_checkpoint(
             f"checkpoint: got {path}, which cannot be read as safetensors ({error}). "
             "Give a complete file written by `edgegrasp train` or `edgegrasp import-checkpoint`."
         ) from error
-    metadata = replace(_read_metadata(path, text), digest=digest)
+    metadata = replace(_read_metadata(path, text), digest=digest, name=path.stem)
     for name, tensor in tensors.items():
         if not tensor.isfinite().all():
             raise InvalidCheckpoint(
