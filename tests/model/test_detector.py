@@ -1,7 +1,6 @@
 """A cloud in, ranked grasps out; and the catalogue of models."""
 
 from collections import Counter
-from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, parse_options
 from edgegrasp_model.ranking import top_down_first
 from edgegrasp_model.results import Outcome
+from edgegrasp_model.scene import network
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Detection, Grasp
 
@@ -55,6 +55,15 @@ def test_the_seed_decides_not_the_order_of_the_points_or_an_empty_previous() -> 
     assert one.counts == other.counts
     for a, b in zip(one.grasps, other.grasps, strict=True):
         np.testing.assert_allclose(a.T_cloud_hand, b.T_cloud_hand, atol=1e-4)
+
+
+def test_no_loop_is_compiled_again_for_the_read_only_cloud_of_a_message() -> None:
+    cloud = CLOUD.astype(np.float32)
+    found = detect(cloud, support="auto")
+    before = network._render.signatures[:]  # type: ignore[attr-defined]  # of Numba
+    cloud.setflags(write=False)
+    assert same(found, detect(cloud, support="auto"))
+    assert network._render.signatures == before != []  # type: ignore[attr-defined]
 
 
 def test_an_obstacle_may_be_as_thin_as_a_number_is() -> None:
