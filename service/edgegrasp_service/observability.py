@@ -222,12 +222,9 @@ class Metrics:
         self._gauge = partial(Gauge, namespace="edgegrasp", registry=self.registry)
         calls = ("transport", "method")
         self._requests = counter("requests", "requests answered", (*calls, "code"))
-        self._seconds = histogram(
-            "request_seconds", "from headers to answer", calls, buckets=SECONDS
-        )
-        self._stages = histogram(
-            "stage_seconds", "stages of a request", ("stage",), buckets=SECONDS
-        )
+        seconds = partial(histogram, buckets=SECONDS)
+        self._seconds = seconds("request_seconds", "from headers to answer", calls)
+        self._stages = seconds("stage_seconds", "stages of a request", ("stage",))
         self._candidates = histogram("candidates", "candidates of a detection", buckets=MANY)
         self._grasps = histogram("grasps_returned", "grasps of a detection", buckets=FEW)
         self._results = counter("stream_results", "results sent on streams", ("code",))

@@ -116,11 +116,9 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
             **{f"/{SERVICE.full_name}/{name}": (name, does) for name, does in ours.items()},
             CHECK: ("HealthCheck", self._check_health),
             f"/{HEALTH}/Watch": ("HealthWatch", self._watch_health),
-            **{
-                f"/{name}/ServerReflectionInfo": ("Reflection", self._reflect)
-                for name in REFLECTION
-            },
         }
+        for name in REFLECTION:
+            self._behaviours[f"/{name}/ServerReflectionInfo"] = "Reflection", self._reflect
         self.server = aio.server(options=_bounds(service.settings))
         self.server.add_generic_rpc_handlers((self,))
         # It has a queue of its own: no other calls come before it.
@@ -209,12 +207,11 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                 await behave(call, context)
             except Cancelled:
                 raise asyncio.CancelledError from None  # an error could not be sent either
-            except EdgeGraspError as error:
-                await _abort(call, context, report(error))
             except aio.AbortError:
                 raise
             except Exception as error:
-                logger.exception("%s failed", method)
+                if not isinstance(error, EdgeGraspError):
+                    logger.exception("%s failed", method)
                 await _abort(call, context, report(error))
 
     async def _answer(self, method: Method, call: Call, context: Any) -> None:

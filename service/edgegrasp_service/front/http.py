@@ -283,8 +283,7 @@ class _Work:
                 more = message.get("more_body", False)
             content_type = headers.get("content-type", "")
             query = scope["query_string"].decode("latin-1")
-            whole = cast(bytes, body)  # not copied
-            job = Job(self.method, "http", whole, content_type=content_type, query=query)
+            job = Job(self.method, "http", cast(bytes, body), 0.0, content_type, query)  # no copy
             answering = asyncio.create_task(service.answer(call, job))
             leaving = asyncio.create_task(_disconnected(receive))
             try:

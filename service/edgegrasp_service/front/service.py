@@ -143,9 +143,12 @@ class GraspService:
         self.check_size(call.bytes_in)
         self.admission.resize(call, call.bytes_in)
         job = replace(job, request_id=call.request_id)
+        now = time.monotonic()
+        for one in [one for one, (until, _) in self._deaths.items() if until <= now]:
+            del self._deaths[one]
         if self._deaths:
-            until, deaths = self._deaths.get(await asyncio.to_thread(_digest, job), (0.0, 0))
-            if deaths >= MOST_DEATHS and time.monotonic() < until:
+            _, deaths = self._deaths.get(await asyncio.to_thread(_digest, job), (0.0, 0))
+            if deaths >= MOST_DEATHS:
                 raise HarmfulRequest()
         worker = await self.pool.take()
         call.end_stage("wait")
