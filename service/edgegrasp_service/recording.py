@@ -38,9 +38,8 @@ class Recorder:
             with os.scandir(folder) as found:
                 files = [(one.path, one.stat().st_size) for one in found if one.name[-4:] == ".job"]
         except OSError as error:
-            raise InvalidSettings(
-                f"record_folder: got {str(folder)!r}. {error.strerror}."
-            ) from None
+            why = f"record_folder: got {str(folder)!r}. {error.strerror}."
+            raise InvalidSettings(why) from None
         self._folder = folder
         self._most = most
         self._hold = hold

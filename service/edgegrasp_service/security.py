@@ -72,9 +72,8 @@ def _read_tokens(setting: str, path: Path | None) -> list[Token]:
     try:
         lines = [line.partition("#")[0].strip() for line in path.read_text().splitlines()]
     except (OSError, UnicodeDecodeError) as error:
-        raise InvalidSettings(
-            f"{setting}: got {str(path)!r}. It cannot be read: {error}."
-        ) from None
+        why = f"{setting}: got {str(path)!r}. It cannot be read: {error}."
+        raise InvalidSettings(why) from None
     tokens: list[Token] = []
     for line in filter(None, lines):
         number = len(tokens) + 1

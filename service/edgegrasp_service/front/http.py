@@ -237,12 +237,10 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
         found |= {file.stem: load_gripper(file) for file in settings.grippers}
         grippers = JSONResponse(jsonable_encoder(found))
         routes.append(Route(f"{PLAYGROUND}grippers.json", grippers, methods=["GET"]))
-        if settings.samples is not None:
-            if not settings.samples.is_dir():
-                raise InvalidSettings(
-                    f"samples: got {str(settings.samples)!r}, which is not a folder."
-                )
-            routes.append(Mount(f"{PLAYGROUND}samples", StaticFiles(directory=settings.samples)))
+        if (folder := settings.samples) is not None:
+            if not folder.is_dir():
+                raise InvalidSettings(f"samples: got {str(folder)!r}, which is not a folder.")
+            routes.append(Mount(f"{PLAYGROUND}samples", StaticFiles(directory=folder)))
         routes.append(_file(PLAYGROUND, PLAYGROUND_FILES / "index.html"))
         routes += _files(PLAYGROUND, PLAYGROUND_FILES)
     return Router(routes, redirect_slashes=False)
