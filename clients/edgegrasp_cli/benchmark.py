@@ -188,7 +188,7 @@ def compare(
         row = figures[name]
         difference = {"value": row["difference"], "wilson_95": row["difference_95"]}
         table.add_row(f"{label} %", *map(percent, (row["first"], row["second"], difference)))
-    console = Console()
+    console = Console(markup=False, emoji=False)
     console.print(table)
     better, worse = figures["second_better"], figures["second_worse"]
     console.print(
@@ -257,7 +257,7 @@ def run_rounds(
 def _print_summary(summary: dict[str, Any], planner: str) -> None:
     from edgegrasp_sim.results import RATE_LABELS, over_seeds, percent
 
-    console = Console(highlight=False, markup=False, soft_wrap=True)
+    console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
     gsr, dr = (
         f"{percent(rate)} %, {over_seeds(rate)} over seeds"
         for rate in (summary["grasp_success_rate"], summary["declutter_rate"])

@@ -118,7 +118,7 @@ def _write(
         shown = Table(*columns, box=None)
         for row in rows:
             shown.add_row(*row)
-        Console().print(shown)
+        Console(markup=False, emoji=False).print(shown)
     print(f"report: {output / 'index.html'}")
 
 
@@ -218,11 +218,7 @@ def _sentence(figures: SceneFigures) -> str:
 
 
 def draw(
-    path: Path,
-    scene: RealScene,
-    grasps: Sequence[Any],
-    plane: tuple[Any, float] | None,
-    title: str,
+    path: Path, scene: RealScene, grasps: Sequence[Any], plane: tuple[Any, float] | None, title: str
 ) -> None:
     """Write a picture: the camera's image with the grasps, and both support planes.
 

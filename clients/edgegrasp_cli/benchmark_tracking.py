@@ -306,7 +306,7 @@ def _print(rows: dict[str, dict[str, Any]]) -> None:
             *(str(row[name]) for name in held),
             "-" if row["alike"] is None else f"{row['alike']:.0%}",
         )
-    Console(width=110).print(table)
+    Console(width=110, markup=False, emoji=False).print(table)
 
 
 def _plot(path: Path, done: dict[str, list[Followed]]) -> None:

@@ -294,7 +294,7 @@ def percent(rate: dict[str, Any]) -> str:
 def over_seeds(rate: dict[str, Any]) -> str:
     """Mean of the seeds' rates, and standard deviation where there are several, in per cent."""
     numbers = (rate["mean_over_seeds"], rate["std_over_seeds"])
-    return " ± ".join(f"{100 * number:.1f}" for number in numbers if number is not None)
+    return " ± ".join(f"{100 * number:.1f}" for number in numbers if number is not None) or "none"
 
 
 def _rate(
