@@ -73,13 +73,17 @@ class ObjectModel:
 
     @property
     def files(self) -> list[Path]:
-        """Its URDF file and the meshes that it names, sorted by name; ValueError: no XML."""
+        """Its URDF file and the meshes that it names, sorted by name; ValueError: unusable."""
         try:
-            meshes = ElementTree.parse(self.urdf).iter("mesh")
+            root = ElementTree.parse(self.urdf).getroot()
         except ElementTree.ParseError as error:
             raise ValueError(f"{self.urdf} cannot be read: {error}") from error
-        named = {self.urdf.parent / mesh.get("filename", "") for mesh in meshes}
-        return sorted({self.urdf} | {path for path in named if path.is_file()})
+        if (links := len(root.findall("link"))) != 1:
+            raise ValueError(f"{self.urdf} has {links} links; describe an object as one link")
+        named = {self.urdf.parent / mesh.get("filename", "") for mesh in root.iter("mesh")}
+        if missing := sorted(str(path) for path in named if not path.is_file()):
+            raise ValueError(f"{self.urdf} names {missing[0]}, which is no file; correct the path")
+        return sorted({self.urdf} | named)
 
     @property
     def digest(self) -> str:

@@ -86,6 +86,9 @@ def test_shapes_are_read_as_they_are_described(tmp_path: Path) -> None:
     (tmp_path / "shapes.urdf").write_text(SHAPES.replace("two.obj", "two.dae"))
     with pytest.raises(ValueError, match=r"two\.dae is not an OBJ file"):
         read_urdf(tmp_path / "shapes.urdf", 1.0)
+    (tmp_path / "shapes.urdf").write_text(SHAPES.replace("2 1 1", "2 1"))
+    with pytest.raises(ValueError, match="scale of its mesh is '2 1'; write 3 numbers"):
+        read_urdf(tmp_path / "shapes.urdf", 1.0)
 
 
 def test_both_engines_see_the_same() -> None:
@@ -220,6 +223,10 @@ def test_folders_are_read_in_order_of_names(tmp_path: Path) -> None:
     assert objects.name == "packed/train"
     with pytest.raises(ValueError, match=r"a\.urdf cannot be read"):
         assert objects.digest
+    for text, message in ((SHAPES, r"two\.obj, which is no file"), ("<robot/>", "has 0 links")):
+        (folder / "a.urdf").write_text(text)
+        with pytest.raises(ValueError, match=rf"a\.urdf .*{message}"):
+            assert objects.digest
 
 
 @pytest.fixture(scope="module")

@@ -138,20 +138,20 @@ def _parts(element: ElementTree.Element, urdf: Path) -> list[Surface]:
         if file.suffix.lower() != ".obj":
             raise ValueError(f"its mesh {file.name} is not an OBJ file; convert it")
         parts = [part for _, part in read_obj(file)]
-        size = _numbers(shape, "scale", "1 1 1")
+        size = _numbers(shape, "scale", 3, "1 1 1")
     elif shape.tag == "box":
         signs = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3), axis=-1).reshape(-1, 3)
-        points = signs * _numbers(shape, "size")
+        points = signs * _numbers(shape, "size", 3)
     elif shape.tag == "cylinder":
         angle = 2 * np.pi / SIDES * np.arange(SIDES)
-        ring = _numbers(shape, "radius") * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        half = 0.5 * float(_numbers(shape, "length")[0])
+        ring = _numbers(shape, "radius", 1) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        half = 0.5 * _numbers(shape, "length", 1)[0]
         points = np.concatenate([np.insert(ring, 2, end, axis=1) for end in (-half, half)])
     elif shape.tag == "sphere":
         z = np.linspace(-1.0, 1.0, BALL)
         angle = np.pi * (1 + 5**0.5) * np.arange(BALL)
         around = np.stack([np.cos(angle), np.sin(angle)]) * np.sqrt(1 - z * z)
-        points = _numbers(shape, "radius") * np.stack([*around, z], axis=1)
+        points = _numbers(shape, "radius", 1) * np.stack([*around, z], axis=1)
     else:
         raise ValueError(f"its shape {shape.tag} is unknown; use box, cylinder, sphere or mesh")
     if shape.tag != "mesh":
@@ -163,9 +163,12 @@ def _origin(element: ElementTree.Element) -> tuple[Matrix, Rotation]:
     origin = element.find("origin")
     if origin is None:
         return np.zeros(3), Rotation.identity()
-    turn = Rotation.from_euler("xyz", _numbers(origin, "rpy", "0 0 0"))
-    return _numbers(origin, "xyz", "0 0 0"), turn
+    turn = Rotation.from_euler("xyz", _numbers(origin, "rpy", 3, "0 0 0"))
+    return _numbers(origin, "xyz", 3, "0 0 0"), turn
 
 
-def _numbers(element: ElementTree.Element, name: str, default: str = "") -> Matrix:
-    return np.array([float(word) for word in element.get(name, default).split()])
+def _numbers(element: ElementTree.Element, name: str, count: int, default: str = "") -> Matrix:
+    text = element.get(name, default)
+    if len(words := text.split()) != count:
+        raise ValueError(f"{name} of its {element.tag} is {text!r}; write {count} numbers")
+    return np.array([float(word) for word in words])
