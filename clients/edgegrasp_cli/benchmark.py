@@ -110,6 +110,8 @@ def _plan(
     if hand is not None:
         options = options | {"gripper": hand}
     if asked.robot is not None:
+        if asked.gripper is not None:
+            raise ValueError(f"gripper is {asked.gripper}; leave it out: {asked.robot} has its own")
         arm, hand, fields = benchmark_arm(asked.robot, rules.camera)
         options = fields | options
     config = BenchmarkConfig(

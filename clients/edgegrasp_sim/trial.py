@@ -174,6 +174,8 @@ class RoundDriver:
 
     def execute(self, grasp: PlannedGrasp, planning_seconds: float = 0.0) -> Attempt:
         """Execute a grasp planned in the last view; raises ValueError unless its pose is rigid."""
+        if not isinstance(grasp, PlannedGrasp):
+            raise ValueError(f"the planner returned {type(grasp)}; return a PlannedGrasp or None")
         result = self.simulation.execute_grasp(grasp.T_world_hand, grasp.motion)
         attempt = Attempt(
             cause=result.cause,

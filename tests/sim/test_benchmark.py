@@ -121,6 +121,8 @@ def test_wrong_settings_are_refused(tmp_path: Path) -> None:
         run_benchmark(config, make_planner, workers=2)
     with pytest.raises(ValueError, match="workers is 0"):
         run_benchmark(replace(config, objects=None), make_planner, workers=0)
+    with pytest.raises(ValueError, match="returned <class 'int'>; return a PlannedGrasp or None"):
+        run_benchmark(replace(config, objects=None), lambda: lambda *_: 7)
 
 
 def test_a_killed_run_goes_on_and_changes_nothing(alone, tmp_path) -> None:
@@ -190,6 +192,7 @@ def test_the_side_view_is_where_giga_has_it() -> None:
         ("views = 1", "views = 0", "camera.views: .* greater than 0"),
         ("num_objects = [5]", "num_objects = []", "scene.num_objects: .* at least 1 item"),
         ("packed_scale = [0.7", "packed_scale = [nan", "scene.packed_scale"),
+        ("radius = [0.6", "radius = [0.9", "camera.radius: .* lower end first"),
         ("version = 3", 'version = 3\nbase = "vgn"\n[rounds]', "rounds: Input"),
         ('table = "known"', 'table = "guess"', "planning.table: .* 'known', 'seen', 'around'"),
         ("version = 3", "version = ", "protocol .*toml"),
