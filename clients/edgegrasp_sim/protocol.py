@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, NonNegativeFloat, PositiveInt, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, PositiveInt, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from edgegrasp_sim.camera import TableView, ViewRange
@@ -19,16 +19,23 @@ from edgegrasp_sim.surroundings import OPEN_THICKNESS
 
 FOLDER = Path(__file__).parent / "protocols"
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
-Range = tuple[float, float]
+
+
+def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError(f"got {ends}; give the lower end first")
+    return ends
+
+
+Range = Annotated[tuple[float, float], AfterValidator(_ascending)]
 
 
 @dataclass(frozen=True, config=STRICT)
 class SceneRules:
     """The objects on the table."""
 
-    num_objects: Annotated[
-        tuple[PositiveInt, ...], Field(min_length=1)
-    ]  # how many objects to try to place, in turn from round to round
+    # How many objects to try to place, in turn from round to round.
+    num_objects: Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
     packed_scale: Range  # range of the factor on the objects' size in packed scenes and on tables
     pile_scale: Range  # range of that factor in piles and bins
     table_thickness: float = OPEN_THICKNESS  # of packed and pile scenes, metres
@@ -47,6 +54,9 @@ class RoundRules:
 class CameraRules(ViewRange):
     """Where the camera stands; ranges are drawn from uniformly before every grasp."""
 
+    radius: Range
+    polar_degrees: Range
+    azimuth_degrees: Range
     views: PositiveInt  # images before every grasp, spread evenly over a full turn from the first
 
 
@@ -54,7 +64,8 @@ class CameraRules(ViewRange):
 class NoiseRules(DepthNoise):
     """Noise of the depth image, see `DepthNoise`, and of the points made from it."""
 
-    point_std: NonNegativeFloat = 0.0  # standard deviation of each coordinate of each point, metres
+    # Standard deviation of each coordinate of each point, metres.
+    point_std: Annotated[float, Field(ge=0.0)] = 0.0
     # Kind of camera whose faults the images have besides; `random`: another before every grasp.
     sensor: Literal["", "random", "structured-light", "stereo", "time-of-flight"] = ""
 
