@@ -88,6 +88,12 @@ class Trainer:
         )
         self.step, self.best_loss = 0, float("inf")
         self.seconds = 0.0  # spent in training steps
+        # What decides every step.
+        self.recipe = options.model_dump(include={*TrainingOptions.model_fields}) | {
+            "data": [path.name for path in train_paths],
+            "teacher": teacher and teacher.metadata.digest,
+            "start_from": self.start and self.start[1].digest,
+        }
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).is_file():
             state = torch.load(folder / STATE_FILE, weights_only=True, map_location=device)
@@ -98,6 +104,12 @@ class Trainer:
                 raise ValueError(
                     f"run: {folder} holds another model. Name another folder"
                 ) from None
+            begun = state.get("recipe", self.recipe)
+            if changed := [name for name in begun if begun[name] != self.recipe[name]]:
+                raise ValueError(
+                    f"run: {folder} was begun with another {', '.join(changed)}. "
+                    "Repeat that command, or name another folder"
+                )
             for name in COUNTERS:
                 setattr(self, name, state[name])
         else:
@@ -288,7 +300,7 @@ class Trainer:
             writer.writerow(row)
 
     def _save_state(self) -> None:
-        state = {name: getattr(self, name) for name in COUNTERS}
+        state = {name: getattr(self, name) for name in (*COUNTERS, "recipe")}
         state |= {name: getattr(self, name).state_dict() for name in STATEFUL}
         partial = self.folder / (STATE_FILE + ".partial")
         torch.save(state, partial)

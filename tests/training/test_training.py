@@ -107,6 +107,8 @@ def test_pausing_and_resuming_is_the_same_as_going_through(make_trainer, tmp_pat
     resumed.run(ignore, until=14)
     assert resumed.step == through.step == 14
     assert same_weights(through, resumed)
+    with pytest.raises(ValueError, match=r"was begun with another seed\."):
+        make_trainer(tmp_path / "paused", network, seed=1)
     other = make_trainer(tmp_path / "other", network, seed=1)
     other.run(ignore, until=3)
     assert not same_weights(through, other)
