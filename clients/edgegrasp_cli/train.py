@@ -149,7 +149,7 @@ def generate_scenes(
 def train_scene(
     data: Annotated[Path, Argument(help="Folder from generate-scenes.")],
     run: Annotated[Path, Option(help="Folder for checkpoints and the log.")],
-    minutes: Annotated[float, Option(min=0.0, help="How long.")] = 70.0,
+    minutes: Annotated[float, Option(min=0.01, help="How long.")] = 70.0,
     threads: Annotated[int, Option(min=1, help="Threads of the processor.")] = 2,
     seed: Annotated[int, Option(min=0, help="Seed of weights and batches.")] = 0,
     start_from: Annotated[Path | None, Option(help="Weights to continue from.")] = None,

@@ -22,6 +22,7 @@ from scipy.special import logit as logit_of
 from scipy.stats import mannwhitneyu
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
+from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_model.hand_description import BEYOND
 from edgegrasp_model.networks.checkpoint import load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
@@ -116,8 +117,7 @@ def write_model_card(
     """Write a card in Markdown, with the evaluation before calibration."""
     network = {name: value for name, value in asdict(metadata.network).items() if value != ()}
     facts = network | {"voxel_size": metadata.voxel_size, "gripper": metadata.gripper}
-    facts |= metadata.training
-    facts |= {
+    facts |= metadata.training | {
         "validation_loss": f"{evaluation.loss:.4f} nats",
         "validation_accuracy": f"{100 * evaluation.accuracy:.1f} %",
         "validation_AUROC": f"{evaluation.auroc:.4f}",
@@ -282,7 +282,10 @@ def main() -> None:
     parser.add_argument("data", type=Path, nargs="+", help="folders of views")
     parser.add_argument("--weights", type=Path, nargs="+", required=True)
     given = parser.parse_args()
-    scored = score_views(find_views(given.data), given.weights)
+    try:
+        scored = score_views(find_views(given.data), given.weights)
+    except (EdgeGraspError, ValueError, OSError) as error:
+        sys.exit(f"{parser.prog}: {error}")
     sys.stdout.write(reliability_tables(scored, list(map(str, given.weights))) + "\n")
 
 

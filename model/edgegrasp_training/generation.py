@@ -120,6 +120,8 @@ def generate(
     found = {"engine": choose_engine(options.engine)}
     # Other machines find files at whole paths too.
     weights, objects = (path and path.resolve() for path in (options.weights, objects))
+    if weights is not None and not weights.is_file():  # not only once a scene is cleared by them
+        raise ValueError(f"weights: got {weights}, which is no file. Name a .safetensors file")
     options = options.model_copy(update=found | {"weights": weights})
     if other := different(folder.glob("*.npz"), "engine") - {options.engine}:
         raise ValueError(
