@@ -35,18 +35,16 @@ def translation(x: float, y: float, z: float) -> Matrix:
     return T
 
 
-def require_pose(T: ArrayLike, field: str) -> Matrix:
-    """Check that `T` is a finite rigid transform (4, 4); the ValueError names `field`."""
-    matrix = np.asarray(T, dtype=np.float64)
-    if matrix.shape != (4, 4):
-        raise ValueError(f"{field} has shape {matrix.shape}; pass one 4 x 4 transform")
-    if not np.isfinite(matrix).all():
-        raise ValueError(f"{field} holds values that are not finite; pass a rigid transform")
+def require_pose(T_world_hand: ArrayLike) -> Matrix:
+    """Check that the pose of a hand is a finite rigid transform (4, 4); raises ValueError."""
+    matrix = np.asarray(T_world_hand, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ValueError(f"T_world_hand is {matrix.tolist()}; pass one finite 4 x 4 transform")
     rotation = matrix[:3, :3]
-    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if error > 1e-3 or np.linalg.det(rotation) < 0:
+    error, det = float(np.abs(rotation @ rotation.T - np.eye(3)).max()), np.linalg.det(rotation)
+    if error > 1e-3 or det < 0:
         raise ValueError(
-            f"{field} is not a rigid transform (R Rᵀ is off the identity by {error:.3g}, "
-            f"det {np.linalg.det(rotation):.3g}); pass a right-handed rotation without scale"
+            f"T_world_hand is not a rigid transform (R Rᵀ is off the identity by {error:.3g}, det "
+            f"{det:.3g}); pass a right-handed rotation without scale"
         )
     return matrix

@@ -167,19 +167,14 @@ def without_too_wide(item: Round) -> Round:
 def by_object(rounds: Sequence[Round]) -> dict[str, dict[str, int]]:
     """For each object: how often it was present, removed, aimed at, and held when aimed at."""
     attempts = [attempt for item in rounds for attempt in item.attempts]
-    present = Counter(name for item in rounds for name in item.objects)
-    removed = Counter(attempt.object for attempt in attempts if attempt.object is not None)
-    aimed = Counter(attempt.target for attempt in attempts)
-    held = Counter(a.target for a in attempts if a.success and not a.wrong_object)
-    return {
-        name: {
-            "present": present[name],
-            "removed": removed[name],
-            "attempts": aimed[name],
-            "successes": held[name],
-        }
-        for name in sorted(present)
+    counts: dict[str, Counter[Any]] = {
+        "present": Counter(name for item in rounds for name in item.objects),
+        "removed": Counter(attempt.object for attempt in attempts),
+        "attempts": Counter(attempt.target for attempt in attempts),
+        "successes": Counter(a.target for a in attempts if a.success and not a.wrong_object),
     }
+    names = sorted(counts["present"])
+    return {name: {key: each[name] for key, each in counts.items()} for name in names}
 
 
 def attempts_digest(rounds: Sequence[Round]) -> str:

@@ -128,11 +128,7 @@ TIME_OF_FLIGHT = DepthSensor(
     baseline=0.0, window=1, fattening=0.0, flying=0.5, noise_floor=0.0010, noise_growth=0.0010,
     noise_pixels=1, warp=0.002, disparity_step=0.0, grazing=82.0, missing=0.005,
 )  # fmt: skip
-SENSORS = {
-    "structured-light": STRUCTURED_LIGHT,
-    "stereo": STEREO,
-    "time-of-flight": TIME_OF_FLIGHT,
-}
+SENSORS = {"structured-light": STRUCTURED_LIGHT, "stereo": STEREO, "time-of-flight": TIME_OF_FLIGHT}
 
 
 def random_sensor(rng: np.random.Generator) -> DepthSensor:

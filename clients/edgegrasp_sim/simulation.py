@@ -155,9 +155,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         return self.num_objects
 
     def reset_from_poses(
-        self,
-        placements: Sequence[ObjectPlacement],
-        surroundings: Surroundings = OPEN_TABLE,
+        self, placements: Sequence[ObjectPlacement], surroundings: Surroundings = OPEN_TABLE
     ) -> None:
         """Put objects exactly at the given poses, at rest, without simulating."""
         self._clear(surroundings)
@@ -171,10 +169,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         self._gripper = self._add_gripper()
 
     def move(
-        self,
-        number: int,
-        position: Sequence[float],
-        quaternion_xyzw: Sequence[float],
+        self, number: int, position: Sequence[float], quaternion_xyzw: Sequence[float]
     ) -> None:
         """Move one of the `placements`, by its index, without simulating."""
         if self._rest_state is not None:
@@ -292,7 +287,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
     def _run(
         self, T_world_hand: ArrayLike, *, to_the_end: bool, shake: bool = False
     ) -> GraspResult:
-        T = require_pose(T_world_hand, "T_world_hand")
+        T = require_pose(T_world_hand)
         self._restore_rest()
         return run_grasp(
             self._hand,

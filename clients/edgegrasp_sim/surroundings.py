@@ -18,10 +18,7 @@ TABLE_FRICTION = 0.5
 WALL_FRICTION = 0.5
 SUPPORT_CLEARANCE = 0.005  # metres over the table at which the workspace begins
 # Lowest and highest corner of where grasps are looked for on an open table.
-WORKSPACE = (
-    (0.02, 0.02, TABLE_HEIGHT + SUPPORT_CLEARANCE),
-    (SIZE - 0.02, SIZE - 0.02, SIZE),
-)
+WORKSPACE = ((0.02, 0.02, TABLE_HEIGHT + SUPPORT_CLEARANCE), (SIZE - 0.02, SIZE - 0.02, SIZE))
 MIDDLE = SIZE / 2  # metres, x and y of the middle of every scene
 
 Span = tuple[float, float]  # least and greatest, metres

@@ -107,10 +107,7 @@ def _runner(made: bytes) -> Callable[[Any], Any]:
 
 
 def _on_ray(
-    address: str,
-    make_runner: MakeRunner[Task, Result],
-    tasks: Sequence[Task],
-    workers: int | None,
+    address: str, make_runner: MakeRunner[Task, Result], tasks: Sequence[Task], workers: int | None
 ) -> Iterator[tuple[Task, Result]]:
     """Run on Ray as tasks, not actors: those of a lost machine are run again elsewhere."""
     try:

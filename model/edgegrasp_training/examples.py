@@ -166,10 +166,7 @@ class Teacher:
 
 
 def pack_balls(
-    grasps: TriedGrasps,
-    balls: Int64,
-    config: NetworkConfig,
-    soft_labels: SoftLabels | None = None,
+    grasps: TriedGrasps, balls: Int64, config: NetworkConfig, soft_labels: SoftLabels | None = None
 ) -> Packed:
     """Pack candidates in balls, rows (A,) of a view; detector's axes, multiples of LENGTH_UNIT."""
     rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, balls))
@@ -207,10 +204,7 @@ def pack_balls(
 
 
 def pack_hands(
-    grasps: TriedGrasps,
-    balls: Int64,
-    config: NetworkConfig,
-    rng: np.random.Generator | None = None,
+    grasps: TriedGrasps, balls: Int64, config: NetworkConfig, rng: np.random.Generator | None = None
 ) -> Packed:
     """Pack the hand network's inputs in balls, rows (A,) of the cloud."""
     seen = grasps.seen

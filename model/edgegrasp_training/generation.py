@@ -349,10 +349,7 @@ def label(
 
 
 def choose_grasps(
-    query: Query,
-    options: GenerationOptions,
-    rng: np.random.Generator,
-    guide: GraspDetector | None,
+    query: Query, options: GenerationOptions, rng: np.random.Generator, guide: GraspDetector | None
 ) -> tuple[SelectedPoints, Scene, Candidates, int | None] | None:
     """Sample candidates of a view as the detector does and choose some; None without any.
 

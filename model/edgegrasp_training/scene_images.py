@@ -179,11 +179,7 @@ def _cast(
 
 
 def _faults(
-    scene: SceneMeshes,
-    depth: Float64,
-    label: NDArray[np.uint8],
-    camera: Intrinsics,
-    pose: Float64,
+    scene: SceneMeshes, depth: Float64, label: NDArray[np.uint8], camera: Intrinsics, pose: Float64
 ) -> tuple[Float64, NDArray[np.uint8]]:
     """The image with a real camera's faults, NaN without a reading, and its labels."""
     rng = scene.rng

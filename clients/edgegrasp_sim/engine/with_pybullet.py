@@ -284,19 +284,17 @@ class PybulletHand(PybulletBody, Hand):
         self.client.setJointMotorControl2(self.uid, link, mode, **goal, **gain)
 
 
-def _hull(client: _Client, mesh: str, quaternion_xyzw: Vector) -> int:
-    shape = client.createCollisionShape(
+def _hull(client: _Client, mesh: str, quaternion_xyzw: Vector) -> Any:
+    return client.createCollisionShape(
         pybullet.GEOM_MESH, fileName=str(_MESHES / mesh), collisionFrameOrientation=quaternion_xyzw
     )
-    return int(shape)
 
 
-def _boxes(client: _Client, parts: Parts) -> int:
-    shape = client.createCollisionShapeArray(
+def _boxes(client: _Client, parts: Parts) -> Any:
+    return client.createCollisionShapeArray(
         shapeTypes=[pybullet.GEOM_BOX] * len(parts),
         halfExtents=[(np.ptp(part, axis=0) / 2).tolist() for part in parts],
         collisionFramePositions=[
             ((part.min(axis=0) + part.max(axis=0)) / 2).tolist() for part in parts
         ],
     )
-    return int(shape)
