@@ -42,7 +42,7 @@ class TrainingOptions(BaseModel, extra="forbid"):
     steps: int = Field(20_000, ge=1, description="Number of training steps")
     views_per_step: int = Field(4, ge=1, description="Views in a step")
     balls_per_view: int = Field(8, ge=1, description="Balls of each view in a step")
-    learning_rate: float = Field(1e-3, description="At the start; falls to 0 at the last step")
+    learning_rate: float = Field(1e-3, gt=0, description="At the start; falls to 0 in the end")
     rotations: Literal["any", "none"] = Field(
         "any", description="Random rotations of training balls, for edgegrasp networks"
     )
