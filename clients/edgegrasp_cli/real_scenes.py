@@ -307,10 +307,12 @@ def _plane(arrays: _Arrays) -> tuple[Float64 | None, float]:
     """Normal (3,) and offset of the support plane; None and 0 if the file has neither."""
     if not {"support_normal", "support_offset"} & arrays.arrays.keys():
         return None, 0.0
-    normal = arrays.get("support_normal", "f", "three numbers, of length 1", (3,))
+    normal = arrays.get("support_normal", "fiu", "three numbers, of length 1", (3,))
     if not abs(np.linalg.norm(normal) - 1.0) <= 1e-3:  # nor NaN
         arrays.refuse("support_normal", f"length {np.linalg.norm(normal):g}", "a unit normal")
-    offset = float(arrays.get("support_offset", "f", "one number, metres", ()))
+    offset = float(arrays.get("support_offset", "fiu", "one number, metres", ()))
+    if not offset < 0.0:
+        arrays.refuse("support_offset", f"{offset:g}, a camera below", "a plane with its normal up")
     return normal.astype(np.float64), offset
 
 
@@ -318,7 +320,7 @@ def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32]:
     """The detector's input, and the points (H, W, 3) or (N, 3), NaN without a reading."""
     if "depth" in arrays.arrays:
         depth = arrays.get("depth", "u", "(H, W) uint16 millimetres")
-        values = arrays.get("intrinsics", "f", "fx, fy, cx, cy beside depth", (4,)).tolist()
+        values = arrays.get("intrinsics", "fiu", "fx, fy, cx, cy beside depth", (4,)).tolist()
         view = DepthView(intrinsics_of(values))
         points = np.asarray(fuse_depth_images([depth], [view]).points, dtype=np.float32)
         return {"depth_images": [{"depth": depth, "intrinsics": values}]}, points

@@ -168,6 +168,7 @@ def test_a_scene_that_is_refused_counts_as_one_without_grasps(scene, run, tmp_pa
         ("intrinsics", np.zeros(4), "box.npz: depth_images.0.intrinsics.fx: got 0"),
         ("support_normal", np.full(3, np.nan), "box.npz: support_normal: got length nan"),
         ("support_normal", np.ones(3), "box.npz: support_normal: got length 1.73"),
+        ("support_offset", np.int64(1), "box.npz: support_offset: got 1, a camera below. Save"),
         ("rgb", np.zeros((2, 2, 3), np.uint8), "box.npz: rgb: got shape (2, 2, 3)"),
     ],
 )
