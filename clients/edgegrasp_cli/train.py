@@ -98,6 +98,8 @@ def train(
         return
     if not data:
         raise ValueError("data: got nothing. Name folders of views, or --outcomes.")
+    if asked.keep and asked.start_from is None:
+        raise ValueError("--keep: got no weights. Name them with --start-from.")
     views, validation = split_by_scene(find_views(data), asked.validation_share, asked.seed)
     metadata, teacher = recipe(asked.model), None
     if asked.teacher is not None:

@@ -101,9 +101,7 @@ class Trainer:
                 for name in STATEFUL:
                     getattr(self, name).load_state_dict(state[name])
             except RuntimeError:
-                raise ValueError(
-                    f"run: {folder} holds another model. Name another folder"
-                ) from None
+                raise ValueError(f"run: {folder} holds another model. Name another") from None
             begun = state.get("recipe", self.recipe)
             if changed := [name for name in begun if begun[name] != self.recipe[name]]:
                 raise ValueError(
