@@ -102,7 +102,8 @@ def _loaded(name: str) -> Any:
             known = ", ".join([*SHIPPED, *sorted(installed.names)])
             raise ValueError(f"planner is {name!r}; choose one of {known}, or module:callable")
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"planner {name!r} cannot be loaded: {error}") from error
+        fix = "its folder must be in PYTHONPATH, or its package installed"
+        raise ValueError(f"planner {name!r} cannot be loaded: {error}; {fix}") from error
     if not callable(found):
         raise ValueError(f"planner {name!r} is not callable; name a function or a class")
     return found
