@@ -124,14 +124,9 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
     def placements(self) -> list[ObjectPlacement]:
         """Where the objects are; `reset_from_poses` takes them back."""
         return [
-            ObjectPlacement(
-                item.model.urdf,
-                item.scale * item.model.scale,
-                (float(x), float(y), float(z)),
-                item.body.quaternion_xyzw,
-            )
+            ObjectPlacement(item.model.urdf, item.scale * item.model.scale, (x, y, z), turn)
             for item in self._objects
-            for x, y, z in [item.body.position]
+            for (x, y, z), turn in [(item.body.position.tolist(), item.body.quaternion_xyzw)]
         ]
 
     def reset(
