@@ -96,20 +96,7 @@ class Trainer:
         }
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).is_file():
-            state = torch.load(folder / STATE_FILE, weights_only=True, map_location=device)
-            try:
-                for name in STATEFUL:
-                    getattr(self, name).load_state_dict(state[name])
-            except RuntimeError:
-                raise ValueError(f"run: {folder} holds another model. Name another") from None
-            begun = state.get("recipe", self.recipe)
-            if changed := [name for name in begun if begun[name] != self.recipe[name]]:
-                raise ValueError(
-                    f"run: {folder} was begun with another {', '.join(changed)}. "
-                    "Repeat that command, or name another folder"
-                )
-            for name in COUNTERS:
-                setattr(self, name, state[name])
+            self._resume(torch.load(folder / STATE_FILE, weights_only=True, map_location=device))
         else:
             self._standardise(known)
 
@@ -296,6 +283,22 @@ class Trainer:
             if file.tell() == 0:
                 writer.writeheader()
             writer.writerow(row)
+
+    def _resume(self, state: dict[str, Any]) -> None:
+        """Continue from a saved state; ValueError: it is of another model or recipe."""
+        try:
+            for name in STATEFUL:
+                getattr(self, name).load_state_dict(state[name])
+        except RuntimeError:
+            raise ValueError(f"run: {self.folder} holds another model. Name another") from None
+        begun = state.get("recipe", self.recipe)
+        if changed := [name for name in begun if begun[name] != self.recipe[name]]:
+            raise ValueError(
+                f"run: {self.folder} was begun with another {', '.join(changed)}. Repeat that "
+                "command, or name another folder"
+            )
+        for name in COUNTERS:
+            setattr(self, name, state[name])
 
     def _save_state(self) -> None:
         state = {name: getattr(self, name) for name in (*COUNTERS, "recipe")}
