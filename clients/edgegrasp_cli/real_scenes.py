@@ -59,8 +59,7 @@ class RealScene:
             np.nanmedian(self.points[self.labels == label], axis=0) for label in self.objects
         ]
         height = np.asarray(middles, dtype=np.float64) @ self.normal - self.offset
-        feet: Float64 = middles - height[:, None] * self.normal
-        return feet
+        return np.asarray(middles - height[:, None] * self.normal)
 
 
 @dataclass(frozen=True)

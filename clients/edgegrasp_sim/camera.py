@@ -39,8 +39,7 @@ class Observation:
     @property
     def camera_position(self) -> NDArray[np.float32]:
         """The first camera, world frame, metres: (3,)."""
-        first: NDArray[np.float32] = self.camera_positions[0]
-        return first
+        return np.asarray(self.camera_positions[0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,5 +103,4 @@ def points_of(
 def crop(points: NDArray[Float], box: NDArray[np.floating], margin: float = 0.0) -> NDArray[Float]:
     """The points (N, 3) in a box (2, 3), lowest and highest corner, grown by a margin."""
     inside = (points >= box[0] - margin) & (points <= box[1] + margin)
-    kept: NDArray[Float] = points[inside[:, 0] & inside[:, 1] & inside[:, 2]]
-    return kept
+    return np.asarray(points[inside[:, 0] & inside[:, 1] & inside[:, 2]])

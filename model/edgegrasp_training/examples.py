@@ -255,8 +255,7 @@ def _labels(view: LabelledView) -> Float32:
     firm = np.full(len(held), FIRM_SHARE)
     if view.firm is not None:
         firm = np.where(view.firm == UNTRIED, FIRM_SHARE, view.firm == 1)
-    label: Float32 = (held * (1.0 - SHAKEN_SHARE * (1.0 - firm))).astype(np.float32)
-    return label
+    return np.asarray(held * (1.0 - SHAKEN_SHARE * (1.0 - firm)), np.float32)
 
 
 def _candidates(view: LabelledView, cloud: Cloud, rows: Int64) -> Candidates:

@@ -289,8 +289,7 @@ def oval(sharp: float = 1.0, corners: int = FINE) -> Float64:
     """(corners, 2) a circle of radius one; below one, `sharp` squares it off."""
     angle = 2 * np.pi * (np.arange(corners) + 0.5) / corners
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    squared: Float64 = np.sign(ring) * np.abs(ring) ** sharp
-    return squared
+    return np.asarray(np.sign(ring) * np.abs(ring) ** sharp)
 
 
 def _rectangle(x: float, y: float) -> Float64:

@@ -155,8 +155,7 @@ class PybulletBody(Body):
     """A body of a physics server."""
 
     def __init__(self, client: _Client, uid: int) -> None:
-        self.client = client
-        self.uid = uid
+        self.client, self.uid = client, uid
 
     def remove(self) -> None:
         self.client.removeBody(self.uid)
@@ -180,8 +179,7 @@ class PybulletBody(Body):
 
     @property
     def bounds(self) -> Matrix:
-        lower, upper = self.client.getAABB(self.uid)
-        return np.asarray((lower, upper), dtype=np.float64)
+        return np.asarray(self.client.getAABB(self.uid), dtype=np.float64)
 
     def contacts(self) -> list[Contact]:
         points = self.client.getContactPoints(self.uid)
