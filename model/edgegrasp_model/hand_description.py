@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from edgegrasp_camera.arrays import Bools, Float32, Int64
-from edgegrasp_model.candidates.collision import APPROACH_LENGTH, NEAR, HandView
-from edgegrasp_model.candidates.edge_grasps import Candidates, support_clearance
+from edgegrasp_model.candidates.collision import NEAR, HandView
+from edgegrasp_model.candidates.edge_grasps import APPROACH_LENGTH, Candidates, support_clearance
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.scene.cloud import UP, unit

@@ -15,8 +15,14 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from edgegrasp_camera.arrays import Float32, Int64
-from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls, edge_grasps, retract
-from edgegrasp_model.candidates.outline import outline_grasps, outlines
+from edgegrasp_model.candidates.edge_grasps import (
+    Candidates,
+    crop_balls,
+    edge_grasps,
+    outline_grasps,
+    outlines,
+    retract,
+)
 from edgegrasp_model.hand_description import HEIGHTS, UNKNOWN_HEIGHT
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import load_checkpoint

@@ -8,8 +8,12 @@ import pytest
 from tests.checks import refusal
 from tests.many_options import OWN_GRIPPER
 
-from edgegrasp_model.candidates.edge_grasps import CLOSED_FURTHER, TIP_MARGIN, support_clearance
-from edgegrasp_model.candidates.outline import MAX_INSERTION
+from edgegrasp_model.candidates.edge_grasps import (
+    CLOSED_FURTHER,
+    MAX_INSERTION,
+    TIP_MARGIN,
+    support_clearance,
+)
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.errors import InvalidGripper
 from edgegrasp_model.gripper import (

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
-from edgegrasp_model.candidates.edge_grasps import support_clearance
+from edgegrasp_model.candidates.edge_grasps import APPROACH_LENGTH, support_clearance
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import (
     any_point_in_boxes,
@@ -22,7 +22,6 @@ from edgegrasp_model.scene.segment import FIXED
 from edgegrasp_model.unseen import enters_unseen
 
 NEAR = 0.006  # metres around a finger that count as near it
-APPROACH_LENGTH = 0.05  # metres of straight approach that the hand description looks at
 FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
 MIN_FIXED = 8  # voxels of background between the fingers that keep them from closing
 TOUCH = 1e-6  # metres between the support plane and a hand that was retracted from it

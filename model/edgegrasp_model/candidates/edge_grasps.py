@@ -1,4 +1,9 @@
-"""Approach points, the edge grasps around them, and their centred variants."""
+"""Approach points and the hands around them: edge grasps, centred ones, and across outlines.
+
+At a depth edge the side of the object is not seen, so the normal that an edge grasp needs is
+missing. Grasps across an outline need only its direction and what lies between, beside and below
+the fingers: the hand comes from above or the camera.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,10 +15,10 @@ from scipy.spatial import cKDTree
 
 from edgegrasp_camera.arrays import Bools, Float32, Int64
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.kernels import extents_between, in_hands
+from edgegrasp_model.kernels import compiled, extents_between, free_way, in_hands
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.results import NoGrasp
-from edgegrasp_model.scene.cloud import Cloud, unit
+from edgegrasp_model.scene.cloud import UP, Cloud, unit
 
 MIN_EDGE = 0.003  # metres between approach and contact point
 EDGE_MARGIN = 0.002  # metres an edge stays below half the opening
@@ -248,3 +253,285 @@ def centred_grasps(
     further = replace(candidates.take(wide[moved]), opening=width[moved])
     further.T_cloud_hand[:, :3, 3] += middle[moved, None] * further.T_cloud_hand[:, :3, 1]
     return further
+
+
+# Grasps across an outline
+
+APPROACH_LENGTH = 0.05  # metres of straight approach that must be free, or is described
+OUTLINE_RADIUS = 0.016  # metres of surface from which the outline's direction is estimated
+MIN_OUTWARD = 0.002  # metres from a neighbourhood's mean to a point on the outline
+THIN = 0.003  # metres of standard deviation across a rim, all of which counts as outline
+LEAN, LEANING = np.radians(30.0), 4  # radians off vertical; directions around it
+DROP = 0.006  # metres below an edge from which a surface counts as another one
+GAP = 0.007  # metres without a point in which a surface ends
+ONE_VIEW = np.cos(np.radians(15.0))  # radians; directions closer than this show the same outline
+CLEARANCE = 0.002  # metres kept free ahead of the hand as it goes in
+MAX_INSERTION = 0.020  # metres deeper than an edge grasp; more does not hold better
+STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it
+LEVEL = 1e-6  # cosine below which a hand moves along the support
+
+
+@dataclass(frozen=True)
+class Outline:
+    """The depth edges of a cloud of N points, as seen from a viewpoint."""
+
+    toward: Float32  # (N, 3) unit, from each point to the viewpoint
+    heading: Float32  # (N, 3) unit, orthogonal to `toward`: across the edge, out of the object
+    is_edge: Bools  # (N,)
+
+
+def outlines(
+    points: Float32,  # (N, 3) canonical frame, metres
+    viewpoints: Float32 | None,  # (W, 3); None where they are unknown
+    rows: Int64,  # (M,) of the points to look at
+    *,
+    leaning: bool = False,  # also from all around, LEAN off above
+) -> list[Outline]:
+    """The outlines of a cloud from above and, if that is another direction, from each camera."""
+    toward = [np.broadcast_to(UP, points.shape)]
+    toward += [unit(eye - points) for eye in ([] if viewpoints is None else viewpoints)]
+    if leaning:
+        for turn in np.linspace(0.0, 2 * np.pi, LEANING, endpoint=False):
+            way = np.array([np.sin(LEAN) * np.cos(turn), np.sin(LEAN) * np.sin(turn), np.cos(LEAN)])
+            toward.append(np.broadcast_to(way.astype(np.float32), points.shape))
+    ways = np.stack([each[rows] for each in toward])
+    spreads = level_spread(points, rows, ways, OUTLINE_RADIUS, DROP)
+    found: list[Outline] = []
+    for each, way, least, outward, spread in zip(toward, ways, *spreads, strict=True):
+        heading, is_edge = np.zeros_like(points), np.zeros(len(points), dtype=bool)
+        # A point is on the outline if its neighbours at its height or above lie on one side.
+        heading[rows] = least
+        is_edge[rows] = (outward > MIN_OUTWARD) | (spread < THIN)
+        if found:
+            is_edge[rows] &= way @ UP < ONE_VIEW
+        found.append(Outline(each, heading, is_edge))
+    return found
+
+
+def outline_grasps(
+    points: Float32,  # (N, 3) the cloud
+    crop: BallCrop,  # balls around the approach points
+    approach_index: Int64,  # (A,) rows of the approach points
+    pair: Int64,  # (M,) rows of `crop`: the contact points that are allowed
+    outline: Outline,  # of the same cloud
+    support: SupportPlane | None,  # plane that the hand stays above
+    gripper: Gripper,
+    margin: float = 0.0,  # metres kept free around the hand
+) -> Candidates:
+    """Hands that approach from the outline's viewpoint and close across it; at most one a contact.
+
+    The contact point lies on the outline, the hand in the middle between it and the opposite edge
+    of the same surface, and the approach point nearest to the hand's axis. The hand moves in until
+    something is right ahead of it, at most MAX_INSERTION deeper than an edge grasp.
+    """
+    y, z = outline.heading, -outline.toward
+    frame = np.stack([points, np.cross(y, z), y, z], axis=1)  # (N, 4, 3)
+    pair = pair[outline.is_edge[crop.ball_rows[pair]]]
+    contact, approach = crop.ball_rows[pair], approach_index[crop.ball_of_point[pair]]
+    apart = points[contact] - points[approach]
+    edge = np.einsum("md,mkd->km", apart, frame[contact, 1:])
+    between = (np.abs(edge[0]) < gripper.pad_half_width) & (edge[2] > -DROP)
+    row = np.flatnonzero(between & (edge[1] > MIN_EDGE) & (edge[1] < gripper.max_opening))
+    first, last = crop.bounds(crop.ball_of_point[pair[row]])
+    strip = np.array([gripper.pad_half_width, gripper.max_opening, DROP, GAP], dtype=np.float32)
+    # How far the surface extends between the pads from each contact, outward and inward: (M, 2).
+    extent = extents_across(points, crop.ball_rows, first, last, frame[contact[row]], strip)
+    width = extent[:, 1] - extent[:, 0]
+    held = (extent[:, 0] > -MIN_EDGE) & (width < gripper.max_opening - 2 * EDGE_MARGIN)
+    held &= edge[1][row] < extent[:, 1] + MIN_EDGE  # the approach point lies on the same surface
+    off_axis = np.hypot(edge[0][row], edge[1][row] - extent.mean(axis=1))
+    nearest = np.lexsort((off_axis, contact[row], ~held))[: held.sum()]
+    chosen = nearest[np.unique(contact[row[nearest]], return_index=True)[1]]
+    row, extent, width = row[chosen], extent[chosen], width[chosen]
+    contact, z = contact[row], z[contact[row]]
+    pose = np.zeros((len(row), 4, 4), dtype=np.float32)
+    pose[:, :3, :3] = frame[contact, 1:].transpose(0, 2, 1)
+    middle = points[contact] - extent.mean(axis=1, keepdims=True) * y[contact]
+    pose[:, :3, 3] = middle - gripper.contact_z_at(width)[:, None] * z
+    pose[:, 3, 3] = 1.0
+    depth = np.maximum(edge[2][row], 0.0)
+    hands = Candidates(pair[row], approach[row], contact, depth, width, pose)
+    return inserted(points, hands, support, gripper, margin)
+
+
+def inserted(
+    points: Float32,
+    candidates: Candidates,
+    support: SupportPlane | None,
+    gripper: Gripper,
+    margin: float,
+) -> Candidates:
+    """The hands moved in until something is right ahead, without those that stop early."""
+    least = gripper.contact_z + TIP_MARGIN - gripper.tip_z  # metres of way that it takes
+    room = np.full(len(candidates), np.inf, dtype=np.float32)  # metres of way above the support
+    if support is not None:
+        fall = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
+        pose, opening = candidates.T_cloud_hand, candidates.opening
+        height = support_clearance(pose, opening, support, gripper) - margin
+        room = np.where(fall > LEVEL, height / np.maximum(fall, LEVEL), room)
+    enough = np.flatnonzero(room >= least)
+    candidates = candidates.take(enough)
+    boxes = gripper.open_boxes + margin * np.array([[-1.0], [1.0]])
+    way = free_way(in_hands(points, candidates.T_cloud_hand), boxes, APPROACH_LENGTH) - CLEARANCE
+    way = np.minimum(way, room[enough])
+    row = np.flatnonzero(way >= least)
+    hands = candidates.take(row)
+    hands.T_cloud_hand[:, :3, 3] -= np.minimum(way[row], MAX_INSERTION)[:, None] * hands.approach
+    return hands
+
+
+@compiled("contract")
+def extents_across(
+    points: Float32,  # (N, 3) of the cloud
+    rows: Int64,  # (P,) of points to look at, group after group
+    first: Int64,  # (M,) places in `rows` where the group of each edge begins
+    last: Int64,  # (M,) and where they end
+    # (M, 4, 3) of each edge the point it is at; across the strip, out of the object along it, and
+    # ahead of the hand, unit vectors
+    frame: Float32,
+    # (4,) its half width and its length, how far ahead of the edge its points may be, and the gap
+    # length that ends it, metres
+    strip: Float32,
+) -> Float32:
+    """Least and greatest metres (M, 2) that the surface extends into the object, across an edge."""
+    columns, extent = np.ascontiguousarray(points[rows].T), np.zeros((len(frame), 2), np.float32)
+    length, gap = strip[1], strip[3]
+    cell = gap / STRIP_CELLS
+    cells = int(np.ceil((length + gap) / cell)) + 1
+    reached = np.empty(cells, np.float32)
+    depth = np.empty(np.max(last - first) if len(first) else 0, np.float32)
+    for m in range(len(frame)):
+        _into_strip(columns, first[m], last[m], frame[m], strip, depth)
+        reached[:] = -np.inf
+        least, found = np.float32(0.0), 0
+        for i in range(last[m] - first[m]):
+            depth[found] = depth[i]
+            found += depth[i] < length
+        for inward in depth[:found]:
+            least = min(least, inward)
+            place = int((inward + gap) / cell)
+            reached[place] = max(reached[place], inward)
+        furthest = np.float32(0.0)
+        for place in range(int(gap / cell), cells):
+            if reached[place] > furthest:
+                if reached[place] - furthest > gap:
+                    break
+                furthest = reached[place]
+        extent[m, 0], extent[m, 1] = least, furthest
+    return extent
+
+
+@compiled("contract")
+def _into_strip(
+    columns: Float32, first: int, last: int, frame: Float32, strip: Float32, depth: Float32
+) -> None:
+    """Distance of a group's points into the object; the strip's length for points outside of it."""
+    # As separate functions on contiguous arrays, such loops are vectorised to 16 points at a time.
+    xs, ys, zs = columns[0, first:last], columns[1, first:last], columns[2, first:last]
+    origin, across, out, ahead = frame[0], frame[1], frame[2], frame[3]
+    half, length, drop, gap = strip[0], strip[1], strip[2], strip[3]
+    for i in range(len(xs)):
+        x, y, z = xs[i] - origin[0], ys[i] - origin[1], zs[i] - origin[2]
+        sideways = x * across[0] + y * across[1] + z * across[2]
+        inward = -(x * out[0] + y * out[1] + z * out[2])
+        below = x * ahead[0] + y * ahead[1] + z * ahead[2]
+        inside = (abs(sideways) < half) & (below < drop) & (inward > -gap)
+        depth[i] = inward if inside else length
+
+
+def level_spread(
+    points: Float32,  # (N, 3) of the cloud
+    rows: Int64,  # (M,) of the points to look at
+    toward: Float32,  # (T, M, 3) unit, toward each viewpoint
+    radius: float,  # metres around each point in which others count,
+    drop: float,  # and how much lower they may lie, metres
+) -> tuple[Float32, Float32, Float32]:
+    """How the neighbourhood of each point is distributed, from each viewpoint.
+
+    Returns the direction orthogonal to `toward` in which they spread least, (T, M, 3) unit; how far
+    (T, M) the point lies from their mean along it, not negative; their standard deviation (T, M)
+    along it, metres.
+    """
+    cells = np.floor((points - points.min(axis=0)) / np.float32(radius)).astype(np.int64) + 1
+    sizes = cells.max(axis=0) + 2
+    key = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
+    order = np.argsort(key, kind="stable")
+    reach, columns = np.array([radius, drop], np.float32), np.ascontiguousarray(points[order].T)
+    return _level_spread(columns, key[order], points[rows], key[rows], sizes, toward, reach)
+
+
+@compiled("contract")
+def _level_spread(
+    columns: Float32,
+    key: Int64,
+    middle: Float32,
+    middle_key: Int64,
+    sizes: Int64,
+    toward: Float32,
+    reach: Float32,
+) -> tuple[Float32, Float32, Float32]:
+    ways = toward.shape[:2]
+    offset, deviation = np.empty(ways, np.float32), np.empty(ways, np.float32)
+    least = np.empty(toward.shape, np.float32)
+    around, axes = np.empty(columns.shape, np.float32), np.zeros((3, 3), np.float32)
+    for m in range(len(middle)):
+        found = 0
+        for dx in range(-1, 2):
+            for dy in range(-1, 2):
+                start = middle_key[m] + (dx * sizes[1] + dy) * sizes[2] - 1
+                for j in range(np.searchsorted(key, start), np.searchsorted(key, start + 3)):
+                    around[0, found] = columns[0, j]
+                    around[1, found] = columns[1, j]
+                    around[2, found] = columns[2, j]
+                    found += 1
+        near = around[0, :found], around[1, :found], around[2, :found]
+        for way in range(len(toward)):
+            _set_level_axes(toward[way, m], axes)
+            count, a, b, aa, ab, bb = _moments(near, middle[m], axes, reach)
+            a, b = a / count, b / count
+            aa, ab, bb = aa / count - a * a, ab / count - a * b, bb / count - b * b
+            turn = 0.5 * np.arctan2(-2.0 * ab, bb - aa)
+            s, t = np.cos(turn), np.sin(turn)  # the direction of least variance
+            outward = -(a * s + b * t)
+            if outward < 0.0:
+                s, t, outward = -s, -t, -outward
+            for d in range(3):
+                least[way, m, d] = s * axes[1, d] + t * axes[2, d]
+            offset[way, m] = outward
+            deviation[way, m] = np.sqrt(max(0.0, s * s * aa + 2.0 * s * t * ab + t * t * bb))
+    return least, offset, deviation
+
+
+@compiled("contract")
+def _set_level_axes(up: Float32, axes: Float32) -> None:
+    """Up and two level directions, from the axis that is farthest from up."""
+    first = 0
+    for d in range(1, 3):
+        first = d if abs(up[d]) < abs(up[first]) else first
+    after, last = (first + 1) % 3, (first + 2) % 3
+    length = np.sqrt(up[after] * up[after] + up[last] * up[last])
+    for d in range(3):
+        axes[0, d] = up[d]
+    axes[1, first], axes[1, after], axes[1, last] = 0.0, -up[last] / length, up[after] / length
+    for d in range(3):
+        one, other = (d + 1) % 3, (d + 2) % 3
+        axes[2, d] = up[one] * axes[1, other] - up[other] * axes[1, one]
+
+
+@compiled("contract", "reassoc", "nsz")
+def _moments(
+    points: tuple[Float32, Float32, Float32], middle: Float32, axes: Float32, reach: Float32
+) -> tuple[np.float32, ...]:
+    """How many points are near, and the sums of their level coordinates s, t, s s, s t and t t."""
+    count, a, b, aa, ab, bb = np.zeros(6, np.float32)
+    xs, ys, zs = points
+    for i in range(len(xs)):
+        x, y, z = xs[i] - middle[0], ys[i] - middle[1], zs[i] - middle[2]
+        above = x * axes[0, 0] + y * axes[0, 1] + z * axes[0, 2] > -reach[1]
+        near = above & (x * x + y * y + z * z < reach[0] * reach[0])
+        one = np.float32(near)
+        s = one * (x * axes[1, 0] + y * axes[1, 1] + z * axes[1, 2])
+        t = one * (x * axes[2, 0] + y * axes[2, 1] + z * axes[2, 2])
+        a, b, aa, ab, bb = a + s, b + t, aa + s * s, ab + s * t, bb + t * t
+        count += one
+    return count, a, b, aa, ab, bb

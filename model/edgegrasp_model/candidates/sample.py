@@ -15,10 +15,11 @@ from edgegrasp_model.candidates.edge_grasps import (
     centred_grasps,
     crop_balls,
     edge_grasps,
+    outline_grasps,
+    outlines,
     retract,
     spread,
 )
-from edgegrasp_model.candidates.outline import outline_grasps, outlines
 from edgegrasp_model.candidates.top_down import top_down_grasps
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import non_max_suppression

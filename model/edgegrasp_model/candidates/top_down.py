@@ -12,8 +12,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64
-from edgegrasp_model.candidates.edge_grasps import EDGE_MARGIN, Candidates
-from edgegrasp_model.candidates.outline import GAP, inserted
+from edgegrasp_model.candidates.edge_grasps import EDGE_MARGIN, GAP, Candidates, inserted
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
