@@ -41,7 +41,7 @@ def test_json_of_a_server_needs_no_package_of_the_server(
 ) -> None:
     """`pip install 'edgegrasp[cli,view]'` is enough."""
     monkeypatch.setitem(sys.modules, "orjson", None)
-    monkeypatch.delitem(sys.modules, "edgegrasp_service.worker.bodies", raising=False)
+    monkeypatch.delitem(sys.modules, "edgegrasp_service.worker.answer", raising=False)
     asked = ("--server", dummy_server.grpc_address, "--json")
     assert len(json.loads(run("detect", *camera_files, *asked))["grasps"]) == 10
 

@@ -1,31 +1,60 @@
 """Answer requests in a worker process, one at a time: decode, detect, encode.
 
+Over HTTP a request is JSON, a point cloud file, or a form with parts, and an answer is JSON. A gRPC
+message is converted to the fields of the same request in JSON, so that one schema checks both.
 Every fault of a request is returned as a Problem. This module knows no event loops, connections or
 transports.
 """
 
+import io
+import json
 import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from datetime import UTC, datetime
+from functools import partial
+from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qsl
 
 import numpy as np
 import orjson
+from google.protobuf.message import DecodeError, Message
+from google.protobuf.unknown_fields import UnknownFieldSet
+from werkzeug.exceptions import HTTPException
+from werkzeug.formparser import MultiPartParser
+from werkzeug.http import parse_options_header
 
+from edgegrasp.v1 import grasp_pb2
 from edgegrasp_camera.arrays import Array
-from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, parse
-from edgegrasp_model.options import DetectOptions, parse_options
-from edgegrasp_model.request_cloud import GIVEN, decode_array, decode_cloud
+from edgegrasp_camera.files import FILE_FORMATS
+from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, brief, parse
+from edgegrasp_model.options import MAX_CANDIDATES, MAX_ROWS, DetectOptions, parse_options
+from edgegrasp_model.request_cloud import (
+    CAMERA,
+    GIVEN,
+    PER_POINT,
+    File,
+    decode_array,
+    decode_cloud,
+    options_of_texts,
+    unique_keys,
+    value_of_text,
+)
 from edgegrasp_model.scene.cloud import CloudInput
-from edgegrasp_results import Detection
+from edgegrasp_results import Detection, Scoring, plain
 from edgegrasp_service import recording
-from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, UnsupportedMediaType, report
+from edgegrasp_service.errors import (
+    DeadlineExceeded,
+    PayloadTooLarge,
+    UnsupportedMediaType,
+    no_message,
+    report,
+)
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker import bodies
-from edgegrasp_service.worker.process import Answer, Facts, Job, limited_memory
+from edgegrasp_service.worker.process import Answer, Facts, Job, Transport, limited_memory
 
 if TYPE_CHECKING:
     from edgegrasp_model.detector import ModelCatalogue
@@ -34,6 +63,16 @@ if TYPE_CHECKING:
 # Memory for reading a request: numbers take about 12 times as much in Python as in JSON.
 DECODE_BYTES, DECODE_FACTOR = 512 * 2**20, 24
 ENCODE_SHARE = 0.1  # share of a request's time that is kept for writing its answer
+
+JSON, FORM = "application/json", "multipart/form-data"
+FILE_TYPES = {f"application/x-{name}": name for name in FILE_FORMATS}
+FIELDS = ("point_cloud2", "depth_images", *PER_POINT, "options")
+MAX_QUERY_FIELDS = 64
+MAX_CAMERA_TEXT = 1000  # most bytes of a part like 615,615,320,240; a longer one must be JSON
+MAX_SHORT_LISTS = 20_000  # in JSON; edges take 6 bytes each
+
+MAX_PARTS = 64  # most messages in a repeated field; no option takes more
+MAX_GIVEN = {"edges": MAX_CANDIDATES, "hand_poses": MAX_CANDIDATES}
 
 
 def load_catalogue(settings: Settings) -> "ModelCatalogue":
@@ -123,18 +162,18 @@ class _Work:
         self.facts.model = result.model
         self.facts.counts = dict(result.counts)
         with self._stage("encode"):
-            body = bodies.write(self.job.transport, result)
+            body = write(self.job.transport, result)
         return body
 
     def _record_outcome(self) -> None:
         """Append a tried grasp, the digest of its weights and the time to the outcomes' file."""
         kind, path = self.job.content_type, self.settings.outcomes_file
-        if not kind.lower().startswith(bodies.JSON):  # foreign web pages cannot send it
-            fix = f"Send {bodies.JSON}."
+        if not kind.lower().startswith(JSON):  # foreign web pages cannot send it
+            fix = f"Send {JSON}."
             raise UnsupportedMediaType("Content-Type", repr(kind[:40]), fix)
         if path is None:  # Ray has this path without the setting too
             raise InvalidRequest("path", "/v1/outcomes", "Set the setting `outcomes_file`.")
-        fields = bodies.read_json("body", self.job.body)
+        fields = read_json("body", self.job.body)
         tried = parse(recording.TriedGrasp, fields, "body")
         self.catalogue.get(tried.model)  # raises UnknownModel
         digests = {row["name"]: row["digest"] for row in self.catalogue.describe()}
@@ -174,7 +213,7 @@ class _Work:
         in_time = most
         try:
             with limited_memory(DECODE_BYTES + DECODE_FACTOR * size):
-                fields = bodies.read_request(self.job)
+                fields = read_request(self.job)
                 self.options = options = parse_options(fields["options"])
                 detector = self.catalogue.get(options.model)
                 given = {} if self.job.method == "DetectGrasps" else _given(fields, most)
@@ -220,3 +259,304 @@ def _given(fields: Mapping[str, Any], max_points: int) -> dict[str, Array]:
     if not isinstance(given, np.ndarray):
         given = decode_array(name, given, max_points)
     return {name: given}
+
+
+# Bodies
+
+
+def read_request(job: Job) -> dict[str, Any]:
+    """The fields of a request.
+
+    Returns:
+        The fields that were sent, as JSON, with bytes and arrays where a message has them, or as
+        File; `cloud` is a File; and `options`.
+
+    Raises:
+        InvalidRequest: The body does not match its content type, has unknown fields or parts, or
+            comes with query parameters although it has options; or a message is invalid.
+        UnsupportedMediaType: There is no reader for the content type.
+    """
+    if job.transport == "grpc":
+        return _fields_of_message(job)
+    media_type, named = parse_options_header(job.content_type)
+    media_type = media_type.lower()
+    scores = job.method == "ScoreGrasps"
+    accepted = (JSON, FORM) if scores else (JSON, *FILE_TYPES, FORM)
+    if media_type not in accepted:
+        fix = f"Send one of: {', '.join(accepted)}."
+        raise UnsupportedMediaType("Content-Type", repr(media_type), fix)
+    try:
+        parameters = parse_qsl(job.query, True, max_num_fields=MAX_QUERY_FIELDS)
+    except ValueError:
+        value = f"more than {MAX_QUERY_FIELDS} parameters"
+        raise InvalidRequest("query", value, "Send each option once.") from None
+    if media_type in FILE_TYPES:
+        file = File(FILE_TYPES[media_type], job.body)
+        return {"cloud": file, "options": options_of_texts(parameters)}
+    if parameters:
+        fix = "Send options in the part `options`."
+        raise InvalidRequest(parameters[0][0], "a query parameter", fix)
+    known = ("points" if media_type == JSON else "cloud", *FIELDS, *(GIVEN if scores else ()))
+    if media_type == JSON:
+        fields: dict[str, Any] = read_json("body", job.body)
+        if not isinstance(fields, dict):
+            raise InvalidRequest("body", brief(fields), "Send a JSON object.")
+        _refuse_unknown(fields, known, "field")
+    else:
+        boundary = named.get("boundary", "")
+        fields = _fields_of_form(job.body, boundary, (*known, *CAMERA))
+    if not isinstance(fields.setdefault("options", {}), dict):
+        raise InvalidRequest("options", brief(fields["options"]), "Send a JSON object.")
+    return fields
+
+
+def write(transport: Transport, result: Detection | Scoring) -> bytes:
+    """A result as DetectionBody or ScoringBody, its floats exact float32 values; or as message."""
+    if transport == "http":
+        return orjson.dumps(result, default=plain, option=orjson.OPT_PASSTHROUGH_DATACLASS)
+    if isinstance(result, Detection):
+        return grasp_pb2.DetectGraspsResponse(**_flat(result)).SerializeToString()
+    return grasp_pb2.ScoreGraspsResponse(**_flat(result)).SerializeToString()
+
+
+def _flat(value: Any) -> Any:
+    """Fields in the form of messages: arrays flat, in row-major order."""
+    if isinstance(value, np.ndarray):
+        return value.ravel().tolist()
+    if isinstance(value, list):
+        return [_flat(part) for part in value]
+    if is_dataclass(value):
+        return {name: _flat(part) for name, part in vars(value).items()}
+    return value
+
+
+def _refuse_unknown(fields: Iterable[str], known: tuple[str, ...], kind: str) -> None:
+    for name in fields:
+        if name not in known:
+            *names, last = known
+            fix = f"Send {', '.join(names)} and {last} only."
+            if name in DetectOptions.model_fields:
+                fix = "Send it in `options`."
+            raise InvalidRequest(name, f"an unknown {kind}", fix)
+
+
+# JSON
+
+
+def read_json(field: str, text: bytes) -> Any:
+    """Parse JSON within the memory allowed for a request of its size.
+
+    Raises:
+        InvalidRequest: It is not JSON, has a key twice, or would take far more memory than points
+            of its size.
+    """
+    lists = text.count(b"[") + text.count(b"{")
+    # Most lists are points of 8 bytes or more; an empty list takes 3 bytes, but 64 in memory.
+    if lists > len(text) // 7 + MAX_SHORT_LISTS:
+        value = f"{lists} lists and objects in {len(text)} bytes"
+        raise InvalidRequest(field, value, "Send lists that hold numbers.")
+    try:
+        return json.loads(text, object_pairs_hook=partial(unique_keys, field))
+    except (ValueError, RecursionError) as error:
+        is_array = field in ("depth", *PER_POINT)  # perhaps an image of another format
+        fix = "Send an .npy or .png file, or JSON." if is_array else "Send a JSON object."
+        raise InvalidRequest(field, f"invalid JSON ({error})", fix) from None
+
+
+# Forms
+
+
+def _fields_of_form(body: bytes, boundary: str, known: tuple[str, ...]) -> dict[str, Any]:
+    """Files as File, other parts as their JSON; the parts of one camera as `depth_images`."""
+    fields: dict[str, Any] = {}
+    for name, file_format, data in _parts(body, boundary, len(known) + 1):
+        _refuse_unknown([name], known, "part")
+        if name in fields:
+            raise InvalidRequest(name, "two parts", "Send one.")
+        if name == "cloud" and file_format is None:
+            raise InvalidRequest("cloud", "no file", "Send the cloud as a file part.")
+        # curl sends `-F options=@file;type=application/json` as a file as well.
+        if name == "cloud" or (file_format in ("npy", "png") and name != "options"):
+            fields[name] = File(file_format or "", data)
+        elif name in CAMERA and len(data) < MAX_CAMERA_TEXT:
+            fields[name] = value_of_text(name, data.decode("utf-8", "replace"))
+        else:
+            fields[name] = read_json(name, data)
+    image = {name: fields.pop(name) for name in CAMERA if name in fields}
+    if image and "depth_images" in fields:
+        raise InvalidRequest("depth_images", f"images beside {next(iter(image))}", "Send one.")
+    return fields | ({"depth_images": [image]} if image else {})
+
+
+def _parts(body: bytes, boundary: str, most: int) -> Iterator[tuple[str, str | None, bytes]]:
+    """Name, file format (None: not a file) and data of each part of a multipart body.
+
+    The format comes from a part's content type, else from its file name.
+    """
+    parser = MultiPartParser(
+        lambda **named: io.BytesIO(),  # type: ignore[arg-type]  # it is called so
+        max_form_memory_size=None,
+        max_form_parts=most,
+    )
+    try:
+        if not boundary:
+            raise ValueError("no boundary in its Content-Type")
+        form, files = parser.parse(io.BytesIO(body), boundary.encode("utf-8", "replace"), len(body))
+    except (ValueError, HTTPException) as error:
+        fix = "Send a file part `cloud` and a JSON part `options`."
+        raise InvalidRequest("body", f"a form that cannot be read ({error})", fix) from None
+    for name, text in form.items(multi=True):
+        yield str(name), None, text.encode()
+    for name, file in files.items(multi=True):
+        suffix = PurePath((file.filename or "").replace("\0", "")).suffix
+        yield str(name), FILE_TYPES.get(file.mimetype) or suffix[1:].lower(), file.read()
+
+
+# Messages
+
+
+def _fields_of_message(job: Job) -> dict[str, Any]:
+    """The fields of a request message; edges (M, 2) and hand poses (M, 4, 4) as arrays.
+
+    Raises InvalidRequest: It is not such a message, has an invalid pose, more parts than any
+    request needs, or an unknown field.
+    """
+    scores = job.method == "ScoreGrasps"
+    kind = grasp_pb2.ScoreGraspsRequest if scores else grasp_pb2.DetectGraspsRequest
+    try:
+        message: Any = kind.FromString(job.body)
+    except DecodeError:
+        raise no_message(job.body) from None
+    _check(message, "request")
+    fields: dict[str, Any] = {}
+    if message.HasField("points"):
+        fields["points"] = message.points
+    if message.HasField("encoded"):
+        fields["cloud"] = File(message.encoded.format, message.encoded.data)
+    if message.HasField("point_cloud2"):
+        fields["point_cloud2"] = _plain_fields(message.point_cloud2)
+    if message.depth_images:
+        images = enumerate(message.depth_images)
+        fields["depth_images"] = [_depth_image(image, row) for row, image in images]
+    fields |= {name: getattr(message, name) for name in PER_POINT if message.HasField(name)}
+    fields["options"] = plain_options(message.options)
+    if scores and message.edges:
+        pairs = [(edge.approach_index, edge.contact_index) for edge in message.edges]
+        fields["edges"] = np.array(pairs)
+    if scores and message.hand_poses:
+        poses = enumerate(message.hand_poses)
+        fields["hand_poses"] = np.array(
+            [_matrix(pose.T_cloud_hand, f"hand_poses.{row}.T_cloud_hand") for row, pose in poses]
+        )
+    return fields
+
+
+def plain_options(message: grasp_pb2.DetectOptions) -> dict[str, Any]:
+    """The options that are set; raises InvalidRequest if one is set in two fields."""
+    options = _set_fields(message)
+    if "object_choice" in options:
+        if "objects" in options:
+            value = f"{options['objects']!r} beside object_choice"
+            raise InvalidRequest("options.objects", value, "Send one of the two.")
+        options["objects"] = options.pop("object_choice")
+    return options
+
+
+def _check(message: Message, name: str) -> None:
+    """Refuse unknown fields, and lists that would take minutes and gigabytes in Python."""
+    if len(unknown := UnknownFieldSet(message)):
+        numbers = sorted({unknown[row].field_number for row in range(len(unknown))})[:5]
+        fix = "Send the fields of edgegrasp.v1 only; is the server older than its client?"
+        raise InvalidRequest(name, f"unknown fields numbered {numbers}", fix)
+    for each in message.DESCRIPTOR.fields:
+        here, is_message = f"{name}.{each.name}", each.message_type is not None
+        if each.is_repeated:
+            parts = getattr(message, each.name)
+            most = MAX_GIVEN.get(each.name, MAX_PARTS) if is_message else MAX_ROWS
+            if len(parts) > most:
+                here = here.removeprefix("request.")
+                raise InvalidRequest(here, f"{len(parts)} of them", f"Send at most {most}.")
+            for row, part in enumerate(parts if is_message else ()):
+                _check(part, f"{here}.{row}")
+        elif is_message and message.HasField(each.name):
+            _check(getattr(message, each.name), here)
+
+
+def _depth_image(message: grasp_pb2.DepthImage, row: int) -> dict[str, Any]:
+    fields = _plain_fields(message)
+    if pose := fields.pop("T_cloud_camera"):
+        fields["T_cloud_camera"] = _matrix(pose, f"depth_images.{row}.T_cloud_camera")
+    return fields
+
+
+def _matrix(numbers: Any, field: str) -> list[list[float]]:
+    if len(numbers) != 16:
+        raise InvalidRequest(field, f"{len(numbers)} numbers", "Send 16, row-major.")
+    return [list(numbers[start : start + 4]) for start in range(0, 16, 4)]
+
+
+def _plain_fields(message: Message) -> dict[str, Any]:
+    """The fields of a message that are set, and all lists, even empty ones."""
+    return {
+        field.name: _field(message, field)
+        for field in message.DESCRIPTOR.fields
+        if field.is_repeated or not field.has_presence or message.HasField(field.name)
+    }
+
+
+def _set_fields(message: Message) -> dict[str, Any]:
+    return {field.name: _field(message, field) for field, _ in message.ListFields()}
+
+
+def _field(message: Message, field: Any) -> Any:
+    value = getattr(message, field.name)
+    if field.type == field.TYPE_BOOL and field.is_repeated:
+        return np.array(value, dtype=bool)  # a mask: millions of values, packed
+    if field.is_repeated:
+        return list(value) if field.message_type is None else [_plain(part) for part in value]
+    return _plain(value)
+
+
+def _plain(value: Any) -> Any:
+    if not isinstance(value, Message):
+        return value
+    form: Callable[[Any], Any] = _FORMS.get(type(value), _plain_fields)
+    return form(value)
+
+
+def _coordinates(message: Message) -> list[float]:
+    return [getattr(message, field.name) for field in message.DESCRIPTOR.fields]
+
+
+def _gripper(message: grasp_pb2.GripperChoice) -> Any:
+    which = message.WhichOneof("choice")
+    return None if which is None else _plain(getattr(message, which))
+
+
+def _tagged(message: Message) -> dict[str, Any]:
+    """The field of the oneof `kind` that is set, its name beside its fields."""
+    which = message.WhichOneof("kind")
+    return {} if which is None else {"kind": which} | _plain_fields(getattr(message, which))
+
+
+def _unless_disabled(message: Message) -> dict[str, Any] | None:
+    fields = _plain_fields(message)
+    for kind in ("ransac", "auto"):  # of a support
+        if kind in fields:
+            fields |= {"kind": kind} | fields.pop(kind)
+    return None if fields.pop("disabled") else fields
+
+
+# Messages that JSON does not write field by field.
+_FORMS: dict[type[Message], Callable[[Any], Any]] = {
+    grasp_pb2.Place: _set_fields,
+    grasp_pb2.Pixel: _coordinates,
+    grasp_pb2.Vector: _coordinates,
+    grasp_pb2.Quaternion: _coordinates,
+    grasp_pb2.HandBox: lambda box: [_coordinates(box.min), _coordinates(box.max)],
+    grasp_pb2.GripperChoice: _gripper,
+    grasp_pb2.Shape: _tagged,
+    grasp_pb2.Obstacle: _tagged,
+    grasp_pb2.Support: _unless_disabled,
+    grasp_pb2.Suppression: _unless_disabled,
+}

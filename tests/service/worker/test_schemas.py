@@ -19,7 +19,7 @@ from edgegrasp_model.options import DetectOptions, parse_options
 from edgegrasp_model.request_cloud import options_of_texts
 from edgegrasp_service.errors import STATUS
 from edgegrasp_service.front.http import DOCUMENT
-from edgegrasp_service.worker.bodies import plain_options as options_from_message
+from edgegrasp_service.worker.answer import plain_options as options_from_message
 
 SCHEMAS = DOCUMENT["components"]["schemas"]
 OPTIONS = DetectOptions.model_json_schema()
