@@ -133,7 +133,11 @@ def select_points(
     counts["in_workspace"] = int(inside.sum())
     seen = Seen(sent.points, None if viewpoints is None else viewpoints.mean(axis=0))
     shown = _segmentation(sent, viewpoints, options)
-    named = _given_numbers(sent) if sent.segment_ids is not None or shown is None else shown.number
+    # The caller's segments, 0 and below meaning none; else all points are one object.
+    number = np.zeros(len(sent.points), dtype=np.int64)
+    if sent.segment_ids is not None:
+        number = np.where(sent.segment_ids > 0, sent.segment_ids, UNKNOWN)
+    named = number if sent.segment_ids is not None or shown is None else shown.number
     support = choose_support(seen, inside, shown, named >= 0, options, warnings)
     up = _up(options, support, None if viewpoints is None else shown)
     # Without a support, everything counts as above it.
@@ -145,9 +149,8 @@ def select_points(
     above = np.flatnonzero(height > margin)
     sent, inside = sent.take(above), inside[above]
     counts["above_support"] = int(inside.sum())
-    on_plan = support.frame.points(sent.points) if support else sent.points.astype(np.float64)
-    plan = on_plan[:, :2]
-    number, confidence = _given_numbers(sent), dict[int, float]()
+    plan = (support.frame.points(sent.points) if support else sent.points.astype(np.float64))[:, :2]
+    number, confidence = number[above], dict[int, float]()
     if not _objects_given(sent, options):
         if shown is not None:
             number, confidence = _recognised(shown, support, above, plan, height, margin)
@@ -302,10 +305,12 @@ def _plane_under_hands(
     support: Support, options: DetectOptions, frame: CanonicalFrame
 ) -> SupportPlane:
     """The plane that hands stay above: one that was found is right within about SPARE."""
-    plane = plane_in_frame(support.plane, frame)
-    if isinstance(options.support, SupportPlane):
-        return plane
-    return plane.model_copy(update={"offset": plane.offset + SPARE})
+    spare = 0.0 if isinstance(options.support, SupportPlane) else SPARE
+    normal = np.asarray(support.plane.normal)
+    length = float(np.linalg.norm(normal))
+    foot = frame.points(normal * (support.plane.offset / length**2))
+    turned = frame.directions(normal) / length
+    return SupportPlane(normal=tuple(turned.tolist()), offset=float(foot @ turned) + spare)
 
 
 def _projection(
@@ -388,13 +393,6 @@ def _up(options: DetectOptions, support: Support | None, shown: Segmentation | N
     return np.array([0.0, 0.0, 1.0]) if shown is None else shown.up
 
 
-def _given_numbers(sent: CheckedCloud) -> Int64:
-    """The caller's segments (N,), 0 and below meaning none; else all points are one object."""
-    if sent.segment_ids is None:
-        return np.zeros(len(sent.points), dtype=np.int64)
-    return np.where(sent.segment_ids > 0, sent.segment_ids, UNKNOWN)
-
-
 def object_probability(scene: Scene, points: Int64) -> Float64:
     """Confidence of the objects of points (E,), rows of the cloud; 1 if given by the caller."""
     number = scene.object_of_point[points].tolist()
@@ -447,12 +445,3 @@ def camera_positions(sent: CheckedCloud, options: DetectOptions) -> Float64 | No
         fix = f"Send numbers from 0 to {len(viewpoints) - 1}, rows of options.viewpoint."
         raise InvalidRequest("view_ids", f"values from {low} to {high}", fix)
     return viewpoints
-
-
-def plane_in_frame(plane: SupportPlane, frame: CanonicalFrame) -> SupportPlane:
-    """A plane of the cloud's frame in the canonical one."""
-    normal = np.asarray(plane.normal)
-    length = float(np.linalg.norm(normal))
-    foot = frame.points(normal * (plane.offset / length**2))
-    turned = frame.directions(normal) / length
-    return SupportPlane(normal=tuple(turned.tolist()), offset=float(foot @ turned))
