@@ -48,11 +48,6 @@ class Gripper:
         rows, others = (one[np.lexsort(one.round(6).T)] for one in (boxes, turned))
         return bool(np.allclose(rows, others))
 
-    @property
-    def finger_depth(self) -> float:
-        """Greatest distance of a contact in front of the palm (the paper's G_d), metres."""
-        return self.contact_z - self.palm_z
-
     @cached_property
     def max_tip_z(self) -> float:
         """Most forward position of the fingertips while closing, metres along z."""

@@ -46,7 +46,14 @@ def describe_hands(
     side, ends = _mirror_sides(around, hands), seen_part(gripper)
     mirrored = hands[:, :3, :3].copy()
     mirrored[:, :, 0] *= side[:, None]
-    seen, first_met, runs = _look(view, cloud.normals, mirrored, side, around.at_side, ends)
+    seen, first_met, runs = (np.zeros((len(side), count), np.float32) for count in (37, 2, 3))
+    boxes = gripper.open_boxes.astype(np.float32)
+    first, last = len(gripper.hand_boxes), len(gripper.hand_boxes) + len(gripper.finger_boxes)
+    across = gripper.pad_half_width, gripper.max_opening / 2
+    lengths = map(np.float32, (*across, ends.palm_z, gripper.tip_z, gripper.max_tip_z))
+    hand = _Hand(boxes[:first], boxes[first:last], *lengths)
+    looked = view, cloud.normals, mirrored, side, around.at_side, hand
+    _look_from_each(*looked, seen, first_met, runs)
     unseen = unseen_space(around.depths, hands, first_met, ends)
     toward = np.zeros((len(mirrored), 3), dtype=np.float32)
     if around.viewpoint is not None:
@@ -119,32 +126,6 @@ class _Hand(NamedTuple):
     end: np.float32  # z of the fingertips at their most forward
 
 
-def _look(
-    view: HandView,
-    normals: Float32,
-    mirrored: Float32,
-    side: Float32,
-    cut: Bools,
-    gripper: Gripper,
-) -> tuple[Float32, Float32, Float32]:
-    """Look from hands with axes (E, 3, 3), the x of which is mirrored where `side` (E,) is -1.
-
-    Returns (E, 37) numbers: those of `_count_hits`, those of `_measure_between`, and how many
-    points between the fingers lie where the workspace cuts objects off, `cut` (N,); then the
-    results of `_runs_along`: greatest and least y between the fingers (E, 2), and runs (E, 3).
-    Counts n are given as log(1 + n).
-    """
-    seen, first_met, runs = (np.zeros((len(side), size), np.float32) for size in (37, 2, 3))
-    boxes = gripper.open_boxes.astype(np.float32)
-    first, last = len(gripper.hand_boxes), len(gripper.hand_boxes) + len(gripper.finger_boxes)
-    across = gripper.pad_half_width, gripper.max_opening / 2
-    along = gripper.palm_z, gripper.tip_z, gripper.max_tip_z
-    lengths = (np.float32(length) for length in (*across, *along))
-    hand = _Hand(boxes[:first], boxes[first:last], *lengths)
-    _look_from_each(view, normals, mirrored, side, cut, hand, seen, first_met, runs)
-    return seen, first_met, runs
-
-
 def _stance(around: Surroundings, candidates: Candidates, gripper: Gripper) -> list[Float32]:
     """The edge itself, and the hand's orientation and height over gravity and support plane."""
     cloud, support, up = around.cloud, around.support, around.up / np.linalg.norm(around.up)
@@ -182,6 +163,12 @@ def _look_from_each(
     first_met: Float32,
     runs: Float32,
 ) -> None:
+    """Look from hands with axes (E, 3, 3), the x of which is mirrored where `side` (E,) is -1.
+
+    Fills in 37 numbers (E, 37): those of `_count_hits`, those of `_measure_between`, and how many
+    points between the fingers lie where the workspace cuts objects off, `cut` (N,), all counts n as
+    log(1 + n); then greatest and least y between the fingers (E, 2), and runs (E, 3).
+    """
     for e in range(len(side)):
         start, stop = view.bounds[e], view.bounds[e + 1]
         x, y, z = view.position[:, start:stop]

@@ -176,7 +176,7 @@ def faults_of(edge: EdgeMeasures, gripper: Gripper) -> dict[NoGrasp, Bools]:
         NoGrasp.TOO_SHORT: edge.length <= MIN_EDGE,
         NoGrasp.TOO_LONG: edge.length >= gripper.max_opening / 2 - EDGE_MARGIN,
         NoGrasp.NO_DIRECTION: edge.depth <= MIN_DEPTH,
-        NoGrasp.TOO_DEEP: edge.depth >= gripper.finger_depth,
+        NoGrasp.TOO_DEEP: edge.depth >= gripper.contact_z - gripper.palm_z,
     }
 
 
@@ -295,13 +295,20 @@ def outlines(
             way = np.array([np.sin(LEAN) * np.cos(turn), np.sin(LEAN) * np.sin(turn), np.cos(LEAN)])
             toward.append(np.broadcast_to(way.astype(np.float32), points.shape))
     ways = np.stack([each[rows] for each in toward])
-    spreads = level_spread(points, rows, ways, OUTLINE_RADIUS, DROP)
+    cells = (
+        np.floor((points - points.min(axis=0)) / np.float32(OUTLINE_RADIUS)).astype(np.int64) + 1
+    )
+    sizes = cells.max(axis=0) + 2
+    key = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
+    order, reach = np.argsort(key, kind="stable"), np.array([OUTLINE_RADIUS, DROP], np.float32)
+    columns = np.ascontiguousarray(points[order].T)
+    spreads = _level_spread(columns, key[order], points[rows], key[rows], sizes, ways, reach)
     found: list[Outline] = []
-    for each, way, least, outward, spread in zip(toward, ways, *spreads, strict=True):
+    for each, way, least, outward, deviation in zip(toward, ways, *spreads, strict=True):
         heading, is_edge = np.zeros_like(points), np.zeros(len(points), dtype=bool)
         # A point is on the outline if its neighbours at its height or above lie on one side.
         heading[rows] = least
-        is_edge[rows] = (outward > MIN_OUTWARD) | (spread < THIN)
+        is_edge[rows] = (outward > MIN_OUTWARD) | (deviation < THIN)
         if found:
             is_edge[rows] &= way @ UP < ONE_VIEW
         found.append(Outline(each, heading, is_edge))
@@ -439,12 +446,15 @@ def _into_strip(
         depth[i] = inward if inside else length
 
 
-def level_spread(
-    points: Float32,  # (N, 3) of the cloud
-    rows: Int64,  # (M,) of the points to look at
+@compiled("contract")
+def _level_spread(
+    columns: Float32,  # (3, N) points, sorted by
+    key: Int64,  # (N,) the number of their cell
+    middle: Float32,  # (M, 3) the points to look at
+    middle_key: Int64,  # (M,)
+    sizes: Int64,  # (3,) of the grid, cells
     toward: Float32,  # (T, M, 3) unit, toward each viewpoint
-    radius: float,  # metres around each point in which others count,
-    drop: float,  # and how much lower they may lie, metres
+    reach: Float32,  # (2,) metres around each point in which others count, and how much lower
 ) -> tuple[Float32, Float32, Float32]:
     """How the neighbourhood of each point is distributed, from each viewpoint.
 
@@ -452,24 +462,6 @@ def level_spread(
     (T, M) the point lies from their mean along it, not negative; their standard deviation (T, M)
     along it, metres.
     """
-    cells = np.floor((points - points.min(axis=0)) / np.float32(radius)).astype(np.int64) + 1
-    sizes = cells.max(axis=0) + 2
-    key = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
-    order = np.argsort(key, kind="stable")
-    reach, columns = np.array([radius, drop], np.float32), np.ascontiguousarray(points[order].T)
-    return _level_spread(columns, key[order], points[rows], key[rows], sizes, toward, reach)
-
-
-@compiled("contract")
-def _level_spread(
-    columns: Float32,
-    key: Int64,
-    middle: Float32,
-    middle_key: Int64,
-    sizes: Int64,
-    toward: Float32,
-    reach: Float32,
-) -> tuple[Float32, Float32, Float32]:
     ways = toward.shape[:2]
     offset, deviation = np.empty(ways, np.float32), np.empty(ways, np.float32)
     least = np.empty(toward.shape, np.float32)
