@@ -160,7 +160,7 @@ def simulator(kind: SceneKind) -> dict[str, dict[str, float]]:
             ours = ModelCatalogue.load().get("edgegrasp-small")
             prepared = ours.prepare(observation.cloud, options)
             assert prepared.scene is not None
-            hands = prepared.gripper, prepared.crop_radius, {}, ours.sees_hands
+            hands = prepared.gripper, prepared.crop_radius, prepared.counts, ours.sees_hands
             sample = Sampler(prepared.scene, options, *hands).all()
             poses = prepared.scene.frame.poses_in_cloud(sample.candidates.T_cloud_hand)
             begin = time.process_time()

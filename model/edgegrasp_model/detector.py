@@ -2,6 +2,7 @@
 
 import re
 import time
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -80,7 +81,7 @@ class Prepared:
     crop_radius: float  # metres
     selected: SelectedPoints
     scene: Scene | None  # None if too few points are left
-    counts: dict[str, int]
+    counts: defaultdict[str, int]
     warnings: list[str]
     seconds: dict[str, float]
     followed: Followed | None = None  # objects followed from an earlier answer
@@ -153,7 +154,7 @@ class GraspDetector:
         """First stage: choose the gripper, and build the scene if enough of the cloud is left."""
         start = time.perf_counter()
         sent = check_cloud(cloud, options.num_approach_points or 1, thin)
-        counts: dict[str, int] = {}
+        counts: defaultdict[str, int] = defaultdict(int)
         gripper, warnings = choose_gripper(options, self.gripper, self.grippers), [*sent.warnings]
         radius = self.metadata.network.crop_radius
         if options.gripper is not None:  # the ball has to contain every contact within reach
@@ -197,14 +198,8 @@ class GraspDetector:
         scene, scored = prepared.scene, None
         if scene is None or not scene.approach_allowed.any() or prepared.options.follows_only:
             return None
-        sampler = Sampler(
-            scene,
-            prepared.options,
-            prepared.gripper,
-            prepared.crop_radius,
-            prepared.counts,
-            sees_hands=self.sees_hands,
-        )
+        given = prepared.options, prepared.gripper, prepared.crop_radius, prepared.counts
+        sampler = Sampler(scene, *given, sees_hands=self.sees_hands)
         for enough in ROUNDS:
             with prepared.timed("candidates"):
                 done = NOTHING
@@ -262,7 +257,7 @@ class GraspDetector:
         counts["returned"] = len(grasps)
         return Detection(
             grasps,
-            counts,
+            dict(counts),
             prepared.seconds | {"total": sum(prepared.seconds.values())},
             self.metadata.name,
             GripperOutline(gripper.name, gripper.palm_z, gripper.tip_z),
@@ -312,8 +307,9 @@ class GraspDetector:
                 evaluations = self._score_given(prepared, scene, given, options.collision)
         prepared.counts["given"] = len(asked)
         prepared.counts["scored"] = sum(each.grasp is not None for each in evaluations)
-        seconds = prepared.seconds | {"total": sum(prepared.seconds.values())}
-        return Scoring(evaluations, prepared.counts, seconds, self.metadata.name, prepared.warnings)
+        counts, seconds = dict(prepared.counts), prepared.seconds
+        seconds["total"] = sum(seconds.values())
+        return Scoring(evaluations, counts, seconds, self.metadata.name, prepared.warnings)
 
     def _score_poses(
         self, prepared: Prepared, scene: Scene, T_cloud_hand: Float32, request: Collision

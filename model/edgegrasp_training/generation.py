@@ -1,6 +1,7 @@
 """Generate labelled views: observe random clutter, try edge grasps in it, keep the outcomes."""
 
 import json
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -365,7 +366,7 @@ def choose_grasps(
             return None
         gripper = choose_gripper(request, load_gripper(), {})
         radius = max(CROP_RADIUS, gripper.max_opening / 2)
-        sample = Sampler(scene, request, gripper, radius, {}, sees_hands=True).all()
+        sample = Sampler(scene, request, gripper, radius, defaultdict(int), sees_hands=True).all()
         if len(sample.candidates) == 0:
             return None
         rows, best = _any(sample, options.grasps_per_view, rng), None

@@ -1,6 +1,7 @@
 """From a scene to the candidates that the network scores."""
 
 import math
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -74,7 +75,7 @@ class Sampler:
         options: DetectOptions,
         gripper: Gripper,
         crop_radius: float,  # of the balls, metres
-        counts: dict[str, int],  # gets the candidates left after each constraint, over all rounds
+        counts: defaultdict[str, int],  # gets what each constraint leaves, over all rounds
         sees_hands: bool = False,  # whether the network scores hands that are no edge grasps well
     ) -> None:
         """Share the approach points among the objects."""
@@ -112,12 +113,12 @@ class Sampler:
         row, free = self._checked(drawn, outcome)
         new = free | (options.collision.mode != "avoid")
         new[new] = different(drawn.T_cloud_hand[row[new]], free[new], self.gripper, options)
-        most = options.num_candidates - self.counts.get("scored", 0)
+        most = options.num_candidates - self.counts["scored"]
         first = int(drawn.top_down[row[free & new]].sum())
         scored = rows_to_score(free, new, options, most, self._rng, first)
         row, free = row[scored], free[scored]
         outcome[row] = CODE[Outcome.RETURNED]
-        self._count("scored", len(row))
+        self.counts["scored"] += len(row)
         return Sample(drawn.take(row), free, drawn, outcome, row)
 
     def all(self) -> Sample:
@@ -136,10 +137,10 @@ class Sampler:
         scene, options, gripper = self.scene, self.options, self.gripper
         points, margin = scene.cloud.points, options.collision.margin
         crop = crop_balls(points, approach_index, self.crop_radius)
-        self._count("approach_points", len(approach_index))
-        self._count("pairs", len(crop.ball_rows))
+        self.counts["approach_points"] += len(approach_index)
+        self.counts["pairs"] += len(crop.ball_rows)
         pair = np.flatnonzero(scene.contact_allowed[crop.ball_rows])
-        self._count("in_contact_region", len(pair))
+        self.counts["in_contact_region"] += len(pair)
         pairs = approach_index[crop.ball_of_point[pair]], crop.ball_rows[pair]
         candidates = edge_grasps(scene.cloud, *pairs, gripper)
         candidates = replace(candidates, pair=pair[candidates.pair])
@@ -159,7 +160,7 @@ class Sampler:
         if self.sees_hands and self._round == 1:  # first, so that none is left out
             top_down = top_down_grasps(scene, gripper, margin)
             candidates = Candidates.concatenate([top_down, candidates])
-        self._count("candidates", len(candidates))
+        self.counts["candidates"] += len(candidates)
         outcome = np.full(len(candidates), CODE[Outcome.RETURNED])
         if scene.support is not None:
             candidates, clear = retract(candidates, scene.support, gripper, margin)
@@ -167,8 +168,8 @@ class Sampler:
         asked, in_frame = options.approach_direction, scene.frame.directions
         allowed = allowed_directions(-candidates.approach, asked, in_frame)
         outcome[~allowed] = CODE[Outcome.DIRECTION]
-        self._count("in_direction", int(allowed.sum()))
-        self._count("clear_of_support", int((outcome == CODE[Outcome.RETURNED]).sum()))
+        self.counts["in_direction"] += int(allowed.sum())
+        self.counts["clear_of_support"] += int((outcome == CODE[Outcome.RETURNED]).sum())
         return candidates, outcome
 
     def _checked(self, candidates: Candidates, outcome: NDArray[np.int8]) -> tuple[Int64, Bools]:
@@ -185,13 +186,9 @@ class Sampler:
         outcome[row] = CODE[Outcome.NOT_SCORED]
         if rule.mode != "ignore":
             outcome[row[~free]] = CODE[Outcome.COLLISION]
-        self._count("checked", len(row))
-        self._count("collision_free", int(free.sum()))
+        self.counts["checked"] += len(row)
+        self.counts["collision_free"] += int(free.sum())
         return row, free
-
-    def _count(self, name: str, number: int) -> None:
-        """Add to a count, which starts at 0."""
-        self.counts[name] = self.counts.get(name, 0) + number
 
     def _spread(self, counts: Int64) -> Int64:
         """Further approach points, `counts` (O,) on each of the objects; rows of the cloud."""
