@@ -30,8 +30,7 @@ from edgegrasp_model.options import (
 from edgegrasp_model.ranking import COLLIDING, objects_first, ranked
 from edgegrasp_model.results import OBSTACLE, Following
 from edgegrasp_model.scene.cloud import thinned
-from edgegrasp_model.scene.regions import numbers_chosen
-from edgegrasp_model.scene.scene import Scene
+from edgegrasp_model.scene.scene import Scene, numbers_chosen
 from edgegrasp_model.scene.segment import FIXED, UNKNOWN
 from edgegrasp_results import Evaluation, Grasp, Tracking
 

@@ -24,7 +24,7 @@ from edgegrasp_model.request_cloud import (
     read_depth_images,
 )
 from edgegrasp_model.scene.cloud import CheckedCloud, check_cloud, seen_from_origin, voxelise
-from edgegrasp_model.scene.regions import check_region, inside_region
+from edgegrasp_model.scene.scene import check_region, inside_region
 from edgegrasp_service.errors import PayloadTooLarge
 
 from .scenes import SEED, random_hands

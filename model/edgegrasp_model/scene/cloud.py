@@ -12,6 +12,7 @@ from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Floats, Int6
 from edgegrasp_camera.clouds import CloudInput as CloudInput
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.kernels import compiled
+from edgegrasp_model.options import Workspace
 
 MAX_EXTENT = 20.0  # metres; if most of a cloud is wider, it is probably in millimetres
 MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
@@ -126,6 +127,15 @@ def _is_fine(image: Floats) -> bool:
 def thinned(count: int, most: int = ENOUGH) -> slice:
     """Rows, spread evenly, of `most` or a few more of a cloud's points."""
     return slice(None, None, max(count // most, 1))
+
+
+def inside_workspace(points: Float32, box: Workspace | None, around: Floats | float = 0.0) -> Bools:
+    """Which points (N, 3) lie in a box grown by `around` metres; all if there is no box."""
+    if box is None:
+        return np.ones(len(points), dtype=bool)
+    low, high = np.asarray(box.min) - around, np.asarray(box.max) + around
+    x, y, z = ((axis >= a) & (axis <= b) for axis, a, b in zip(points.T, low, high, strict=True))
+    return np.asarray(x & y & z)
 
 
 def unit(vectors: Vectors) -> Vectors:

@@ -11,8 +11,13 @@ from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import DetectOptions, RansacPlane, SupportPlane
-from edgegrasp_model.scene.cloud import MAX_DISTANCE, CanonicalFrame, CheckedCloud, thinned
-from edgegrasp_model.scene.regions import inside_workspace
+from edgegrasp_model.scene.cloud import (
+    MAX_DISTANCE,
+    CanonicalFrame,
+    CheckedCloud,
+    inside_workspace,
+    thinned,
+)
 from edgegrasp_model.scene.segment import Segmentation
 
 THICK, GROWTH = 0.004, 0.006  # metres from a plane, plus this per squared metre of distance
