@@ -13,13 +13,12 @@ from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.candidates.top_down import smallest_rectangle
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_description import seen_part
 from edgegrasp_model.kernels import mean_of_alike, non_max_suppression
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Outcome, Ungraspable
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.support import Support
-from edgegrasp_model.unseen import leaves_image, unseen_space
+from edgegrasp_model.unseen import leaves_image, seen_part, unseen_space
 from edgegrasp_results import DebugInfo, DetectedObject, FoundSupport, Grasp
 
 COLLIDING = 0.5  # factor on the score of a colliding grasp in the ranking

@@ -1,7 +1,7 @@
 """Space around a hand that no camera saw, and the visible extent of objects."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple, Self
 
@@ -28,6 +28,7 @@ HALF = 256  # most cells from the middle of the map to its edge: some 0.5 m
 FARTHEST = 10 * HALF  # stands for everything beyond
 NUM_EXTENTS = 11
 EXTENT_POINTS = 256  # most points of an object that its extents are measured with
+SEEN_LENGTH = 0.0465  # metres of finger length from the tips: as long as the Panda's
 FARTHEST_EXTENT = 0.25  # metres; extents are clipped here
 
 
@@ -103,6 +104,11 @@ def leaves_image(
     share = outside(P_image_hand[leaves, None], places).mean(axis=2).max(axis=1)  # of a slice
     leaves[leaves] = share > OUTSIDE_SHARE
     return leaves
+
+
+def seen_part(gripper: Gripper) -> Gripper:
+    """The hand with a palm at most SEEN_LENGTH behind its tips, as if its fingers were short."""
+    return replace(gripper, palm_z=max(gripper.palm_z, gripper.tip_z - SEEN_LENGTH))
 
 
 def unseen(behind: Float32) -> Float32:

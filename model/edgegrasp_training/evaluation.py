@@ -23,10 +23,9 @@ from scipy.stats import mannwhitneyu
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
 from edgegrasp_model.errors import EdgeGraspError
-from edgegrasp_model.hand_description import BEYOND
 from edgegrasp_model.networks.checkpoint import load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
-from edgegrasp_model.networks.hand import HandBatch
+from edgegrasp_model.networks.hand import BEYOND, HandBatch
 from edgegrasp_model.ranking import HIDDEN
 from edgegrasp_training.examples import pack_hands, tried_grasps
 from edgegrasp_training.views import find_views, load_view, scene_of, table

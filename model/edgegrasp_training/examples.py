@@ -23,11 +23,10 @@ from edgegrasp_model.candidates.edge_grasps import (
     outlines,
     retract,
 )
-from edgegrasp_model.hand_description import HEIGHTS, UNKNOWN_HEIGHT
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.networks.config import NetworkConfig
-from edgegrasp_model.networks.hand import HandBatch
+from edgegrasp_model.networks.hand import HEIGHTS, UNKNOWN_HEIGHT, HandBatch
 from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
 from edgegrasp_model.scene.scene import Surroundings
 from edgegrasp_training.recipes import LENGTH_UNIT

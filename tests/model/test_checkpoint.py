@@ -14,7 +14,6 @@ from safetensors import safe_open
 from safetensors.torch import load, load_file, save_file
 
 from edgegrasp_model.errors import InvalidCheckpoint
-from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE as SIZE
 from edgegrasp_model.networks.checkpoint import (
     build_network,
     check_reference_logits,
@@ -22,6 +21,7 @@ from edgegrasp_model.networks.checkpoint import (
     save_checkpoint,
 )
 from edgegrasp_model.networks.config import EDGEGRASP, HAND, CheckpointMetadata
+from edgegrasp_model.networks.config import HAND_DESCRIPTION_SIZE as SIZE
 from edgegrasp_model.networks.import_checkpoint import import_checkpoint
 
 CONFIG = replace(HAND, crop_radius=0.04)

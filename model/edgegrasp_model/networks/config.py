@@ -6,8 +6,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE
-
+HAND_DESCRIPTION_SIZE = 87  # numbers
 Architecture = Literal["edgegrasp", "vn-edgegrasp", "hand"]
 Count = Annotated[int, Field(gt=0, strict=True)]
 Metres = Annotated[float, Field(gt=0.0, lt=1.0)]

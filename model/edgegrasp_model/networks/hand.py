@@ -1,30 +1,29 @@
 """HandNet: scores edge grasps from what each hand sees in its own frame.
 
-A PointNet over the points around the fingers, beside the hand description. Where the paper's
+A PointNet over the points around the fingers, beside a description of the hand. Where the paper's
 network shares one ball among all its edge grasps and has to learn what a rotation does, this one
-sees each edge grasp in the frame of its own hand: invariant by construction.
+sees each edge grasp in the frame of its own hand: invariant under rotations, translations and
+reflections of the whole scene by construction. The numbers of the description say how many points
+the hand would hit, what lies between its fingers, from where that was seen, how the hand is
+oriented to gravity and support, how much of the space around it the camera did not see, the hand's
+own measures, and the visible extent of the object around it.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from edgegrasp_camera.arrays import Float32, Int64
-from edgegrasp_model.candidates.collision import hand_views
-from edgegrasp_model.candidates.edge_grasps import Candidates
+from edgegrasp_camera.arrays import Bools, Float32, Int64
+from edgegrasp_model.candidates.collision import NEAR, HandView, hand_views
+from edgegrasp_model.candidates.edge_grasps import APPROACH_LENGTH, Candidates, support_clearance
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_description import (
-    HAND_DESCRIPTION_SIZE,
-    describe_hands,
-    points_around_fingers,
-)
 from edgegrasp_model.kernels import compiled
-from edgegrasp_model.networks.config import NetworkConfig
+from edgegrasp_model.networks.config import HAND_DESCRIPTION_SIZE, NetworkConfig
 from edgegrasp_model.networks.layers import (
     EDGE_ROWS,
     PackedMlp,
@@ -34,12 +33,27 @@ from edgegrasp_model.networks.layers import (
     maximum,
     mlp,
 )
+from edgegrasp_model.scene.cloud import UP, unit
 from edgegrasp_model.scene.scene import Surroundings
+from edgegrasp_model.unseen import seen_part, unseen_space, visible_extents
 
+# The network
 POINT_UNIT = 0.05  # metres; scale of the positions around the fingers
 DROPOUT = 0.1  # dropout of the classifier's inputs
 CONSTANT = 1e-6  # standard deviation below which a number of the description counts as constant
 CHUNK = 64  # hands at a time, so that the work stays in cache
+
+# The description
+AXIS = 0.001  # metres from the approach axis, on which the approach point itself lies
+SLAB = 0.004  # metres; thickness of the first layer each finger would meet
+FACING = 0.7  # cosine from which a normal faces a finger
+ABOVE = 0.001  # metres over the camera
+# Metres beyond the pads' sides, the open fingers' inner faces, the palm and the tips.
+BESIDE, OUTSIDE, BEHIND, BEYOND_TIPS = 0.027, 0.06, 0.026, 0.012
+UNKNOWN_HEIGHT = 0.10  # metres; heights are clipped here, and unknown ones get this value
+GAP = 0.007  # metres; a gap this long ends what lies between the fingers
+HEIGHTS = slice(58, 61)  # numbers that are heights over the support plane
+BEYOND = slice(65, 67)  # unseen metres outward from what each finger meets first
 
 
 @dataclass(frozen=True)
@@ -60,11 +74,14 @@ class HandBatch:
         description_size: int = HAND_DESCRIPTION_SIZE,
     ) -> Self:
         """The view of each candidate's hand, with at most `num_points` points."""
-        T_cloud_hand = candidates.T_cloud_hand
-        view = hand_views(around.cloud, T_cloud_hand, gripper)
-        description = describe_hands(around, candidates, gripper, view, description_size)
-        points, count = points_around_fingers(around, T_cloud_hand, gripper, view, num_points)
-        return cls(torch.from_numpy(description), torch.from_numpy(points), torch.from_numpy(count))
+        hands, ends = candidates.T_cloud_hand, seen_part(gripper)
+        view, side = hand_views(around.cloud, hands, gripper), _mirror_sides(around, hands)
+        description = describe_hands(around, candidates, gripper, view, side, description_size)
+        x, y = gripper.pad_half_width + BESIDE, gripper.max_opening / 2 + OUTSIDE
+        low, high = (-x, -y, ends.palm_z - BEHIND), (x, y, gripper.tip_z + BEYOND_TIPS)
+        box = np.array([low, high, (0.0, 0.0, gripper.tip_z)], dtype=np.float32)
+        points = _around_fingers(view, around.cloud.normals, hands, side, box, num_points)
+        return cls(*map(torch.from_numpy, (description, *points)))
 
     @staticmethod
     def concatenate(batches: Sequence["HandBatch"]) -> "HandBatch":
@@ -159,3 +176,277 @@ def _pool(features: Float32, count: Int64, pooled: Float32) -> None:
                 mean[c] += value
         for c in range(channels):
             mean[c] /= np.float32(max(count[e], 1))
+
+
+# The description of a hand
+
+
+def describe_hands(
+    around: Surroundings,  # what they look at
+    candidates: Candidates,  # E candidates
+    gripper: Gripper,  # fingers open to its maximum
+    view: HandView,  # of the same candidates
+    side: Float32,  # (E,) as from `_mirror_sides`
+    size: int,  # numbers that the network reads; the extents, which come last, may be skipped
+) -> Float32:
+    """The description (E, F) of candidates: log(1 + counts), metres and cosines."""
+    cloud, up, hands, ends = around.cloud, around.up, candidates.T_cloud_hand, seen_part(gripper)
+    mirrored = hands[:, :3, :3].copy()
+    mirrored[:, :, 0] *= side[:, None]
+    seen, first_met, runs = (np.zeros((len(side), count), np.float32) for count in (37, 2, 3))
+    boxes = gripper.open_boxes.astype(np.float32)
+    first, last = len(gripper.hand_boxes), len(gripper.hand_boxes) + len(gripper.finger_boxes)
+    across = gripper.pad_half_width, gripper.max_opening / 2
+    lengths = map(np.float32, (*across, ends.palm_z, gripper.tip_z, gripper.max_tip_z))
+    hand = _Hand(boxes[:first], boxes[first:last], *lengths)
+    looked = view, cloud.normals, mirrored, side, around.at_side, hand
+    _look_from_each(*looked, seen, first_met, runs)
+    unseen = unseen_space(around.depths, hands, first_met, ends)
+    toward = np.zeros((len(mirrored), 3), dtype=np.float32)
+    if around.viewpoint is not None:
+        toward = unit(around.viewpoint - hands[:, :3, 3])
+    ups = np.broadcast_to(up / np.linalg.norm(up), toward.shape)
+    length, swing = gripper.tip_z - gripper.palm_z, gripper.max_tip_z - gripper.tip_z
+    thick = max(high[1] for _, high in gripper.finger_boxes)
+    measures = gripper.max_opening, length, gripper.pad_half_width, thick, swing  # of a finger
+    columns = [
+        *seen.T,
+        *np.einsum("ed,edk->ke", toward, mirrored),  # 0 where the camera is unknown
+        *np.einsum("ed,edk->ke", ups, mirrored),
+        *unseen.parts,
+        *_stance(around, candidates, gripper),
+        # Older networks read only the first numbers, so new ones are appended here.
+        *unseen.ways,
+        *unseen.depths,
+        *unseen.beyond,
+        unseen.free,
+        *runs.T,
+        *np.tile(measures, (len(candidates), 1)).T,
+    ]
+    if size > len(columns):
+        of_object = cloud.points, around.object_of_point, candidates.contact_index
+        columns += [*visible_extents(*of_object, hands, side, ends, up).T]
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def _mirror_sides(around: Surroundings, T_cloud_hand: Float32) -> Float32:
+    """Factor (E,), 1 or -1, on a hand's x that puts a single camera on its positive side."""
+    if around.viewpoint is None:
+        return np.ones(len(T_cloud_hand), dtype=np.float32)
+    # If a hand approaches straight from the camera, up decides instead of rounding errors.
+    toward = around.viewpoint + ABOVE * UP - T_cloud_hand[:, :3, 3]
+    along_x = np.einsum("ed,ed->e", toward, T_cloud_hand[:, :3, 0])
+    return np.where(along_x < 0.0, -1.0, 1.0).astype(np.float32)
+
+
+class _Hand(NamedTuple):
+    """The open gripper as the compiled loops read it; metres."""
+
+    boxes: Float32  # (B, 2, 3) of the hand
+    fingers: Float32  # (F, 2, 3) of the finger on the side of positive y
+    half: np.float32  # width of a pad
+    inner: np.float32  # y of that finger's inner face
+    palm: np.float32  # z
+    tip: np.float32
+    end: np.float32  # z of the fingertips at their most forward
+
+
+def _stance(around: Surroundings, candidates: Candidates, gripper: Gripper) -> list[Float32]:
+    """The edge itself, and the hand's orientation and height over gravity and support plane."""
+    cloud, support, up = around.cloud, around.support, around.up / np.linalg.norm(around.up)
+    pose = candidates.T_cloud_hand
+    contact = cloud.points[candidates.contact_index]  # (E, 3)
+    edge = contact - cloud.points[candidates.approach_index]
+    columns = [
+        candidates.depth,
+        np.linalg.norm(edge, axis=1),
+        np.einsum("ed,ed->e", edge, pose[:, :3, 1]),
+        candidates.approach @ up,
+        np.abs(pose[:, :3, 1] @ up),
+    ]
+    if support is None:
+        return columns + [np.full(len(pose), UNKNOWN_HEIGHT, dtype=np.float32)] * 3
+    normal = np.asarray(support.normal)
+    tips = pose[:, :3, 3] + gripper.tip_z * pose[:, :3, 2]
+    heights = [
+        tips @ normal - support.offset,
+        contact @ normal - support.offset,
+        support_clearance(pose, candidates.opening, support, gripper),
+    ]
+    return columns + [np.clip(h, -UNKNOWN_HEIGHT, UNKNOWN_HEIGHT) for h in heights]
+
+
+@compiled("contract")
+def _look_from_each(
+    view: HandView,
+    normals: Float32,
+    axes: Float32,
+    side: Float32,
+    cut: Bools,
+    hand: _Hand,
+    seen: Float32,
+    first_met: Float32,
+    runs: Float32,
+) -> None:
+    """Look from hands with axes (E, 3, 3), the x of which is mirrored where `side` (E,) is -1.
+
+    Fills in 37 numbers (E, 37): those of `_count_hits`, those of `_measure_between`, and how many
+    points between the fingers lie where the workspace cuts objects off, `cut` (N,), all counts n as
+    log(1 + n); then greatest and least y between the fingers (E, 2), and runs (E, 3).
+    """
+    for e in range(len(side)):
+        start, stop = view.bounds[e], view.bounds[e + 1]
+        x, y, z = view.position[:, start:stop]
+        x = side[e] * x
+        _count_hits(x, y, z, hand, seen[e, :7])
+        across, ahead = np.abs(y) < hand.inner, z > hand.palm
+        pads = across & ahead & (np.abs(x) < hand.half + NEAR) & (z < hand.tip + NEAR)
+        wide = np.flatnonzero(across & ahead & (np.abs(x) < 3 * hand.half) & (z < hand.end))
+        points, facing = np.empty((2, 3, len(wide)), dtype=np.float32)
+        points[0], points[1], points[2] = x[wide], y[wide], z[wide] - hand.palm
+        for d in range(3):
+            for i in range(len(wide)):
+                n = normals[view.row[start + wide[i]]]
+                facing[d, i] = n[0] * axes[e, 0, d] + n[1] * axes[e, 1, d] + n[2] * axes[e, 2, d]
+        _measure_between(points, facing, hand, seen[e, 7:36])
+        seen[e, 36] = np.log1p(np.sum(cut[view.row[start:stop]] & pads))
+        _runs_along(points[1][np.abs(points[0]) < hand.half], first_met[e], runs[e])
+
+
+@compiled("contract")
+def _count_hits(x: Float32, y: Float32, z: Float32, hand: _Hand, hits: Float32) -> None:
+    """Count points in the open fingers, in the hand, near each finger, on the approach, ahead."""
+    on_way = _in_any(hand.boxes, x, y, z, 0.0, np.inf)
+    for finger in range(2):
+        outward = y if finger == 0 else -y
+        on_way |= _in_any(hand.fingers, x, outward, z, 0.0, APPROACH_LENGTH)
+        hits[finger] = np.sum(_in_any(hand.fingers, x, outward, z, 0.0, 0.0))
+        hits[3 + finger] = np.sum(_in_any(hand.fingers, x, outward, z, NEAR, 0.0))
+    hits[2] = np.sum(_in_any(hand.boxes, x, y, z, 0.0, 0.0))
+    hits[5] = np.sum(on_way)
+    hits[6] = np.sum((np.abs(x) < hand.half) & (np.abs(y) < hand.inner) & (z >= hand.tip))
+    hits[:] = np.log1p(hits)
+
+
+@compiled("contract")
+def _in_any(
+    boxes: Float32, x: Float32, y: Float32, z: Float32, around: float, behind: float
+) -> Bools:
+    """Which points lie in one of some boxes, grown around (not behind) and lengthened behind."""
+    inside = np.zeros(len(x), dtype=np.bool_)
+    grown, longer = np.float32(around), np.float32(behind)
+    for b in range(len(boxes)):
+        low, high = boxes[b, 0] - grown, boxes[b, 1] + grown
+        back = boxes[b, 0, 2] - longer
+        for i in range(len(x)):
+            level = (x[i] > low[0]) & (x[i] < high[0]) & (y[i] > low[1]) & (y[i] < high[1])
+            inside[i] |= level & (z[i] > back) & (z[i] < high[2])
+    return inside
+
+
+@compiled("contract")
+def _measure_between(points: Float32, normals: Float32, hand: _Hand, numbers: Float32) -> None:
+    """Extent, middle and normals of points (3, P), z from the palm, that the fingers would touch.
+
+    Those between the pads: their number; greatest, least and mean x, y and z. All, up to three
+    pads wide: their number; greatest, least and mean x. Between the pads: the mean size of the
+    normals' x and y, and their mean z; how many face each finger; the mean y of the normals on
+    either side of the hand's axis. Of what each finger meets first: number, mean y of the normals,
+    mean z and mean x.
+    """
+    length = hand.end - hand.palm
+    between = np.flatnonzero(np.abs(points[0]) < hand.half)
+    inside, normal = points[:, between], normals[:, between]
+    x, y, z = inside
+    ny = normal[1]
+    numbers[0] = np.log1p(len(between))
+    for d in range(3):
+        empty = np.float32(0.0) if d < 2 else length
+        _extent(inside[d], empty, numbers[1 + 3 * d : 4 + 3 * d])
+    numbers[10] = np.log1p(len(points[0]))
+    _extent(points[0], np.float32(0.0), numbers[11:14])
+    numbers[14], numbers[15] = _mean(np.abs(normal[0])), _mean(np.abs(ny))
+    numbers[16] = _mean(normal[2])
+    numbers[17], numbers[18] = np.log1p(np.sum(ny > FACING)), np.log1p(np.sum(ny < -FACING))
+    numbers[19], numbers[20] = _mean(ny[y > AXIS]), _mean(ny[y < -AXIS])
+    for finger in range(2):
+        first = y > numbers[4] - SLAB if finger == 0 else y < numbers[5] + SLAB
+        count, at = np.sum(first), 21 + 4 * finger
+        numbers[at], numbers[at + 1] = np.log1p(count), _mean(ny[first])
+        numbers[at + 2] = _mean(z[first]) if count else length / 2
+        numbers[at + 3] = _mean(x[first])
+
+
+@compiled("contract")
+def _extent(values: Float32, empty: np.float32, numbers: Float32) -> None:
+    """Greatest, least and mean; if there is no value: 0, `empty` and half of `empty`."""
+    numbers[0], numbers[1], numbers[2] = 0.0, empty, empty / 2
+    if len(values):
+        numbers[0], numbers[1], numbers[2] = values.max(), values.min(), _mean(values)
+
+
+@compiled("contract")
+def _mean(values: Float32) -> float:
+    """The mean; 0 without values."""
+    total = 0.0
+    for i in range(len(values)):
+        total += values[i]
+    return total / max(len(values), 1)
+
+
+@compiled("contract")
+def _runs_along(y: Float32, ends: Float32, runs: Float32) -> None:
+    """The longest empty stretch of y, and the gapless length of what each finger touches first.
+
+    Also the greatest and the least y, which stay 0 without points.
+    """
+    along = np.sort(y)
+    if len(along) == 0:
+        return
+    low, high = along[0], along[-1]
+    ends[0], ends[1] = high, low
+    runs[1], runs[2] = high - low, high - low
+    whole = True
+    for i in range(1, len(along)):
+        apart = along[i] - along[i - 1]
+        runs[0] = max(runs[0], apart)
+        if apart > GAP:
+            runs[1] = high - along[i]
+            if whole:
+                runs[2] = along[i - 1] - low
+            whole = False
+
+
+@compiled("contract")
+def _around_fingers(
+    view: HandView,
+    normals: Float32,
+    T_cloud_hand: Float32,
+    side: Float32,
+    box: Float32,
+    limit: int,
+) -> tuple[Float32, Int64]:
+    """The points of hands (E, 4, 4) in a box around their fingers; x as `side` (E,) has it.
+
+    `box` (3, 3) are its corners and the origin, between the fingertips. At most `limit` points are
+    kept of each hand, spread evenly over the cloud's order. Returns (E, limit, 6) positions in
+    metres and normals, in hand frames, zeros behind the last; and their number (E,).
+    """
+    points, count = np.zeros((len(side), limit, 6), np.float32), np.zeros(len(side), np.int64)
+    low, high, origin = box
+    for e in range(len(side)):
+        start, stop = view.bounds[e], view.bounds[e + 1]
+        x, y, z = view.position[:, start:stop]
+        inside = (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
+        near = start + np.flatnonzero(inside & (z > low[2]) & (z < high[2]))
+        count[e] = min(len(near), limit)
+        for slot in range(count[e]):
+            # If there are too many, an even selection in the cloud's order.
+            p = near[((slot + 1) * len(near) - 1) // limit if len(near) > limit else slot]
+            for d in range(3):
+                points[e, slot, d] = view.position[d, p] - origin[d]
+                for k in range(3):
+                    points[e, slot, 3 + d] += normals[view.row[p], k] * T_cloud_hand[e, k, d]
+            points[e, slot, 0] *= side[e]
+            points[e, slot, 3] *= side[e]
+    return points, count
