@@ -547,22 +547,16 @@ def inside_region(
     cloud: CheckedCloud,  # the points in `voxels`, of the cloud as sent
 ) -> Bools:
     """Which voxels (V,) of the processed cloud a region holds."""
-
-    def in_any(shapes: tuple[Shape, ...]) -> Bools:
-        found = np.zeros(len(points), dtype=bool)
-        for shape in shapes:
-            if isinstance(shape, Rows):
-                found |= voxels.share(_in_rows(shape, cloud)) >= HELD_SHARE
-            else:
-                found |= inside_shape(shape, points)
-        return found
-
-    wanted = in_any(region.include) if region.include else np.ones(len(points), dtype=bool)
-    return wanted & ~in_any(region.exclude)
+    nowhere, arrays = np.zeros(len(points), dtype=bool), (points, voxels, cloud)
+    included, excluded = (
+        np.any([nowhere, *(_inside_shape(shape, *arrays) for shape in shapes)], axis=0)
+        for shapes in (region.include, region.exclude)
+    )
+    return np.asarray((included | (not region.include)) & ~excluded)
 
 
-def inside_shape(shape: Box | OrientedBox | Sphere | HalfSpace, points: Float32) -> Bools:
-    """Which points (V, 3), in the shape's frame, lie in it.  # (V,)."""
+def _inside_shape(shape: Shape, points: Float32, voxels: Voxels, cloud: CheckedCloud) -> Bools:
+    """Which voxels (V,) a shape holds, by their mean points or as it lists their points."""
     match shape:
         case Box():
             return inside_workspace(points, shape)
@@ -575,15 +569,11 @@ def inside_shape(shape: Box | OrientedBox | Sphere | HalfSpace, points: Float32)
             return np.asarray(apart <= shape.radius)
         case HalfSpace():
             return np.asarray(points @ np.asarray(shape.normal) >= shape.offset)
-
-
-def _in_rows(shape: Rows, cloud: CheckedCloud) -> Bools:
-    """Which points of the cloud are listed by rows, a mask or segments.  # (N,)."""
-    match shape:
         case Indices():
-            return np.isin(cloud.row, np.asarray(shape.indices, dtype=np.int64))
+            listed = np.isin(cloud.row, np.asarray(shape.indices, dtype=np.int64))
         case Mask():
-            return np.frombuffer(shape.mask, dtype=bool)[cloud.row]
+            listed = np.frombuffer(shape.mask, dtype=bool)[cloud.row]
         case Segments():
             assert cloud.segment_ids is not None
-            return np.isin(cloud.segment_ids, shape.ids)
+            listed = np.isin(cloud.segment_ids, shape.ids)
+    return voxels.share(listed) >= HELD_SHARE
