@@ -32,7 +32,6 @@ from edgegrasp_model.ranking import (
     SURE_SCORE,
     debug_info,
     detected_objects,
-    found_support,
     grasps_in_cloud,
     judged_together,
     select,
@@ -56,7 +55,7 @@ from edgegrasp_model.tracking import (
     relabelled,
     untracked,
 )
-from edgegrasp_results import Detection, Evaluation, GripperOutline, Scoring
+from edgegrasp_results import Detection, Evaluation, FoundSupport, GripperOutline, Scoring
 
 NO_APPROACH_POINT = (
     "the approach region contains no point of the processed cloud. Rows contain a voxel if they "
@@ -254,7 +253,11 @@ class GraspDetector:
             if prepared.followed is not None:
                 surface = prepared.followed.surface
                 objects = [replace(one, surface=surface.get(one.number)) for one in objects]
-        counts["returned"] = len(grasps)
+        counts["returned"], plane = len(grasps), None
+        if (support := prepared.selected.support) is not None:
+            normal, residual = support.normal.astype(np.float32), support.residual
+            offset = -float(support.frame.T_canonical_cloud[2, 3])  # of the normal of length 1
+            plane = FoundSupport(normal, offset, residual, support.share)
         return Detection(
             grasps,
             dict(counts),
@@ -263,7 +266,7 @@ class GraspDetector:
             GripperOutline(gripper.name, gripper.palm_z, gripper.tip_z),
             prepared.warnings,
             debug,
-            found_support(prepared.selected.support),
+            plane,
             prepared.selected.up.astype(np.float32),
             objects,
             tracking,

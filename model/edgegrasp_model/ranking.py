@@ -17,9 +17,8 @@ from edgegrasp_model.kernels import mean_of_alike, non_max_suppression
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Outcome, Ungraspable
 from edgegrasp_model.scene.scene import Scene
-from edgegrasp_model.scene.support import Support
 from edgegrasp_model.unseen import leaves_image, seen_part, unseen_space
-from edgegrasp_results import DebugInfo, DetectedObject, FoundSupport, Grasp
+from edgegrasp_results import DebugInfo, DetectedObject, Grasp
 
 COLLIDING = 0.5  # factor on the score of a colliding grasp in the ranking
 GOOD_SCORE = 0.5  # score from which an object has a good grasp
@@ -206,15 +205,6 @@ def _far_side_hidden(scene: Scene, T_cloud_hand: Float32, met: Float32, gripper:
     """Hands (E,) beyond whose fingers the object may go on unseen; `met`: what they touch first."""
     beyond = unseen_space(scene.depths, T_cloud_hand, met, seen_part(gripper)).beyond
     return np.asarray(np.maximum(*beyond) > HIDDEN)
-
-
-def found_support(support: Support | None) -> FoundSupport | None:
-    """The support plane as the caller gets it."""
-    if support is None:
-        return None
-    residual = None if math.isnan(support.residual) else support.residual
-    offset = -float(support.frame.T_canonical_cloud[2, 3])  # of the normal of length 1
-    return FoundSupport(support.normal.astype(np.float32), offset, residual, support.share)
 
 
 def detected_objects(

@@ -58,7 +58,7 @@ class Support:
     plane: SupportPlane
     frame: CanonicalFrame  # its z is the height over the plane
     least: float  # metres above it that always belong to it
-    residual: float = math.nan  # metres, median distance of its points; NaN where it is not seen
+    residual: float | None = None  # metres, median distance of its points; None: it is not seen
     share: float = 0.0  # of the points that lie in it
     growth: float = math.nan  # noise of its points, metres per squared metre of distance
     # Rise over the plane at (x, y): of 1, x, y, x^2, x y, y^2.
