@@ -1,7 +1,7 @@
 """From the caller's array to the small, clean cloud with normals that the network sees."""
 
 from dataclasses import dataclass, replace
-from typing import Self, TypeVar, cast
+from typing import NamedTuple, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -252,8 +252,7 @@ def _finite(points: Floats) -> Bools:
     return np.asarray(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
 
 
-@dataclass(frozen=True)
-class Voxels:
+class Voxels(NamedTuple):
     """The occupied voxels of a cloud, sorted by position: the order of the points has no effect."""
 
     voxel: Int64  # (N,) voxel of each point
@@ -291,25 +290,20 @@ def voxelise(points: Floats, voxel_size: float) -> Voxels:
     return Voxels(voxel, count)
 
 
-def nearest_points(points: Float32) -> tuple[Float64, Int64]:
-    """Metres (N, K) to the nearest of points (N, 3), and their rows; the point itself first.
+def neighbourhoods(points: Float32) -> tuple[Bools, Int64]:
+    """Which of points (N, 3) are no outliers, (N,), and rows (N, K) of the nearest to each.
 
-    K is NORMAL_NEIGHBORS, or N where there are fewer.
+    The mean distance of an outlier to those next to it is unusual for the cloud. The first of the
+    rows is the point itself; K is NORMAL_NEIGHBORS, or N where there are fewer.
     """
     k = min(NORMAL_NEIGHBORS, len(points))
     # For a single round of queries a tree that is quickly built is faster.
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
     distance, row = tree.query(points, k=range(1, k + 1))
-    return np.asarray(distance), np.asarray(row)
-
-
-def statistical_outlier_removal(distance: Float64) -> Bools:
-    """A mask (N,) of points whose distances (N, K) to neighbours are not unusual for the cloud."""
-    if len(distance) <= OUTLIER_NEIGHBORS:
-        return np.ones(len(distance), dtype=bool)
-    mean = distance[:, 1 : OUTLIER_NEIGHBORS + 1].mean(axis=1)
-    kept: Bools = mean <= mean.mean() + OUTLIER_DEVIATIONS * mean.std()
-    return kept
+    if len(points) <= OUTLIER_NEIGHBORS:
+        return np.ones(len(points), dtype=bool), np.asarray(row)
+    mean = np.asarray(distance)[:, 1 : OUTLIER_NEIGHBORS + 1].mean(axis=1)
+    return mean <= mean.mean() + OUTLIER_DEVIATIONS * mean.std(), np.asarray(row)
 
 
 @compiled("contract")
@@ -402,10 +396,7 @@ class CanonicalFrame:
 
     def directions(self, directions: ArrayLike) -> Float64:
         """Directions (..., 3) of the cloud's frame in this one."""
-        turned: Float64 = (
-            np.asarray(directions, dtype=np.float64) @ self.T_canonical_cloud[:3, :3].T
-        )
-        return turned
+        return np.asarray(directions, dtype=np.float64) @ self.T_canonical_cloud[:3, :3].T
 
     def poses(self, T_cloud_hand: ArrayLike) -> Float32:
         """Poses (..., 4, 4) in the cloud's frame, in this one."""
@@ -418,9 +409,8 @@ class CanonicalFrame:
 
     def directions_in_cloud(self, directions: ArrayLike) -> Float32:
         """Directions (..., 3) of this frame in the cloud's."""
-        return (np.asarray(directions, dtype=np.float64) @ self.T_canonical_cloud[:3, :3]).astype(
-            np.float32
-        )
+        turned = np.asarray(directions, dtype=np.float64) @ self.T_canonical_cloud[:3, :3]
+        return turned.astype(np.float32)
 
     def poses_in_cloud(self, T_canonical_hand: ArrayLike) -> Float32:
         """Poses (..., 4, 4) in this frame, in the cloud's."""

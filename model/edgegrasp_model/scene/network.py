@@ -198,7 +198,11 @@ def range_image(
     in_view = apart @ turn.T
     low, high = _view(in_view)
     finest = float(np.sqrt((high - low).prod() / (WIDTH * HEIGHT)))
-    spacing = _spacing(in_view, low, high, len(points))
+    # Distance at a depth of one metre between neighbours, from the area that points cover.
+    ahead, cell = in_view[in_view[:, 2] > NEAREST], max(float((high - low).max()) / COARSE, 1e-6)
+    place = ((ahead[:, :2] / ahead[:, 2:] - low) / cell).astype(np.int64)
+    occupied = len(np.unique(place[:, 0] * 4096 + place[:, 1])) * cell * cell
+    spacing = float(np.sqrt(occupied / len(points)))
     pixel_size = finest if spacing < FILLED * finest else SPACING * spacing
     width, height = (int(np.ceil(side / MULTIPLE)) * MULTIPLE for side in (high - low) / pixel_size)
     middle = (low + high) / 2
@@ -238,15 +242,6 @@ def _view(points: Float64) -> tuple[Float64, Float64]:
     edge = 0.02 * (high - low) + 1e-3
     low, high = np.maximum(low - edge, -WIDEST_VIEW), np.minimum(high + edge, WIDEST_VIEW)
     return low.round(9), high.round(9)
-
-
-def _spacing(points: Float64, low: Float64, high: Float64, count: int) -> float:
-    """Distance at z = 1 between neighbours of `count` points like (N, 3)."""
-    ahead = points[points[:, 2] > NEAREST]
-    cell = max(float((high - low).max()) / COARSE, 1e-6)
-    place = ((ahead[:, :2] / ahead[:, 2:] - low) / cell).astype(np.int64)
-    occupied = len(np.unique(place[:, 0] * 4096 + place[:, 1])) * cell * cell
-    return float(np.sqrt(occupied / max(count, 1)))
 
 
 def _enlarged(depth: Float32, times: int, corner: Float64, pixel_size: float) -> Float32:

@@ -37,8 +37,7 @@ from edgegrasp_model.scene.cloud import (
     Voxels,
     inside_workspace,
     least_spread,
-    nearest_points,
-    statistical_outlier_removal,
+    neighbourhoods,
     thinned,
     unit,
     voxelise,
@@ -294,6 +293,7 @@ def build_scene(
     counts["in_approach_region"] = int(approach.sum())
     point_of_row = np.full(sent.rows_sent, -1, dtype=np.int64)
     point_of_row[sent.row] = np.where(kept, np.cumsum(kept) - 1, -1)[voxels.voxel]
+    spare = 0.0 if isinstance(options.support, SupportPlane) else SPARE
     return Scene(
         cloud=cloud,
         up=UP,
@@ -303,7 +303,7 @@ def build_scene(
         approach_allowed=approach,
         contact_allowed=contact,
         object_of_point=number,
-        support=None if support is None else _plane_under_hands(support, options, frame),
+        support=None if support is None else _plane_under_hands(support.plane, frame, spare),
         at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, sent.points),
         viewpoints=None if viewpoints is None else frame.points(viewpoints).astype(np.float32),
         confidence=selected.confidence,
@@ -313,14 +313,11 @@ def build_scene(
     )
 
 
-def _plane_under_hands(
-    support: Support, options: DetectOptions, frame: CanonicalFrame
-) -> SupportPlane:
-    """The plane that hands stay above: one that was found is right within about SPARE."""
-    spare = 0.0 if isinstance(options.support, SupportPlane) else SPARE
-    normal = np.asarray(support.plane.normal)
+def _plane_under_hands(plane: SupportPlane, frame: CanonicalFrame, spare: float) -> SupportPlane:
+    """The plane that hands stay above, canonical frame: `spare` metres over one that was found."""
+    normal = np.asarray(plane.normal)
     length = float(np.linalg.norm(normal))
-    foot = frame.points(normal * (support.plane.offset / length**2))
+    foot = frame.points(normal * (plane.offset / length**2))
     turned = frame.directions(normal) / length
     return SupportPlane(normal=tuple(turned.tolist()), offset=float(foot @ turned) + spare)
 
@@ -358,8 +355,7 @@ def _clean_cloud(
     Normals are as given, else estimated and turned to the camera: without one, to a place one metre
     above the middle.
     """
-    distance, near = nearest_points(middles)
-    kept = statistical_outlier_removal(distance)
+    kept, near = neighbourhoods(middles)
     if kept.sum() < MIN_POINTS:
         return None, kept
     points, normals = middles[kept], least_spread(middles, near)[kept]
