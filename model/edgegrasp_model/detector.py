@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -93,8 +93,7 @@ class Prepared:
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
-@dataclass(frozen=True)
-class Scored:
+class Scored(NamedTuple):
     """The candidates of a request, E of them, and the network's logit (E,) of each."""
 
     sample: Sample
@@ -294,10 +293,8 @@ class GraspDetector:
         unused = dict.fromkeys(("approach_region", "contact_region", "num_approach_points"))
         options = options.model_copy(update=unused)
         prepared = self.prepare(cloud, options, max_voxels, thin=False)
-        rows_sent = len(prepared.selected.labels)
-        asked: Array = (
-            check_hand_poses(hand_poses) if edges is None else check_edges(edges, rows_sent)
-        )
+        rows = len(prepared.selected.labels)
+        asked: Array = check_hand_poses(hand_poses) if edges is None else check_edges(edges, rows)
         evaluations = [Evaluation(None, NoGrasp.NO_POINT)] * len(asked)
         if prepared.scene is not None:
             scene, gripper = prepared.scene, prepared.gripper

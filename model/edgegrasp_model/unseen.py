@@ -1,7 +1,7 @@
 """Space around a hand that no camera saw, and the visible extent of objects."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple, Self
 
@@ -223,8 +223,7 @@ def visible_extents(
     group = groups.reshape(-1).astype(np.int64)
     _extents(np.concatenate(parts), bounds, group, T_cloud_hand, side, limits, extents)
     extents[:, -3:] = sizes[group]
-    extents = np.clip(extents, -FARTHEST_EXTENT, FARTHEST_EXTENT)
-    return extents
+    return np.clip(extents, -FARTHEST_EXTENT, FARTHEST_EXTENT, out=extents)
 
 
 @compiled("contract")
@@ -260,8 +259,7 @@ def _extents(
         extents[e, 6], extents[e, 7] = high_z - tip, palm - low_z
 
 
-@dataclass(frozen=True)
-class DepthMap:
+class DepthMap(NamedTuple):
     """Distance of the first surface in each direction from a camera."""
 
     viewpoint: Float32  # (3,)

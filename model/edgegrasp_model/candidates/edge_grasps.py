@@ -271,8 +271,7 @@ STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it
 LEVEL = 1e-6  # cosine below which a hand moves along the support
 
 
-@dataclass(frozen=True)
-class Outline:
+class Outline(NamedTuple):
     """The depth edges of a cloud of N points, as seen from a viewpoint."""
 
     toward: Float32  # (N, 3) unit, from each point to the viewpoint

@@ -244,9 +244,7 @@ def rows_to_score(
 
     Then the others.
     """
-    if options.collision.mode == "ignore":
-        rows = np.flatnonzero(new)
-        return rows[random_rows(len(rows), most, rng)]
+    free = free | (options.collision.mode == "ignore")
     clear, hit = np.flatnonzero(free & new), np.flatnonzero(~free & new)
     rows = clear[random_rows(len(clear), most, rng, first)]
     if options.collision.mode == "penalise":

@@ -266,13 +266,9 @@ def _stance(around: Surroundings, candidates: Candidates, gripper: Gripper) -> l
     ]
     if support is None:
         return columns + [np.full(len(pose), UNKNOWN_HEIGHT, dtype=np.float32)] * 3
-    normal = np.asarray(support.normal)
     tips = pose[:, :3, 3] + gripper.tip_z * pose[:, :3, 2]
-    heights = [
-        tips @ normal - support.offset,
-        contact @ normal - support.offset,
-        support_clearance(pose, candidates.opening, support, gripper),
-    ]
+    clearance = support_clearance(pose, candidates.opening, support, gripper)
+    heights = support.heights(tips), support.heights(contact), clearance
     return columns + [np.clip(h, -UNKNOWN_HEIGHT, UNKNOWN_HEIGHT) for h in heights]
 
 
