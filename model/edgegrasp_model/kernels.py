@@ -278,11 +278,8 @@ def _blocks(columns: Float32) -> Float32:
         for d in range(3):
             sphere[k, d] = (block[d].min() + block[d].max()) / np.float32(2.0)
         for i in range(block.shape[1]):
-            x, y, z = (
-                block[0, i] - sphere[k, 0],
-                block[1, i] - sphere[k, 1],
-                block[2, i] - sphere[k, 2],
-            )
+            x, y = block[0, i] - sphere[k, 0], block[1, i] - sphere[k, 1]
+            z = block[2, i] - sphere[k, 2]
             furthest = max(furthest, x * x + y * y + z * z)
         sphere[k, 3] = np.sqrt(furthest) + np.float32(SLACK)
     return sphere

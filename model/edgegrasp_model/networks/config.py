@@ -56,7 +56,6 @@ EDGEGRASP = NetworkConfig(
     classifier_widths=(512, 256, 128),
 )
 
-
 # Its rotation-invariant variant of Vector Neurons: 1.70 M parameters.
 VN_EDGEGRASP = NetworkConfig(
     architecture="vn-edgegrasp",
@@ -66,7 +65,6 @@ VN_EDGEGRASP = NetworkConfig(
     classifier_widths=(256, 128, 64),
 )
 
-
 # An eighth of the paper's network (0.39 M parameters), for machines without a GPU.
 EDGEGRASP_SMALL = NetworkConfig(
     architecture="edgegrasp",
@@ -75,7 +73,6 @@ EDGEGRASP_SMALL = NetworkConfig(
     global_widths_2=(256, 256),
     classifier_widths=(256, 128),
 )
-
 
 # Scores each edge grasp in the frame of its own hand; 0.13 M parameters.
 HAND = NetworkConfig(

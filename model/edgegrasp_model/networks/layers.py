@@ -79,9 +79,8 @@ class PackedLinear:
         """Prepare a weight (outputs, C), any part of a matrix; `rectified`: a ReLU follows."""
         self._weight, self._bias, self._rectified = weight, bias, rectified
         self._packed: Tensor | None = None  # for oneDNN; None: the plain product is used
-        avx = torch.backends.cpu.get_cpu_capability().startswith(
-            "AVX"
-        )  # on others it is unmeasured
+        # On processors without AVX it is unmeasured.
+        avx = torch.backends.cpu.get_cpu_capability().startswith("AVX")
         there = avx and torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
         if len(weight) > 1 and there and float32_inference(weight):
             # Changes of an inference tensor are not counted.

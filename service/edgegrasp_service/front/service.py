@@ -315,11 +315,7 @@ class Admission:
         """Hold a place in the server for a request until its deadline.
 
         The body of the context is cancelled at the deadline, on the event loop's clock. Waits until
-        there is room for `size`, the most bytes of the body.
-
-        Raises:
-            Overloaded: There is no place, or its turn would come after its deadline.
-            DeadlineExceeded: The deadline passed inside.
+        there is room for `size`, the most bytes of the body. Raises as `GraspService.admit` does.
         """
         remaining = call.deadline - asyncio.get_running_loop().time()
         if remaining <= 0.0:
