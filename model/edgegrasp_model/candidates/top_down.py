@@ -54,11 +54,11 @@ def top_down_grasps(scene: Scene, gripper: Gripper, margin: float = 0.0) -> Cand
     pair, approach_index, contact_index, width, pose = (
         np.array(column) for column in zip(*found, strict=True)
     )
-    points = scene.cloud.points
-    depth = (points[approach_index, 2] - points[contact_index, 2]).clip(0.0)
+    height = scene.cloud.points[:, 2]
+    depth = (height[approach_index] - height[contact_index]).clip(0.0)
     opening = width.astype(np.float32)
     hands = Candidates(pair, approach_index, contact_index, depth, opening, pose)
-    return inserted(points, hands, scene.support, gripper, margin)
+    return inserted(scene.cloud.points, hands, scene.support, gripper, margin)
 
 
 def smallest_rectangle(plan: Float64) -> tuple[Float64, Float64, Float64]:
@@ -114,8 +114,8 @@ def _between_pads(points: Float64, half: float) -> Iterator[tuple[int, _Held]]:
         if rim:
             strip &= height > top - RIM[1]
         reach = np.sort(along[strip])[::-1]
-        gaps = np.flatnonzero(-np.diff(reach) > GAP) if rim else []
-        reach = reach[: gaps[0] + 1] if len(gaps) else reach
+        if rim and (gaps := np.flatnonzero(-np.diff(reach) > GAP)).size:
+            reach = reach[: gaps[0] + 1]
         first, last = float(reach[-1]), float(reach[0])
         at = way * (first + last) / 2 + across * centre
         # A round object is touched below its top.

@@ -102,7 +102,7 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
     _check_place(len(valid), float(np.maximum(-low, high).max()), num_approach_points)
     _beside("colors", sent.colors, size, row[:0], 3)
     return CheckedCloud(
-        np.require(valid, np.float32, "CW"),  # loops are not compiled for read-only ones
+        np.require(valid, np.float32, ("C", "W")),  # loops are not compiled for read-only ones
         row.astype(np.int64, copy=False),
         size,
         _beside("normals", sent.normals, size, row, 3),
