@@ -474,6 +474,18 @@ def table_with_box(rng: np.random.Generator, table: int = 2000, on_table: int = 
     return points + rng.normal(0, 0.001, points.shape)
 
 
+def chosen_support(background: np.ndarray, objects: np.ndarray, camera: object) -> Any:
+    """The support where all background is classified as such, and the warnings."""
+    points = np.concatenate([background, objects])
+    points += np.random.default_rng(0).normal(0, 0.001, points.shape)
+    number = np.repeat([FIXED, 0], [len(background), len(objects)])
+    up, of_object = np.array([0.0, 0.0, 1.0]), (number == 0).astype(np.float32)
+    shown = Segmentation(number, of_object, 1 - of_object, np.ones(1), up)
+    seen, inside = Seen(points.astype(np.float32), np.array(camera)), np.ones(len(points), bool)
+    warnings: list[str] = []
+    return choose_support(seen, inside, shown, number == 0, parse_options({}), warnings), warnings
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_the_floor_of_a_bin_counts_and_not_the_table_beside_it(seed: int) -> None:
     """Its floor is 12 mm over a table that is seen to one side, with as many points."""
@@ -481,16 +493,10 @@ def test_the_floor_of_a_bin_counts_and_not_the_table_beside_it(seed: int) -> Non
     floor = rng.uniform((-0.2, -0.15, 0.012), (0.2, 0.15, 0.012), (4000, 3))
     table = rng.uniform((0.22, -0.3, 0.0), (0.6, 0.3, 0.0), (4000, 3))
     held = rng.uniform((-0.04, -0.04, 0.02), (0.04, 0.04, 0.06), (500, 3))
-    points = np.concatenate([floor, table, held])
-    points = (points + rng.normal(0, 0.001, points.shape)).astype(np.float32)
-    number = np.repeat([FIXED, 0], [8000, 500])
-    up, of_object = np.array([0.0, 0.0, 1.0]), (number == 0).astype(np.float32)
-    shown = Segmentation(number, of_object, 1 - of_object, np.ones(1), up)
-    seen, inside = Seen(points, np.array([0.0, -0.5, 0.8])), np.ones(len(points), dtype=bool)
-    found = choose_support(seen, inside, shown, number == 0, parse_options({}), [])
+    found, _ = chosen_support(np.concatenate([floor, table]), held, (0.0, -0.5, 0.8))
     assert found is not None
     assert np.abs(found.plane.heights(floor[np.abs(floor[:, 0]) < 0.1])).max() < 0.001
-    assert found.share == pytest.approx(8000 / len(points), abs=0.01)  # of all points
+    assert found.share == pytest.approx(8000 / 8500, abs=0.01)  # of all points
 
 
 @pytest.mark.parametrize("below", [0.25, 0.9])  # the median is over the lid, or under it
@@ -500,14 +506,8 @@ def test_a_lid_that_a_quarter_of_the_objects_lie_below_is_no_support(below: floa
     lid = rng.uniform((-0.2, 0.0, 0.1), (0.2, 0.2, 0.1), (2000, 3))
     height = np.where(rng.random(4000) < below, 0.04, 0.14)
     heap = np.column_stack([rng.uniform((-0.2, -0.2), (0.2, 0.0), (4000, 2)), height])
-    points = np.concatenate([lid, heap])
-    points = (points + rng.normal(0, 0.001, points.shape)).astype(np.float32)
-    number = np.repeat([FIXED, 0], [len(lid), len(heap)])
-    up, of_object = np.array([0.0, 0.0, 1.0]), (number == 0).astype(np.float32)
-    shown = Segmentation(number, of_object, 1 - of_object, np.ones(1), up)
-    seen, inside = Seen(points, np.array([0.0, 0.0, 0.8])), np.ones(len(points), dtype=bool)
-    warnings: list[str] = []
-    assert choose_support(seen, inside, shown, number == 0, parse_options({}), warnings) is None
+    found, warnings = chosen_support(lid, heap, (0.0, 0.0, 0.8))
+    assert found is None
     assert "no support plane is seen" in warnings[0]
 
 
