@@ -169,7 +169,9 @@ class _Tools:
         from mcp.server.mcpserver import Image
 
         asked = _asked(options, num_grasps, robot, viewpoint)
-        of_image = [intrinsics, mask_file, depth_scale, T_base_camera] != [None] * 4
+        of_image = any(
+            each is not None for each in (intrinsics, mask_file, depth_scale, T_base_camera)
+        )
         if (point_cloud_file is None) == (depth_file is None) or (depth_file is None and of_image):
             raise ValueError("Give point_cloud_file alone, or depth_file and intrinsics.")
         file, images = None, None

@@ -5,7 +5,7 @@ import platform
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from importlib.metadata import distributions
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -89,7 +89,6 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
     carried: dict[str, Any] = {} if config.gripper is None else {"gripper": config.gripper}
     if config.arm is not None:
         carried["arm"] = config.arm.joint_names
-    versions = {each.name: each.version for each in distributions()}
     return {
         "run": {
             "scene": config.scene.value,
@@ -104,8 +103,7 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
         "seeds": list(config.seeds),
         "objects_folder": str(config.objects) if config.objects is not None else None,
         "split": config.split,
-        "versions": {"python": platform.python_version()}
-        | {name: versions.get(name) for name in PACKAGES},
+        "versions": {"python": platform.python_version()} | {n: _version(n) for n in PACKAGES},
         "host": {
             "name": platform.node(),
             "platform": platform.platform(),
@@ -166,3 +164,10 @@ class RoundRunner:
         self.simulation.close()
         if close := getattr(self.planner, "close", None):
             close()
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return None

@@ -155,7 +155,8 @@ class PybulletBody(Body):
     """A body of a physics server."""
 
     def __init__(self, client: _Client, uid: int) -> None:
-        self.client, self.uid = client, uid
+        self.client = client
+        self.uid = uid
 
     def remove(self) -> None:
         self.client.removeBody(self.uid)
@@ -179,7 +180,8 @@ class PybulletBody(Body):
 
     @property
     def bounds(self) -> Matrix:
-        return np.asarray(self.client.getAABB(self.uid), dtype=np.float64)
+        lower, upper = self.client.getAABB(self.uid)
+        return np.asarray((lower, upper), dtype=np.float64)
 
     def contacts(self) -> list[Contact]:
         points = self.client.getContactPoints(self.uid)
@@ -282,17 +284,19 @@ class PybulletHand(PybulletBody, Hand):
         self.client.setJointMotorControl2(self.uid, link, mode, **goal, **gain)
 
 
-def _hull(client: _Client, mesh: str, quaternion_xyzw: Vector) -> Any:
-    return client.createCollisionShape(
+def _hull(client: _Client, mesh: str, quaternion_xyzw: Vector) -> int:
+    shape = client.createCollisionShape(
         pybullet.GEOM_MESH, fileName=str(_MESHES / mesh), collisionFrameOrientation=quaternion_xyzw
     )
+    return int(shape)
 
 
-def _boxes(client: _Client, parts: Parts) -> Any:
-    return client.createCollisionShapeArray(
+def _boxes(client: _Client, parts: Parts) -> int:
+    shape = client.createCollisionShapeArray(
         shapeTypes=[pybullet.GEOM_BOX] * len(parts),
         halfExtents=[(np.ptp(part, axis=0) / 2).tolist() for part in parts],
         collisionFramePositions=[
             ((part.min(axis=0) + part.max(axis=0)) / 2).tolist() for part in parts
         ],
     )
+    return int(shape)
