@@ -2,18 +2,16 @@
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
-from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Array, Bools, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import FINGER_CLEARANCE, clearances, met_first
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
+from edgegrasp_model.candidates.top_down import smallest_rectangle
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import mean_of_alike, non_max_suppression
 from edgegrasp_model.options import DetectOptions
@@ -28,9 +26,7 @@ SURE_SCORE = 0.9  # score from which the order `highest` goes by height (the pap
 HIDDEN = 0.004  # metres of unseen space into which an object may extend
 FLAT = 0.012  # metres of visible height below which the support may block grasps
 DRAWBACK, FAR = 0.02, 0.1  # of a rating; metres from an object's middle
-# Best hands that are compared; weight of the logarithm of how many good ones are around each; loss
-# of rating by which a good one counts 1/e as much.
-BEST, SURROUNDED, LESS = 100, 0.1, 0.02
+AS_GOOD = 0.05  # of a rating, by which a top-down grasp may be worse than the best
 OUTSIDE = 0.3  # of the rating of a hand that reaches out of the image
 # Hands that are judged together: metres and radians apart; weight of a hand's own logit; factor
 # that calibrates the average.
@@ -86,8 +82,9 @@ def select(
     order, dropped = order[good], order[:0]
     counts["above_min_score"] = len(order)
     if options.order == "score":
-        liked = surrounded_first(order, worth, T_cloud_tcp)
-        order = objects_first(order, liked, rating, scene.object_of_point[contact])
+        number = scene.object_of_point[contact]
+        liked = top_down_first(order, worth, candidates, number)
+        order = objects_first(order, liked, rating, number)
     if (rule := options.suppression) is not None:
         near = rule.translation, rule.rotation
         order, dropped = non_max_suppression(T_cloud_tcp, order, *near, options.top_k)
@@ -97,20 +94,20 @@ def select(
     return order, outcome
 
 
-def surrounded_first(order: Int64, worth: Floats, T_cloud_tcp: Floats) -> Int64:
-    """The rows `order`, the best reordered by how many good hands surround each; worth (E,).
+def top_down_first(order: Int64, worth: Floats, candidates: Candidates, number: Int64) -> Int64:
+    """The rows `order`, the first of each object (E,) replaced by a top-down grasp that is as good.
 
-    New noise makes another hand the best one, but good ones still surround the same hands.
+    New noise hardly moves these.
     """
-    best = order[:BEST]
-    place, turn = T_cloud_tcp[best, :3, 3], T_cloud_tcp[best, :3, :3].reshape(-1, 9)
-    trace, approach = turn @ turn.T, turn[:, 2::3] @ turn[:, 2::3].T
-    trace = np.maximum(trace, 2 * approach - trace)  # a hand turned by half is the same
-    angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
-    away = np.square(cdist(place, place) / ALIKE) + np.square(angle / ALIKE_ANGLE)
-    good = np.exp((worth[best] - worth[best].max(initial=0.0)) / LESS)
-    raised = worth[best] + SURROUNDED * np.log(np.exp(-away / 2) @ good)
-    return np.concatenate([best[np.argsort(-raised, kind="stable")], order[BEST:]])
+    liked = order.copy()
+    _, place, row = np.unique(number[order], return_index=True, return_inverse=True)
+    best = np.full(len(place), -np.inf)
+    np.maximum.at(best, row, worth[order])
+    as_good = candidates.top_down[order] & (worth[order] >= best[row] - AS_GOOD)
+    found, which = order[as_good], row[as_good]
+    last = np.argsort(candidates.pair[found], kind="stable")  # the preferred ones overwrite others
+    liked[place[which[last]]] = found[last]
+    return liked
 
 
 def _drawbacks(
@@ -274,24 +271,12 @@ def _why(
 def _upright_box(scene: Scene, held: Bools) -> tuple[Float32, Float32]:
     """Pose T_cloud_box (4, 4) and half extents (3,) of the smallest upright box around points."""
     points = scene.cloud.points[held].astype(np.float64)
-    corners = plan = points[:, :2]
-    with suppress(QhullError, ValueError):  # too few points, or all on a line
-        corners = plan[ConvexHull(plan).vertices]
-    edges = np.roll(corners, -1, axis=0) - corners
-    edges = edges[np.linalg.norm(edges, axis=1) > 0] if len(corners) > 1 else edges[:0]
-    edges = np.concatenate([edges, [[1.0, 0.0]]])
-    edges /= np.linalg.norm(edges, axis=1, keepdims=True)
-    # The smallest rectangle around them has a side along an edge of their hull.
-    axes = np.stack([edges, np.stack([-edges[:, 1], edges[:, 0]], axis=1)], axis=1)  # (K, 2, 2)
-    turned = np.einsum("kad,cd->kca", axes, corners)
-    size = np.ptp(turned, axis=1)
-    best = int(size.prod(axis=1).argmin())
+    axes, middle, size = smallest_rectangle(points[:, :2])
     bottom, top = points[:, 2].min(), points[:, 2].max()
     T_canonical_box = np.eye(4)
-    T_canonical_box[:2, :2] = axes[best].T
-    middle = axes[best].T @ (turned[best].min(axis=0) + size[best] / 2)
+    T_canonical_box[:2, :2] = axes.T
     T_canonical_box[:3, 3] = [*middle, (bottom + top) / 2]
-    half: Float32 = np.array([*size[best], top - bottom], dtype=np.float32) / np.float32(2)
+    half: Float32 = np.array([*size, top - bottom], dtype=np.float32) / np.float32(2)
     return scene.frame.poses_in_cloud(T_canonical_box), half
 
 

@@ -88,7 +88,7 @@ def crop_balls(
 class Candidates:
     """Edge grasps of one cloud (paper section III)."""
 
-    pair: Int64  # (E,) which of the given pairs of points
+    pair: Int64  # (E,) which of the given pairs of points; below 0: a top-down grasp
     approach_index: Int64  # (E,) p_a, rows of the cloud
     contact_index: Int64  # (E,) p_c, rows of the cloud
     depth: Float32  # (E,) d, metres the contact lies ahead of the approach point
@@ -102,6 +102,11 @@ class Candidates:
     def approach(self) -> Float32:
         """(E, 3) unit, outward: from the object back to the hand."""
         return -self.T_cloud_hand[:, :3, 2]
+
+    @property
+    def top_down(self) -> Bools:
+        """Which (E,) are top-down grasps."""
+        return self.pair < 0
 
     @staticmethod
     def none() -> "Candidates":
@@ -352,10 +357,10 @@ def outline_grasps(
     pose[:, 3, 3] = 1.0
     depth = np.maximum(edge[2][row], 0.0)
     hands = Candidates(pair[row], approach[row], contact, depth, width, pose)
-    return _inserted(points, hands, support, gripper, margin)
+    return inserted(points, hands, support, gripper, margin)
 
 
-def _inserted(
+def inserted(
     points: Float32,
     candidates: Candidates,
     support: SupportPlane | None,

@@ -21,6 +21,7 @@ from edgegrasp_model.candidates.edge_grasps import (
     retract,
     spread,
 )
+from edgegrasp_model.candidates.top_down import top_down_grasps
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import non_max_suppression
 from edgegrasp_model.options import ApproachDirection, DetectOptions
@@ -113,7 +114,8 @@ class Sampler:
         new = free | (options.collision.mode != "avoid")
         new[new] = different(drawn.T_cloud_hand[row[new]], free[new], self.gripper, options)
         most = options.num_candidates - self.counts["scored"]
-        scored = rows_to_score(free, new, options, most, self._rng)
+        first = int(drawn.top_down[row[free & new]].sum())
+        scored = rows_to_score(free, new, options, most, self._rng, first)
         row, free = row[scored], free[scored]
         outcome[row] = CODE[Outcome.RETURNED]
         self.counts["scored"] += len(row)
@@ -155,6 +157,9 @@ class Sampler:
                 for each in outlines(points, scene.viewpoints, contacts, leaning=leaning)
             ]
             candidates = Candidates.concatenate([candidates, *across])
+        if self.sees_hands and self._round == 1:  # first, so that none is left out
+            top_down = top_down_grasps(scene, gripper, margin)
+            candidates = Candidates.concatenate([top_down, candidates])
         self.counts["candidates"] += len(candidates)
         outcome = np.full(len(candidates), CODE[Outcome.RETURNED])
         if scene.support is not None:
@@ -172,7 +177,8 @@ class Sampler:
         rule = self.options.collision
         passed = np.flatnonzero(outcome == CODE[Outcome.RETURNED])
         most = OVERSAMPLING * self.options.num_candidates
-        row = passed[random_rows(len(passed), most, self._rng)]
+        first = int(candidates.top_down[passed].sum())
+        row = passed[random_rows(len(passed), most, self._rng, first)]
         outcome[passed] = CODE[Outcome.NOT_CHECKED]
         checked = candidates.take(row)
         hands = checked.T_cloud_hand, checked.opening
@@ -232,23 +238,28 @@ def different(
 
 
 def rows_to_score(
-    free: Bools, new: Bools, options: DetectOptions, most: int, rng: np.random.Generator
+    free: Bools, new: Bools, options: DetectOptions, most: int, rng: np.random.Generator, first: int
 ) -> Int64:
-    """Ascending rows of at most so many new candidates, collision-free ones first."""
+    """Ascending rows of at most so many new candidates: collision-free ones, `first` of them first.
+
+    Then the others.
+    """
     free = free | (options.collision.mode == "ignore")
     clear, hit = np.flatnonzero(free & new), np.flatnonzero(~free & new)
-    rows = clear[random_rows(len(clear), most, rng)]
+    rows = clear[random_rows(len(clear), most, rng, first)]
     if options.collision.mode == "penalise":
         rest = random_rows(len(hit), most - len(rows), rng)
         rows = np.sort(np.concatenate([rows, hit[rest]]))
     return rows
 
 
-def random_rows(size: int, limit: int, rng: np.random.Generator) -> Int64:
-    """Ascending rows of at most `limit` out of `size`."""
+def random_rows(size: int, limit: int, rng: np.random.Generator, first: int = 0) -> Int64:
+    """Ascending rows of at most `limit` out of `size`; up to a quarter are the `first` ones."""
     if size <= limit:
         return np.arange(size, dtype=np.int64)
-    return np.sort(rng.choice(size, limit, replace=False)).astype(np.int64)
+    first = min(first, limit // 4)
+    others = first + np.sort(rng.choice(size - first, limit - first, replace=False))
+    return np.concatenate([np.arange(first), others]).astype(np.int64)
 
 
 def allowed_directions(
