@@ -12,10 +12,10 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
-from scipy.special import expit
+from scipy.special import expit, logit
 from torch import nn
 
-from edgegrasp_camera.arrays import Array, Float32, Int64
+from edgegrasp_camera.arrays import Array, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls
 from edgegrasp_model.candidates.sample import NOTHING, Sample, Sampler
@@ -115,9 +115,6 @@ class GraspDetector:
         self.metadata = metadata
         # Whether the network scores the hand pose itself rather than the edge.
         self.sees_hands = metadata.network.architecture == "hand"
-        # Of calibrated logits, fitted to outcomes of a robot.
-        rescaled: tuple[float, float] = metadata.training.get("outcomes_scale_shift", (1.0, 0.0))
-        self._scale, self._shift = rescaled
         self.gripper = load_gripper(metadata.gripper)  # used if a request names none
         self.device = torch.device(device)
         self.grippers = dict(grippers or {})
@@ -202,7 +199,7 @@ class GraspDetector:
             with prepared.timed("candidates"):
                 done = NOTHING
                 if scored is not None:
-                    held = expit(self._before_outcomes(scored.logits)) >= enough
+                    held = expit(self._calibrated(scored.logits)) >= enough
                     if prepared.options.collision.mode != "ignore":
                         held &= scored.sample.collision_free
                     done = scene.object_of_point[scored.sample.candidates.approach_index[held]]
@@ -224,18 +221,18 @@ class GraspDetector:
         with prepared.timed("ranking"):
             logits, outcome = np.empty(0, dtype=np.float32), np.empty(0, dtype=np.int8)
             if scored is not None and scene is not None:
-                logits = self._before_outcomes(scored.logits)
+                logits = self._calibrated(scored.logits)
                 if self.sees_hands:
                     logits = judged_together(logits, scored.sample, scene, gripper)
-            score = expit(self._scale * logits + self._shift)
+            score: Floats = expit(logits)
             if scene is not None and not scene.approach_allowed.any():
                 prepared.warnings.append(NO_APPROACH_POINT)
             elif scored is not None and len(logits) == 0:
                 prepared.warnings.append(NO_CANDIDATE)
             elif scene is not None and sample is not None:
-                found = object_probability(scene, sample.candidates.contact_index)
-                score, ratings = score * found, expit(logits) * found
-                rows, outcome = select(scene, sample, score, ratings, gripper, options, counts)
+                rating = score * object_probability(scene, sample.candidates.contact_index)
+                score = self._rescaled(rating)
+                rows, outcome = select(scene, sample, score, rating, gripper, options, counts)
                 best, free = sample.candidates.take(rows), sample.collision_free[rows]
                 grasps = grasps_in_cloud(scene, best, gripper, score[rows], free)
             if options.debug and scene is not None:
@@ -327,8 +324,8 @@ class GraspDetector:
         candidates, gripper = given.candidates, prepared.gripper
         logits = self._logits(prepared, scene, candidates).astype(np.float64)
         with prepared.timed("network"):
-            score = expit(logits / self.metadata.temperature)
-            score *= object_probability(scene, candidates.contact_index)
+            found = object_probability(scene, candidates.contact_index)
+            score = self._rescaled(expit(logits / self.metadata.temperature) * found)
             hands = candidates.T_cloud_hand, candidates.opening
             free = ~collides(scene, *hands, gripper, request)
             if given.T_cloud_hand is not None:
@@ -339,10 +336,17 @@ class GraspDetector:
             evaluations[number] = Evaluation(grasp, None)
         return evaluations
 
-    def _before_outcomes(self, logits: Float32) -> Float32:
-        """Calibrated logits (E,) as they were before outcomes of a robot rescaled them."""
-        calibrated = logits / self.metadata.temperature
-        return ((calibrated - self._shift) / self._scale).astype(np.float32)
+    def _calibrated(self, logits: Float32) -> Float32:
+        """The network's logits (E,), calibrated in training."""
+        return (logits / self.metadata.temperature).astype(np.float32)
+
+    def _rescaled(self, score: Floats) -> Floats:
+        """Scores (E,) as outcomes of a robot rescaled them (Platt scaling), if there are any."""
+        if (fitted := self.metadata.training.get("rescaled_by_outcomes")) is None:
+            return score
+        scale, shift = fitted
+        rescaled: Floats = expit(scale * logit(score) + shift)
+        return rescaled
 
     def _logits(self, prepared: Prepared, scene: Scene, candidates: Candidates) -> Float32:
         """The network's logits (E,) of candidates."""

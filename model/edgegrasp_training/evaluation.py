@@ -184,24 +184,18 @@ def recalibrate(weights: Path, outcomes_file: Path, folder: Path) -> str:
     network, metadata = load_checkpoint(weights)
     logit, held = read_outcomes(outcomes_file, metadata.digest)
     scale, shift = fit(logit, held)
-    temperature = metadata.temperature / scale
-    # sigmoid((logit + shift * temperature) / temperature): the shift goes into the last bias.
-    last = [layer for layer in network.modules() if isinstance(layer, torch.nn.Linear)][-1]
-    with torch.no_grad():
-        last.bias.add_(shift * temperature)
     share = float(held.mean())
-    old_scale, old_shift = metadata.training.get("outcomes_scale_shift", (1.0, 0.0))
+    old_scale, old_shift = metadata.training.get("rescaled_by_outcomes", (1.0, 0.0))
     training = metadata.training | {
         "outcomes": len(held),
         "outcomes_held": round(share, 3),
-        "outcomes_scale_shift": [scale * old_scale, scale * old_shift + shift],
+        "rescaled_by_outcomes": [scale * old_scale, scale * old_shift + shift],
         "recalibrated_from_digest": metadata.digest,
     }
     name = f"{metadata.name}-robot"
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.safetensors"
-    new = replace(metadata, name=name, temperature=temperature, training=training)
-    save_checkpoint(path, network, new)
+    save_checkpoint(path, network, replace(metadata, name=name, training=training))
     before, after = cross_entropy(logit, held), cross_entropy(scale * logit + shift, held)
     few = f" Warning: fewer than {FEW} outcomes say little." if len(held) < FEW else ""
     return (

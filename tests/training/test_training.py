@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.special import expit, logit
+from tests.model.scenes import VIEW, box_on_table
 
 from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector
 from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
@@ -15,9 +17,6 @@ from edgegrasp_training.evaluation import fit, read_outcomes, recalibrate
 from edgegrasp_training.examples import (
     GRASPS_PER_BALL,
     Teacher,
-    pack_balls,
-    pack_hands,
-    tried_grasps,
 )
 from edgegrasp_training.options import TrainingOptions
 from edgegrasp_training.recipes import RECIPES
@@ -217,17 +216,20 @@ def test_the_new_weights_answer_the_fitted_probability(name, tmp_path):
     file = tmp_path / "outcomes.jsonl"
     file.write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert recalibrate(old, file, tmp_path).startswith("60 outcomes, 0.33 held")
-    new, recalibrated = load_checkpoint(tmp_path / "old-robot.safetensors")
-    assert recalibrated.training["recalibrated_from_digest"] == metadata.digest
+    new = tmp_path / "old-robot.safetensors"
+    assert load_checkpoint(new)[1].training["recalibrated_from_digest"] == metadata.digest
     scale, shift = fit(*read_outcomes(file, metadata.digest))
     assert shift < -0.5
-    grasps = tried_grasps(made_up_view(1), config)
-    pack = pack_hands if name == "hands" else pack_balls
-    batch = pack(grasps, grasps.balls(), config).batch
-    with torch.inference_mode():
-        before, after = network(batch), new(batch)
-    expected = scale * before / metadata.temperature + shift
-    torch.testing.assert_close(after / recalibrated.temperature, expected, atol=1e-4, rtol=1e-4)
+    options = DetectOptions(viewpoint=VIEW, min_score=0.0)
+    box = box_on_table(table=True)
+    before, after = GraspDetector.load(old), GraspDetector.load(new)
+    answers = [one.detect(box, options) for one in (before, after)]
+    assert max(one.confidence for one in answers[0].objects) < 1.0  # counts in the score
+    poses = np.array([one.T_cloud_hand for one in answers[0].grasps])
+    given = [one.score(box, options, hand_poses=poses).evaluations for one in (before, after)]
+    for pair in ([one.grasps for one in answers], [[one.grasp for one in some] for some in given]):
+        first, second = (np.array([one.score for one in grasps]) for grasps in pair)
+        np.testing.assert_allclose(second, expit(scale * logit(first) + shift), atol=1e-4)
 
 
 def test_the_order_of_grasps_stays_and_few_outcomes_warn(tmp_path: Path) -> None:
