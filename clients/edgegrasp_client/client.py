@@ -163,6 +163,8 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
         self, detection: Detection, grasp: Grasp, held: bool, *, timeout: float | None = None
     ) -> None:
         """Tell a server with an `outcomes_file` what became of a grasp; REST only."""
+        if held not in (True, False):
+            raise invalid("held", repr(held), "Give True or False.")
         tried = {"model": detection.model, "score": float(grasp.score), "held": bool(held)}
         await self._retried(partial(self._transport.record_outcome, tried), timeout)
 

@@ -5,6 +5,7 @@ import json
 import resource
 import signal
 from pathlib import Path
+from typing import Any
 
 import httpx
 import jsonschema
@@ -14,6 +15,7 @@ from benchmarks.dummy import DummyCatalogue
 from tests.cloud_files import npy
 
 from edgegrasp_cli.replay import answer_again
+from edgegrasp_client import GraspClient, InvalidRequestError
 from edgegrasp_service.errors import DiskFull, InvalidSettings
 from edgegrasp_service.front.http import DOCUMENT
 from edgegrasp_service.front.service import Admission
@@ -89,7 +91,7 @@ async def test_what_waits_to_be_written_is_bounded(tmp_path: Path) -> None:
 TRIED = {"model": "dummy", "score": 0.9, "held": True, "request_id": "a1"}
 
 
-def test_outcomes_are_appended_until_the_file_is_full(start_dummy, tmp_path: Path) -> None:
+def test_outcomes_are_appended_until_the_file_is_full(start_dummy, cloud, tmp_path) -> None:
     file = tmp_path / "outcomes.jsonl"
     with (
         start_dummy("--outcomes-file", str(file)) as server,
@@ -102,7 +104,13 @@ def test_outcomes_are_appended_until_the_file_is_full(start_dummy, tmp_path: Pat
         digest = http.get("/v1/models").json()["models"][0]["digest"]
         assert TRIED.items() <= first.items()
         assert (first["digest"], second["held"]) == (digest, False)
-        assert read_outcomes(file, digest)[1].tolist() == [1.0, 0.0]
+        with GraspClient(server.http_url) as client:
+            detection = client.detect(cloud)
+            client.record_outcome(detection, detection.grasps[0], held=True)
+            unclear: Any = "maybe"
+            with pytest.raises(InvalidRequestError, match="held: got 'maybe'"):
+                client.record_outcome(detection, detection.grasps[0], held=unclear)
+        assert read_outcomes(file, digest)[1].tolist() == [1.0, 0.0, 1.0]
 
         for changes, field in (
             ({"score": 1.5}, "body.score"),
@@ -116,7 +124,7 @@ def test_outcomes_are_appended_until_the_file_is_full(start_dummy, tmp_path: Pat
         assert http.post("/v1/outcomes", content=b"{", headers=as_json).status_code == 400
         # A form of a web page elsewhere.
         assert http.post("/v1/outcomes", content=json.dumps(TRIED)).status_code == 415
-        assert len(file.read_text().splitlines()) == 2
+        assert len(file.read_text().splitlines()) == 3
 
         with file.open("r+b") as grown:
             grown.truncate(64 * 2**20 + 1)
