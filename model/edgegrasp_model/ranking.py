@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Array, Bools, Float32, Floats, Int64
@@ -26,7 +27,10 @@ SURE_SCORE = 0.9  # score from which the order `highest` goes by height (the pap
 HIDDEN = 0.004  # metres of unseen space into which an object may extend
 FLAT = 0.012  # metres of visible height below which the support may block grasps
 DRAWBACK, FAR = 0.02, 0.1  # of a rating; metres from an object's middle
-AS_GOOD = 0.05  # of a rating, by which a top-down grasp may be worse than the best
+AS_GOOD = 0.02  # of a rating, by which a top-down grasp may be worse than the best
+# Best hands that are compared; weight of the logarithm of how many good ones are around each; loss
+# of rating by which a good one counts 1/e as much.
+BEST, SURROUNDED, LESS = 100, 0.1, 0.02
 OUTSIDE = 0.3  # of the rating of a hand that reaches out of the image
 # Hands that are judged together: metres and radians apart; weight of a hand's own logit; factor
 # that calibrates the average.
@@ -83,7 +87,8 @@ def select(
     counts["above_min_score"] = len(order)
     if options.order == "score":
         number = scene.object_of_point[contact]
-        liked = top_down_first(order, worth, candidates, number)
+        surrounded = surrounded_first(order, worth, T_cloud_tcp)
+        liked = steady_first(order, surrounded, worth, candidates, number)
         order = objects_first(order, liked, rating, number)
     if (rule := options.suppression) is not None:
         near = rule.translation, rule.rotation
@@ -94,20 +99,37 @@ def select(
     return order, outcome
 
 
-def top_down_first(order: Int64, worth: Floats, candidates: Candidates, number: Int64) -> Int64:
-    """The rows `order`, the first of each object (E,) replaced by a top-down grasp that is as good.
+def steady_first(
+    order: Int64, surrounded: Int64, worth: Floats, candidates: Candidates, number: Int64
+) -> Int64:
+    """The rows `order`, the first of each object (E,) replaced by one that noise hardly moves.
 
-    New noise hardly moves these.
+    That is a top-down grasp if one is as good, else the object's first one in `surrounded`.
     """
     liked = order.copy()
     _, place, row = np.unique(number[order], return_index=True, return_inverse=True)
-    best = np.full(len(place), -np.inf)
-    np.maximum.at(best, row, worth[order])
-    as_good = candidates.top_down[order] & (worth[order] >= best[row] - AS_GOOD)
+    liked[place] = surrounded[np.unique(number[surrounded], return_index=True)[1]]
+    as_good = candidates.top_down[order] & (worth[order] >= worth[order[place]][row] - AS_GOOD)
     found, which = order[as_good], row[as_good]
     last = np.argsort(candidates.pair[found], kind="stable")  # the preferred ones overwrite others
     liked[place[which[last]]] = found[last]
     return liked
+
+
+def surrounded_first(order: Int64, worth: Floats, T_cloud_tcp: Floats) -> Int64:
+    """The rows `order`, the best reordered by how many good hands surround each; worth (E,).
+
+    New noise makes another hand the best one, but good ones still surround the same hands.
+    """
+    best = order[:BEST]
+    place, turn = T_cloud_tcp[best, :3, 3], T_cloud_tcp[best, :3, :3].reshape(-1, 9)
+    trace, approach = turn @ turn.T, turn[:, 2::3] @ turn[:, 2::3].T
+    trace = np.maximum(trace, 2 * approach - trace)  # a hand turned by half is the same
+    angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+    away = np.square(cdist(place, place) / ALIKE) + np.square(angle / ALIKE_ANGLE)
+    good = np.exp((worth[best] - worth[best].max(initial=0.0)) / LESS)
+    raised = worth[best] + SURROUNDED * np.log(np.exp(-away / 2) @ good)
+    return np.concatenate([best[np.argsort(-raised, kind="stable")], order[BEST:]])
 
 
 def _drawbacks(

@@ -18,7 +18,7 @@ from edgegrasp_model.kernels import mean_of_alike
 from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, parse_options
-from edgegrasp_model.ranking import top_down_first
+from edgegrasp_model.ranking import steady_first, surrounded_first
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene import network
 from edgegrasp_model.scene.cloud import CloudInput
@@ -356,14 +356,22 @@ def test_hands_are_averaged_with_others_on_the_same_object_that_are_near_and_tur
     assert np.isnan(found[3:]).all()
 
 
-@pytest.mark.parametrize(("worth", "first"), [(0.93, 1), (0.88, 3)])
+def test_a_hand_among_good_ones_comes_before_a_lone_one_that_is_hardly_better() -> None:
+    poses, order = hands([0.0, 0.01, 0.02, 0.2], [0.0] * 4), np.array([3, 1, 0, 2])
+    for lone, first in ((0.92, 1), (0.99, 3)):
+        worth = np.array([0.9, 0.91, 0.9, lone])
+        assert surrounded_first(order, worth, poses)[0] == first
+
+
+@pytest.mark.parametrize(("worth", "first"), [(0.94, 1), (0.92, 3)])
 def test_a_top_down_grasp_comes_first_if_it_is_hardly_worse(worth: float, first: int) -> None:
     rows = np.arange(5)
     pair = np.array([-2, -1, 0, 0, 0])  # the second is preferred to the first
     poses = hands([0.0] * 5, [0.0] * 5)
     candidates = Candidates(pair, rows, rows, *np.zeros((2, 5), np.float32), poses)
     rating, number = np.array([worth, worth, 0.7, 0.95, 0.99]), np.array([0, 0, 1, 0, 2])
-    liked = top_down_first(np.array([4, 3, 0, 1, 2]), rating, candidates, number)
+    order = np.array([4, 3, 0, 1, 2])
+    liked = steady_first(order, order, rating, candidates, number)
     assert liked[:2].tolist() == [4, first]
 
 
