@@ -129,6 +129,15 @@ def generate(
             f"{folder} holds labels of {', '.join(other)}, not of {options.engine}; "
             "choose another folder"
         )
+    made = folder / f"seed_{options.seed}.json"
+    given = options.model_dump(mode="json", exclude={"scenes", "views_per_scene"})
+    before = json.loads(made.read_text()) if made.is_file() else given
+    if changed := [name for name, value in given.items() if before.get(name) != value]:
+        raise ValueError(
+            f"{', '.join(changed)}: {folder} holds scenes of seed {options.seed} that were made "
+            "with other values; choose another folder or seed"
+        )
+    made.write_text(json.dumps(given))
     missing = missing_scenes(folder, options)
     sets = {}
     if objects is not None:

@@ -82,6 +82,14 @@ def test_labels_of_two_engines_are_not_mixed(data: Path) -> None:
                 list(generate(data, None, small(scenes=5, engine=other)))
 
 
+def test_scenes_of_a_seed_are_all_made_with_the_same_options(tmp_path: Path) -> None:
+    asked = {"scene": "packed", "views_per_scene": 1, "grasps_per_view": 4}
+    list(generate(tmp_path, None, small(scenes=1, **asked)))
+    with pytest.raises(ValueError, match=r"grasps_per_view: .*holds scenes of seed 5"):
+        list(generate(tmp_path, None, small(scenes=2, **asked | {"grasps_per_view": 5})))
+    assert len(list(generate(tmp_path, None, small(scenes=2, **asked)))) == 1
+
+
 def test_random_hands_differ_between_scenes_and_are_what_the_network_is_told(tmp_path) -> None:
     options = small(scenes=3, views_per_scene=2, scene="packed", gripper="random")
     list(generate(tmp_path, None, options))
