@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_camera.arrays import Array, Bools, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import FINGER_CLEARANCE, clearances, met_first
 from edgegrasp_model.candidates.edge_grasps import Candidates
-from edgegrasp_model.candidates.sample import CODE, Sample
-from edgegrasp_model.candidates.top_down import smallest_rectangle
+from edgegrasp_model.candidates.sample import CODE, Sample, smallest_rectangle
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import mean_of_alike, non_max_suppression
 from edgegrasp_model.options import DetectOptions
@@ -109,7 +108,8 @@ def steady_first(
     liked = order.copy()
     _, place, row = np.unique(number[order], return_index=True, return_inverse=True)
     liked[place] = surrounded[np.unique(number[surrounded], return_index=True)[1]]
-    as_good = candidates.top_down[order] & (worth[order] >= worth[order[place]][row] - AS_GOOD)
+    as_good = worth[order] >= worth[order[place]][row] - AS_GOOD
+    as_good &= candidates.pair[order] < 0  # top-down
     found, which = order[as_good], row[as_good]
     last = np.argsort(candidates.pair[found], kind="stable")  # the preferred ones overwrite others
     liked[place[which[last]]] = found[last]
@@ -242,7 +242,13 @@ def detected_objects(
     objects = []
     for row in np.argsort(-count, kind="stable"):
         which = int(number[row])
-        T_cloud_box, half = _upright_box(scene, scene.object_of_point == which)
+        points = scene.cloud.points[scene.object_of_point == which].astype(np.float64)
+        axes, middle, size = smallest_rectangle(points[:, :2])
+        bottom, top = points[:, 2].min(), points[:, 2].max()
+        T_canonical_box = np.eye(4)
+        T_canonical_box[:2, :2], T_canonical_box[:3, 3] = axes.T, [*middle, (bottom + top) / 2]
+        T_cloud_box = scene.frame.poses_in_cloud(T_canonical_box)
+        half = np.array([*size, top - bottom], dtype=np.float32) / np.float32(2)
         turn = Rotation.from_matrix(T_cloud_box[:3, :3])
         good = best.get(which, 0.0) >= GOOD_SCORE
         objects.append(
@@ -288,18 +294,6 @@ def _why(
     met = met_first(scene.cloud, hands, gripper)
     hidden = _far_side_hidden(scene, hands, met, gripper)
     return Ungraspable.HIDDEN if hidden.mean() > 0.5 else None
-
-
-def _upright_box(scene: Scene, held: Bools) -> tuple[Float32, Float32]:
-    """Pose T_cloud_box (4, 4) and half extents (3,) of the smallest upright box around points."""
-    points = scene.cloud.points[held].astype(np.float64)
-    axes, middle, size = smallest_rectangle(points[:, :2])
-    bottom, top = points[:, 2].min(), points[:, 2].max()
-    T_canonical_box = np.eye(4)
-    T_canonical_box[:2, :2] = axes.T
-    T_canonical_box[:3, 3] = [*middle, (bottom + top) / 2]
-    half: Float32 = np.array([*size, top - bottom], dtype=np.float32) / np.float32(2)
-    return scene.frame.poses_in_cloud(T_canonical_box), half
 
 
 def debug_info(

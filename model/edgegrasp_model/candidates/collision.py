@@ -68,19 +68,13 @@ def collides(
         hit |= solid.reshape(len(hit), len(boxes)).any(axis=1)
     if request.margin >= 0.0:
         free = np.flatnonzero(~hit)
-        hit[free] = closes_on_background(scene, T_cloud_hand[free], gripper)
+        fixed = in_hands(scene.cloud.points[scene.object_of_point == FIXED], T_cloud_hand[free])
+        side, inner = gripper.pad_half_width, gripper.max_opening / 2
+        low, high = (-side, -inner, gripper.palm_z), (side, inner, gripper.tip_z)
+        between, _, _ = points_in_hand_boxes(fixed, *np.array([low, high], dtype=np.float32))
+        hit[free] = np.bincount(between, minlength=len(free)) >= MIN_FIXED
         hit[free] |= enters_unseen(scene.depths, T_cloud_hand[free], gripper)
     return hit
-
-
-def closes_on_background(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Bools:
-    """Which hands have a wall, a rim or other background between their fingers.  # (E,)."""
-    fixed = scene.cloud.points[scene.object_of_point == FIXED]
-    half, opening = gripper.pad_half_width, gripper.max_opening
-    low = np.array([-half, -opening / 2, gripper.palm_z], dtype=np.float32)
-    high = np.array([half, opening / 2, gripper.tip_z], dtype=np.float32)
-    hand, _, _ = points_in_hand_boxes(in_hands(fixed, T_cloud_hand), low, high)
-    return np.bincount(hand, minlength=len(T_cloud_hand)) >= MIN_FIXED
 
 
 def clearances(scene: Scene, T_cloud_hand: Float32, opening: Float32, gripper: Gripper) -> Float32:

@@ -103,11 +103,6 @@ class Candidates:
         """(E, 3) unit, outward: from the object back to the hand."""
         return -self.T_cloud_hand[:, :3, 2]
 
-    @property
-    def top_down(self) -> Bools:
-        """Which (E,) are top-down grasps."""
-        return self.pair < 0
-
     @staticmethod
     def none() -> "Candidates":
         """No candidate."""
