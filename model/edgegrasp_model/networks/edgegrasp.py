@@ -13,16 +13,16 @@ from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.layers import (
     CONVOLVED,
     EDGE_ROWS,
-    BallMaximum,
-    PackedLinear,
-    PackedMlp,
-    SharedProduct,
     ball_chunks,
+    ball_maximum,
     by_chunks,
     gather_rows,
     in_chunks,
     maximum,
     mlp,
+    packed,
+    packed_linear,
+    shared_product,
 )
 
 GRASP_WIDTH = 3 + 3 + 1 + 3  # contact point, its normal, depth, approach direction
@@ -54,8 +54,8 @@ class EdgeGraspNet(nn.Module):
         contact, depth = batch.contact, batch.depth.unsqueeze(1)
         own = batch.points[contact], batch.normals[contact], depth, batch.approach, f3[contact]
         grasp = torch.cat(own, dim=1)  # (E, 138)
-        join = SharedProduct(self.join.weight, self.join.bias, ball)
-        classifier, logits = PackedMlp(self.classifier), []
+        join = shared_product(self.join.weight, self.join.bias, ball)
+        classifier, logits = packed(self.classifier), []
         for rows, ball_of_edge in in_chunks(EDGE_ROWS, grasp, batch.ball_of_edge):
             logits.append(classifier(join(rows, ball_of_edge).relu_()))  # (e, 1)
         return torch.cat(logits).squeeze(1)[: len(grasp)]
@@ -72,9 +72,9 @@ class PointNetConv(nn.Module):
     def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, inputs) to (P, width)."""
         # W [f_j, p_j - p_i] + b = W [f_j, p_j] + b - V p_i: the product runs per point.
-        weight, output = self.hidden.weight, PackedLinear(self.output.weight)
+        weight, output = self.hidden.weight, packed_linear(self.output.weight)
         u = torch.cat((features, batch.points), dim=1)
-        u = by_chunks(PackedLinear(weight, self.hidden.bias), u)  # (P, width)
+        u = by_chunks(packed_linear(weight, self.hidden.bias), u)  # (P, width)
         # The bias is the same for all neighbours: added once, after the maximum.
         here, pooled = batch.points @ weight[:, -3:].t(), []  # (P, width)
         for neighbors, own in in_chunks(CONVOLVED, batch.neighbors, here):
@@ -95,13 +95,9 @@ class GlobalFeature(nn.Module):
     def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 224) to ball features (B, 1024)."""
         chunks = ball_chunks(local, batch)
-        mlp_1, maximum_1 = PackedMlp(self.mlp_1), BallMaximum()
-        for chunk in chunks:
-            maximum_1.add(mlp_1(chunk.values), chunk)
-        pooled = maximum_1.result()  # (B, 512)
-        join = SharedProduct(self.join.weight, self.join.bias, pooled)
-        mlp_2, maximum_2 = PackedMlp(self.mlp_2), BallMaximum()
-        for chunk in chunks:
-            joined = join(chunk.values, chunk.ball_of_point).relu_()  # (p, 1024)
-            maximum_2.add(mlp_2(joined), chunk)
-        return maximum_2.result()
+        mlp_1, mlp_2 = packed(self.mlp_1), packed(self.mlp_2)
+        pooled = ball_maximum(chunks, lambda chunk: mlp_1(chunk.values))  # (B, 512)
+        join = shared_product(self.join.weight, self.join.bias, pooled)
+        return ball_maximum(
+            chunks, lambda chunk: mlp_2(join(chunk.values, chunk.ball_of_point).relu_())
+        )

@@ -26,12 +26,12 @@ from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks.config import HAND_DESCRIPTION_SIZE, NetworkConfig
 from edgegrasp_model.networks.layers import (
     EDGE_ROWS,
-    PackedMlp,
     by_chunks,
     float32_inference,
     in_chunks,
     maximum,
     mlp,
+    packed,
 )
 from edgegrasp_model.scene.cloud import UP, unit
 from edgegrasp_model.scene.scene import Surroundings
@@ -75,8 +75,15 @@ class HandBatch:
     ) -> Self:
         """The view of each candidate's hand, with at most `num_points` points."""
         hands, ends = candidates.T_cloud_hand, seen_part(gripper)
-        view, side = hand_views(around.cloud, hands, gripper), _mirror_sides(around, hands)
-        description = describe_hands(around, candidates, gripper, view, side, description_size)
+        view = hand_views(around.cloud, hands, gripper)
+        eye, side = None, np.ones(len(hands), dtype=np.float32)
+        if around.viewpoints is not None and len(around.viewpoints) == 1:
+            # If a hand approaches straight from the camera, up decides instead of rounding errors.
+            eye = around.viewpoints[0]
+            toward = eye + ABOVE * UP - hands[:, :3, 3]
+            along_x = np.einsum("ed,ed->e", toward, hands[:, :3, 0])
+            side = np.where(along_x < 0.0, -1.0, 1.0).astype(np.float32)
+        description = describe_hands(around, candidates, gripper, view, eye, side, description_size)
         x, y = gripper.pad_half_width + BESIDE, gripper.max_opening / 2 + OUTSIDE
         low, high = (-x, -y, ends.palm_z - BEHIND), (x, y, gripper.tip_z + BEYOND_TIPS)
         box = np.array([low, high, (0.0, 0.0, gripper.tip_z)], dtype=np.float32)
@@ -134,31 +141,25 @@ class HandNet(nn.Module):
         """Logits (E,) of success; in training `left_out` draws what dropout removes."""
         known = batch.description[:, : self.config.description_size]
         description = (known - self.mean) / self.std  # (E, F)
-        encoder = PackedMlp(self.point_encoder)
-        chunks = in_chunks(CHUNK, batch.points, batch.point_count)
-        around = torch.cat([_around(encoder, *chunk) for chunk in chunks])
-        around = around[: len(description)]  # (E, 2 C)
-        seen = torch.cat((description, around), dim=1)
+        encoder, chunks = packed(self.point_encoder), []
+        for points, count in in_chunks(CHUNK, batch.points, batch.point_count):
+            positions, normals = torch.split(points, 3, dim=2)
+            encoded = encoder(torch.cat((positions / POINT_UNIT, normals), dim=2))  # (E, P, C)
+            if float32_inference(encoded):
+                pooled = torch.zeros(len(encoded), 2 * encoded.shape[2])
+                _pool(encoded.numpy(), count.numpy(), pooled.numpy())
+            else:
+                there = torch.arange(points.shape[1], device=points.device) < count.unsqueeze(1)
+                features = F.relu(encoded) * there.unsqueeze(2)  # (E, P, C), none below 0
+                mean = features.sum(dim=1) / count.clamp_min(1).unsqueeze(1)  # (E, C)
+                pooled = torch.cat((maximum(features, dim=1), mean), dim=1)
+            chunks.append(pooled)  # (E, 2 C): maximum and mean over the hand's points
+        seen = torch.cat((description, torch.cat(chunks)[: len(description)]), dim=1)
         if left_out is not None:
             draws = torch.rand(seen.shape, generator=left_out, device=left_out.device)
             seen = seen * (draws >= DROPOUT).to(seen.device) / (1.0 - DROPOUT)
-        logits = by_chunks(PackedMlp(self.classifier), seen, EDGE_ROWS)
+        logits = by_chunks(packed(self.classifier), seen, EDGE_ROWS)
         return logits.squeeze(1)  # (E,)
-
-
-def _around(encoder: PackedMlp, points: Tensor, count: Tensor) -> Tensor:
-    """Maximum and mean of the features of the valid points of (E, P, 6): (E, 2 C)."""
-    positions, normals = torch.split(points, 3, dim=2)
-    unit = torch.cat((positions / POINT_UNIT, normals), dim=2)  # (E, P, 6)
-    encoded = encoder(unit)  # (E, P, C)
-    if float32_inference(encoded):
-        pooled = torch.zeros(len(encoded), 2 * encoded.shape[2])
-        _pool(encoded.numpy(), count.numpy(), pooled.numpy())
-        return pooled
-    there = torch.arange(points.shape[1], device=points.device) < count.unsqueeze(1)  # (E, P)
-    features = F.relu(encoded) * there.unsqueeze(2)  # (E, P, C), none below 0
-    mean = features.sum(dim=1) / count.clamp_min(1).unsqueeze(1)  # (E, C)
-    return torch.cat((maximum(features, dim=1), mean), dim=1)  # (E, 2 C)
 
 
 @compiled("contract", "nsz")
@@ -186,7 +187,8 @@ def describe_hands(
     candidates: Candidates,  # E candidates
     gripper: Gripper,  # fingers open to its maximum
     view: HandView,  # of the same candidates
-    side: Float32,  # (E,) as from `_mirror_sides`
+    eye: Float32 | None,  # (3,) the camera, where there is exactly one
+    side: Float32,  # (E,) 1 or -1, the factor on a hand's x that puts it on the positive side
     size: int,  # numbers that the network reads; the extents, which come last, may be skipped
 ) -> Float32:
     """The description (E, F) of candidates: log(1 + counts), metres and cosines."""
@@ -203,8 +205,8 @@ def describe_hands(
     _look_from_each(*looked, seen, first_met, runs)
     unseen = unseen_space(around.depths, hands, first_met, ends)
     toward = np.zeros((len(mirrored), 3), dtype=np.float32)
-    if around.viewpoint is not None:
-        toward = unit(around.viewpoint - hands[:, :3, 3])
+    if eye is not None:
+        toward = unit(eye - hands[:, :3, 3])
     ups = np.broadcast_to(up / np.linalg.norm(up), toward.shape)
     length, swing = gripper.tip_z - gripper.palm_z, gripper.max_tip_z - gripper.tip_z
     thick = max(high[1] for _, high in gripper.finger_boxes)
@@ -227,16 +229,6 @@ def describe_hands(
         of_object = cloud.points, around.object_of_point, candidates.contact_index
         columns += [*visible_extents(*of_object, hands, side, ends, up).T]
     return np.stack(columns, axis=1).astype(np.float32)
-
-
-def _mirror_sides(around: Surroundings, T_cloud_hand: Float32) -> Float32:
-    """Factor (E,), 1 or -1, on a hand's x that puts a single camera on its positive side."""
-    if around.viewpoint is None:
-        return np.ones(len(T_cloud_hand), dtype=np.float32)
-    # If a hand approaches straight from the camera, up decides instead of rounding errors.
-    toward = around.viewpoint + ABOVE * UP - T_cloud_hand[:, :3, 3]
-    along_x = np.einsum("ed,ed->e", toward, T_cloud_hand[:, :3, 0])
-    return np.where(along_x < 0.0, -1.0, 1.0).astype(np.float32)
 
 
 class _Hand(NamedTuple):

@@ -6,6 +6,7 @@ is the same whatever else is scored with it.
 
 from collections import defaultdict
 from collections.abc import Callable, MutableMapping, Sequence
+from functools import reduce
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,6 +17,8 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from edgegrasp_model.networks.balls import BallBatch
 
+Layer = Callable[[Tensor], Tensor]
+
 # Products of fewer rows are summed in an order that depends on their number.
 MIN_ROWS = 32
 ROWS = 512  # points at a time: 1,024 channels of them stay in cache
@@ -25,25 +28,22 @@ EDGE_ROWS = 256  # edge grasps at a time
 _PACKED: MutableMapping[Tensor, tuple[int, Tensor]] = WeakTensorKeyDictionary()
 
 
-class SharedProduct:
-    """W [a, b] = W_a a + W_b b on rows [own, shared[row]], each shared part multiplied once."""
+def shared_product(
+    weight: Tensor, bias: Tensor | None, shared: Tensor
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """W [a, b] = W_a a + W_b b, where the shared parts b (B, ..., C2) are multiplied once.
 
-    def __init__(self, weight: Tensor, bias: Tensor | None, shared: Tensor) -> None:
-        """Multiply the shared parts (B, ..., C2) by their part of the weight (outputs, C1 + C2)."""
-        widths = [weight.shape[1] - shared.shape[-1], shared.shape[-1]]
-        own_weight, shared_weight = torch.split(weight, widths, dim=1)
-        self._own = PackedLinear(own_weight, bias)
-        self._shared = row_linear(shared, shared_weight)  # (B, ..., outputs)
-
-    def __call__(self, own: Tensor, shared_of_row: Tensor) -> Tensor:
-        """Maps `own` (M, ..., C1) and the rows (M,) of the shared parts to (M, ..., outputs)."""
-        rows = self._own(own)
-        rows += self._shared.index_select(0, shared_of_row)
-        return rows
+    It maps parts a (M, ..., C1), and the rows (M,) of their shared parts, to (M, ..., outputs). The
+    weight is (outputs, C1 + C2).
+    """
+    widths = [weight.shape[1] - shared.shape[-1], shared.shape[-1]]
+    own_weight, shared_weight = torch.split(weight, widths, dim=1)
+    own, products = packed_linear(own_weight, bias), row_linear(shared, shared_weight)
+    return lambda values, row: own(values).add_(products.index_select(0, row))
 
 
 def mlp(widths: Sequence[int]) -> nn.Sequential:
-    """Linear layers from widths[0] to widths[-1] with ReLUs in between, for `PackedMlp`."""
+    """Linear layers from widths[0] to widths[-1] with ReLUs in between, for `packed`."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         layers += [nn.Linear(inputs, outputs), nn.ReLU(inplace=True)]
@@ -70,53 +70,37 @@ def row_linear(values: Tensor, weight: Tensor, bias: Tensor | None = None) -> Te
     return F.linear(values, weight, bias)
 
 
-class PackedLinear:
-    """A linear layer for many chunks of rows in one forward pass, by oneDNN on x86."""
+def packed_linear(weight: Tensor, bias: Tensor | None = None, *, rectified: bool = False) -> Layer:
+    """A linear layer for many chunks of rows in one forward pass, by oneDNN on x86.
 
-    def __init__(
-        self, weight: Tensor, bias: Tensor | None = None, *, rectified: bool = False
-    ) -> None:
-        """Prepare a weight (outputs, C), any part of a matrix; `rectified`: a ReLU follows."""
-        self._weight, self._bias, self._rectified = weight, bias, rectified
-        self._packed: Tensor | None = None  # for oneDNN; None: the plain product is used
-        # On processors without AVX it is unmeasured.
-        avx = torch.backends.cpu.get_cpu_capability().startswith("AVX")
-        there = avx and torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
-        if len(weight) > 1 and there and float32_inference(weight):
-            # Changes of an inference tensor are not counted.
-            version = -1 if weight.is_inference() else weight._version
-            if version < 0 or _PACKED.get(weight, (-1, weight))[0] != version:
-                packed = torch.ops.mkldnn._reorder_linear_weight(weight.detach().contiguous())
-                _PACKED[weight] = version, packed
-            self._packed = _PACKED[weight][1]
-
-    def __call__(self, values: Tensor) -> Tensor:
-        """Map (M, ..., C) to (M, ..., outputs); oneDNN sets up again for each number of rows M."""
-        if self._packed is None:
-            rows = row_linear(values, self._weight, self._bias)
-            return rows.relu_() if self._rectified else rows
-        then = "relu" if self._rectified else "none"
-        result: Tensor = torch.ops.mkldnn._linear_pointwise(
-            values, self._packed, self._bias, then, [], ""
-        )
-        return result
+    It maps (M, ..., C) to (M, ..., outputs); oneDNN sets up again for each number of rows M. The
+    weight (outputs, C) is any part of a matrix; `rectified`: a ReLU follows.
+    """
+    # On processors without AVX it is unmeasured.
+    avx = torch.backends.cpu.get_cpu_capability().startswith("AVX")
+    there = avx and torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
+    if len(weight) == 1 or not there or not float32_inference(weight):
+        then: Layer = torch.relu_ if rectified else nn.Identity()
+        return lambda values: then(row_linear(values, weight, bias))
+    # Changes of an inference tensor are not counted.
+    version = -1 if weight.is_inference() else weight._version
+    if version < 0 or _PACKED.get(weight, (-1, weight))[0] != version:
+        reordered = torch.ops.mkldnn._reorder_linear_weight(weight.detach().contiguous())
+        _PACKED[weight] = version, reordered
+    for_onednn, after = _PACKED[weight][1], "relu" if rectified else "none"
+    return lambda values: torch.ops.mkldnn._linear_pointwise(
+        values, for_onednn, bias, after, [], ""
+    )
 
 
-class PackedMlp:
-    """The linear layers of an MLP as `PackedLinear`s, with their ReLUs."""
-
-    def __init__(self, mlp: nn.Sequential) -> None:
-        layers = [layer for layer in mlp if isinstance(layer, nn.Linear)]
-        self._products = [
-            PackedLinear(layer.weight, layer.bias, rectified=layer is not layers[-1])
-            for layer in layers
-        ]
-
-    def __call__(self, values: Tensor) -> Tensor:
-        """Maps (M, ..., C) to (M, ..., outputs)."""
-        for product in self._products:
-            values = product(values)
-        return values
+def packed(mlp: nn.Sequential) -> Layer:
+    """The linear layers of an MLP as by `packed_linear`, with their ReLUs."""
+    layers = [layer for layer in mlp if isinstance(layer, nn.Linear)]
+    products = [
+        packed_linear(layer.weight, layer.bias, rectified=layer is not layers[-1])
+        for layer in layers
+    ]
+    return lambda values: reduce(lambda rows, product: product(rows), products, values)
 
 
 def float32_inference(values: Tensor) -> bool:
@@ -163,26 +147,19 @@ def in_chunks(rows: int, *values: Tensor) -> list[tuple[Tensor, ...]]:
     return chunks
 
 
-def by_chunks(layer: Callable[[Tensor], Tensor], values: Tensor, rows: int = ROWS) -> Tensor:
+def by_chunks(layer: Layer, values: Tensor, rows: int = ROWS) -> Tensor:
     """A layer that maps the rows of values (M, ...) one by one."""
     parts = [layer(part) for (part,) in in_chunks(rows, values)]
     return torch.cat(parts)[: len(values)]
 
 
-class BallMaximum:
-    """Maximum over the points of each ball, chunk by chunk."""
-
-    def __init__(self) -> None:
-        self._parts: defaultdict[int, list[Tensor]] = defaultdict(list)  # by ball, ascending
-
-    def add(self, values: Tensor, chunk: BallChunk) -> None:
-        """Take in the values (p, C) of a chunk's points."""
-        for ball, part in zip(chunk.balls, torch.split(values, chunk.sizes), strict=False):
-            self._parts[ball].append(maximum(part, dim=0))
-
-    def result(self) -> Tensor:
-        """The maximum (B, C) of each ball."""
-        return torch.stack([maximum(torch.stack(parts), dim=0) for parts in self._parts.values()])
+def ball_maximum(chunks: list[BallChunk], layer: Callable[[BallChunk], Tensor]) -> Tensor:
+    """Maximum (B, C), over the points of each ball, of a layer's values (p, C) of each chunk."""
+    found: defaultdict[int, list[Tensor]] = defaultdict(list)  # by ball, ascending
+    for chunk in chunks:
+        for ball, part in zip(chunk.balls, torch.split(layer(chunk), chunk.sizes), strict=False):
+            found[ball].append(maximum(part, dim=0))
+    return torch.stack([maximum(torch.stack(parts), dim=0) for parts in found.values()])
 
 
 def maximum(values: Tensor, dim: int) -> Tensor:

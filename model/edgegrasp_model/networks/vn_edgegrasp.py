@@ -16,15 +16,16 @@ from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.layers import (
     EDGE_ROWS,
-    PackedLinear,
-    PackedMlp,
-    SharedProduct,
+    Layer,
     ball_chunks,
     by_chunks,
     float32_inference,
     gather_rows,
     in_chunks,
     mlp,
+    packed,
+    packed_linear,
+    shared_product,
 )
 
 _TINY = 1e-7  # keeps the division finite where a direction vanishes; the reference's value
@@ -63,9 +64,9 @@ class VNEdgeGraspNet(nn.Module):
         ball = self.ball_feature(torch.cat((f1, f2, f3), dim=2), batch)  # (B, 3, 381)
         named = (batch.approach, batch.points[contact], batch.normals[contact])
         grasp = torch.cat((torch.stack(named, dim=2), f3[contact]), dim=2)  # (E, 3, 131)
-        join = SharedProduct(self.frame_1.weights, None, ball)
-        frame_2, frame_3 = PackedLinear(self.frame_2.weights), PackedLinear(self.frame_3.weight)
-        classifier, logits = PackedMlp(self.classifier), []
+        join = shared_product(self.frame_1.weights, None, ball)
+        frame_2, frame_3 = packed_linear(self.frame_2.weights), packed_linear(self.frame_3.weight)
+        classifier, logits = packed(self.classifier), []
         for own, ball_of_edge in in_chunks(EDGE_ROWS, grasp, batch.ball_of_edge):
             # Three learned vectors rotate with the grasp, so coordinates along them are invariant.
             frame = frame_3(relu(frame_2(relu(join(own, ball_of_edge)))))  # (e, 3, 3)
@@ -91,9 +92,9 @@ class VNPointNetConv(nn.Module):
         # W [f_j, p_j - p_i] = W [f_j, p_j] - w p_i, w the last column: the product runs per point.
         weight, direction = self.hidden.weight, self.hidden_relu.direction.weight
         weight = torch.cat((weight, direction @ weight))
-        output = PackedLinear(_with_reach(self.output, self.reach))
+        output = packed_linear(_with_reach(self.output, self.reach))
         u = torch.cat((features, batch.points.unsqueeze(2)), dim=2)
-        u = by_chunks(PackedLinear(weight), u, VN_ROWS)  # (P, 3, 2 width)
+        u = by_chunks(packed_linear(weight), u, VN_ROWS)  # (P, 3, 2 width)
         if float32_inference(u):
             vectors = _convolved(u, weight[:, -1].contiguous(), output, batch)
         else:
@@ -122,15 +123,15 @@ class VNGlobalFeature(nn.Module):
 
     def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 3, 224) to ball features (B, 3, 381)."""
-        vn_1, vn_2 = PackedLinear(self.vn_1.weights), PackedLinear(self.vn_2.weights)
-        vn_3 = PackedLinear(_with_reach(self.vn_3, self.maximum_1.reach))
-        vn_5 = PackedLinear(_with_reach(self.vn_5, self.maximum_2.reach))
+        vn_1, vn_2 = packed_linear(self.vn_1.weights), packed_linear(self.vn_2.weights)
+        vn_3 = packed_linear(_with_reach(self.vn_3, self.maximum_1.reach))
+        vn_5 = packed_linear(_with_reach(self.vn_5, self.maximum_2.reach))
         chunks = ball_chunks(local, batch, VN_ROWS)
         furthest_1 = Furthest(batch.num_balls, self.vn_3.out_features)
         for chunk in chunks:
             both = vn_3(relu(vn_2(relu(vn_1(chunk.values)))))  # (p, 3, 2 x 128)
             furthest_1.add(both, chunk.balls, chunk.sizes)
-        join = SharedProduct(self.join.weights, None, self.maximum_1.relu(furthest_1.vectors))
+        join = shared_product(self.join.weights, None, self.maximum_1.relu(furthest_1.vectors))
         furthest_2 = Furthest(batch.num_balls, self.vn_5.out_features)
         for chunk in chunks:
             both = vn_5(relu(join(chunk.values, chunk.ball_of_point)))  # (p, 3, 2 x 381)
@@ -171,7 +172,7 @@ class VNReLU(nn.Module):
 
     def forward(self, vectors: Tensor) -> Tensor:
         """Maps (M, 3, width) to the same shape."""
-        directions = PackedLinear(self.direction.weight)
+        directions = packed_linear(self.direction.weight)
         return by_chunks(lambda v: relu(torch.cat((v, directions(v)), dim=2)), vectors, VN_ROWS)
 
 
@@ -197,7 +198,7 @@ def relu(both: Tensor) -> Tensor:
     return torch.addcmul(vectors, along / (length_squared + _TINY), directions, value=-1.0)
 
 
-def _convolved(u: Tensor, offset: Tensor, output: PackedLinear, batch: BallBatch) -> Tensor:
+def _convolved(u: Tensor, offset: Tensor, output: Layer, batch: BallBatch) -> Tensor:
     """The furthest (P, 3, C) of the messages of each point's neighbours, in a reused buffer."""
     (count, k), width = batch.neighbors.shape, len(offset) // 2
     points, neighbors = batch.points.numpy(), batch.neighbors.numpy()
