@@ -15,16 +15,16 @@ import torch
 from scipy.special import expit, logit
 from torch import nn
 
-from edgegrasp_camera.arrays import Array, Float32, Floats, Int64
+from edgegrasp_camera.arrays import Array, Float32, Floats
 from edgegrasp_model.candidates.collision import collides
-from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls
+from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import NOTHING, Sample, Sampler
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import Given, check_edges, check_hand_poses, from_edges, from_hand_poses
 from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import check_reference_logits, load_checkpoint
-from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
+from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import Collision, DetectOptions
 from edgegrasp_model.ranking import (
@@ -37,7 +37,7 @@ from edgegrasp_model.ranking import (
     select,
 )
 from edgegrasp_model.results import NoGrasp, Pace
-from edgegrasp_model.scene.cloud import CheckedCloud, check_cloud, seen_from_origin
+from edgegrasp_model.scene.cloud import check_cloud, seen_from_origin
 from edgegrasp_model.scene.scene import (
     MAX_VOXELS,
     Scene,
@@ -94,10 +94,10 @@ class Prepared:
 
 
 class Scored(NamedTuple):
-    """The candidates of a request, E of them, and the network's logit (E,) of each."""
+    """The candidates of a request, E of them."""
 
     sample: Sample
-    logits: Float32
+    logits: Float32  # (E,) calibrated in training
 
 
 class GraspDetector:
@@ -160,7 +160,16 @@ class GraspDetector:
                 f"the weights were trained for the gripper {self.gripper.name!r}: their scores are "
                 f"uncalibrated for {gripper.name!r}; use them for ranking only."
             )
-        options = _with_viewpoint(sent, options, warnings)
+        if options.viewpoint is None and seen_from_origin(sent.points, options.up):
+            warnings.append(
+                "viewpoint is not given: the camera is assumed at the origin, as the whole cloud "
+                "lies in front of it; if the camera is elsewhere, send its position."
+            )
+            options = options.model_copy(update={"viewpoint": (0.0, 0.0, 0.0)})
+        elif options.viewpoint is None and sent.normals is None:
+            warnings.append(
+                "viewpoint is not given: normals are oriented upward; send the camera's position."
+            )
         previous, followed, choice = options.previous, None, options.objects
         if previous is not None:
             options = narrowed(options, gripper.name, sent.points)
@@ -199,7 +208,7 @@ class GraspDetector:
             with prepared.timed("candidates"):
                 done = NOTHING
                 if scored is not None:
-                    held = expit(self._calibrated(scored.logits)) >= enough
+                    held = expit(scored.logits) >= enough
                     if prepared.options.collision.mode != "ignore":
                         held &= scored.sample.collision_free
                     done = scene.object_of_point[scored.sample.candidates.approach_index[held]]
@@ -207,6 +216,7 @@ class GraspDetector:
             if sample is None:
                 continue
             logits = self._logits(prepared, scene, sample.candidates)
+            logits = (logits / self.metadata.temperature).astype(np.float32)
             if scored is not None:
                 sample = scored.sample.and_further(sample)
                 logits = np.concatenate([scored.logits, logits])
@@ -221,7 +231,7 @@ class GraspDetector:
         with prepared.timed("ranking"):
             logits, outcome = np.empty(0, dtype=np.float32), np.empty(0, dtype=np.int8)
             if scored is not None and scene is not None:
-                logits = self._calibrated(scored.logits)
+                logits = scored.logits
                 if self.sees_hands:
                     logits = judged_together(logits, scored.sample, scene, gripper)
             score: Floats = expit(logits)
@@ -251,9 +261,9 @@ class GraspDetector:
                 objects = [replace(one, surface=surface.get(one.number)) for one in objects]
         counts["returned"], plane = len(grasps), None
         if (support := prepared.selected.support) is not None:
-            normal, residual = support.normal.astype(np.float32), support.residual
-            offset = -float(support.frame.T_canonical_cloud[2, 3])  # of the normal of length 1
-            plane = FoundSupport(normal, offset, residual, support.share)
+            *normal, height = support.frame.T_canonical_cloud[2].tolist()  # of the cloud's origin
+            unit = np.array(normal, dtype=np.float32)
+            plane = FoundSupport(unit, -height, support.residual, support.share)
         return Detection(
             grasps,
             dict(counts),
@@ -336,10 +346,6 @@ class GraspDetector:
             evaluations[number] = Evaluation(grasp, None)
         return evaluations
 
-    def _calibrated(self, logits: Float32) -> Float32:
-        """The network's logits (E,), calibrated in training."""
-        return (logits / self.metadata.temperature).astype(np.float32)
-
     def _rescaled(self, score: Floats) -> Floats:
         """Scores (E,) as outcomes of a robot rescaled them (Platt scaling), if there are any."""
         if (fitted := self.metadata.training.get("rescaled_by_outcomes")) is None:
@@ -349,67 +355,25 @@ class GraspDetector:
         return rescaled
 
     def _logits(self, prepared: Prepared, scene: Scene, candidates: Candidates) -> Float32:
-        """The network's logits (E,) of candidates."""
-        logits = np.empty(len(candidates), np.float32)
-        sizes = prepared.crop_radius, self.metadata.network
-        parts = _batches(scene, candidates, prepared.gripper, *sizes)
-        while True:
+        """The network's logits (E,) of candidates: of all hands at once, or of some balls."""
+        logits, network = np.empty(len(candidates), np.float32), self.metadata.network
+        _, ball = np.unique(candidates.approach_index, return_inverse=True)
+        part = np.zeros_like(ball) if self.sees_hands else ball // BALLS_AT_A_TIME
+        for number in range(part.max(initial=-1) + 1):
+            rows = np.flatnonzero(part == number)
             with prepared.timed("description"):
-                part = next(parts, None)
-            if part is None:
-                return logits
-            rows, batch = part
+                some = candidates.take(rows)
+                batch: HandBatch | BallBatch
+                if self.sees_hands:
+                    sizes = network.hand_points, network.description_size
+                    batch = HandBatch.of_hands(scene, some, prepared.gripper, *sizes)
+                else:
+                    batch = BallBatch.of_candidates(
+                        scene.cloud, some, prepared.crop_radius, network.k
+                    )
             with prepared.timed("network"), torch.inference_mode():
                 logits[rows] = self.network(batch.to(self.device)).float().cpu().numpy()
-
-
-def _batches(
-    scene: Scene,
-    candidates: Candidates,  # E of them
-    gripper: Gripper,
-    crop_radius: float,  # of the balls, metres
-    network: NetworkConfig,
-) -> Iterator[tuple[Int64, BallBatch | HandBatch]]:
-    """Inputs of the network and the rows of their candidates: of hands at once, or of some balls.
-
-    There is one ball for each approach point.
-    """
-    if network.architecture == "hand":
-        sizes = network.hand_points, network.description_size
-        yield np.arange(len(candidates)), HandBatch.of_hands(scene, candidates, gripper, *sizes)
-        return
-    points, normals = scene.cloud.points, scene.cloud.normals
-    balls = np.unique(candidates.approach_index)
-    for start in range(0, len(balls), BALLS_AT_A_TIME):
-        some = balls[start : start + BALLS_AT_A_TIME]
-        crop = crop_balls(points, some, crop_radius)
-        rows = np.flatnonzero(np.isin(candidates.approach_index, some))
-        here = candidates.take(rows)
-        size = len(points)
-        keys = crop.ball_of_point * size + crop.ball_rows  # ascending
-        ball = np.searchsorted(some, here.approach_index)
-        contact = np.searchsorted(keys, ball * size + here.contact_index).astype(np.int64)
-        edges = contact, here.approach, here.depth
-        yield rows, BallBatch.from_cloud(points, normals, some, crop, *edges, network.k)
-
-
-def _with_viewpoint(
-    sent: CheckedCloud, options: DetectOptions, warnings: list[str]
-) -> DetectOptions:
-    """The options, with the camera at the origin if the cloud was probably seen from there."""
-    if options.viewpoint is not None:
-        return options
-    if seen_from_origin(sent.points, options.up):
-        warnings.append(
-            "viewpoint is not given: the camera is assumed at the origin, as the whole cloud lies "
-            "in front of it; if the camera is elsewhere, send its position."
-        )
-        return options.model_copy(update={"viewpoint": (0.0, 0.0, 0.0)})
-    if sent.normals is None:
-        warnings.append(
-            "viewpoint is not given: normals are oriented upward; send the camera's position."
-        )
-    return options
+        return logits
 
 
 class ModelCatalogue:

@@ -12,8 +12,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from edgegrasp_camera.arrays import Floats
-from edgegrasp_model.candidates.edge_grasps import BallCrop, crop_balls
+from edgegrasp_model.candidates.edge_grasps import BallCrop, Candidates, crop_balls
 from edgegrasp_model.networks.config import NetworkConfig
+from edgegrasp_model.scene.cloud import Cloud
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,17 @@ class BallBatch:
     contact: Tensor  # (E,) int64, rows of `points`: the contact point of each edge grasp
     approach: Tensor  # (E, 3) float32, outward approach direction u, unit length
     depth: Tensor  # (E,) float32, |r_perp|: contact below approach point along u
+
+    @classmethod
+    def of_candidates(cls, cloud: Cloud, candidates: Candidates, radius: float, k: int) -> Self:
+        """Candidates with balls of `radius` metres around their approach points; `k` as below."""
+        balls, size = np.unique(candidates.approach_index), len(cloud.points)
+        crop = crop_balls(cloud.points, balls, radius)
+        keys = crop.ball_of_point * size + crop.ball_rows  # ascending
+        ball = np.searchsorted(balls, candidates.approach_index)
+        contact = np.searchsorted(keys, ball * size + candidates.contact_index)
+        edges = contact, candidates.approach, candidates.depth
+        return cls.from_cloud(cloud.points, cloud.normals, balls, crop, *edges, k)
 
     @classmethod
     def from_cloud(
