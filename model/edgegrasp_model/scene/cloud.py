@@ -30,7 +30,6 @@ ENOUGH = 6000  # points that stand for a whole cloud where a fit, a mean or a vi
 LARGE = 704, 960  # pixels of an image of which every second row and column may be enough
 FINE = 0.00125  # metres between its neighbouring pixels, at most, if they are
 
-
 Vectors = TypeVar("Vectors", bound=Floats)
 
 
@@ -81,7 +80,8 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
             step = 2 if thin and _is_fine(points) else 1
             columns, points = points.shape[1], points[::step, ::step]
             narrow, points = points.shape[1], points.reshape(-1, 3)
-            kept = np.flatnonzero(_finite(points))
+            x, y, z = points.T
+            kept = np.flatnonzero(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
             row = kept if step == 1 else kept // narrow * (step * columns) + kept % narrow * step
             points = points.take(kept, axis=0)
             if len(points) == 0:
@@ -99,7 +99,17 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
         )
         valid, row = valid[near], row[near]
         low, high = valid.min(axis=0), valid.max(axis=0)
-    _check_place(len(valid), float(np.maximum(-low, high).max()), num_approach_points)
+    if (furthest := float(np.maximum(-low, high).max())) > MAX_DISTANCE:
+        value = f"points {furthest:.4g} m from the origin, where float32 rounds away millimetres"
+        fix = (
+            "Subtract an origin near the cloud from it and from every position of the request, and "
+            "add it to the grasps."
+        )
+        raise InvalidRequest("cloud", value, fix)
+    if len(valid) < num_approach_points:
+        value = f"{len(valid)} points for num_approach_points = {num_approach_points}"
+        fix = "Send more points or lower options.num_approach_points."
+        raise InvalidRequest("cloud", value, fix)
     _beside("colors", sent.colors, size, row[:0], 3)
     return CheckedCloud(
         np.require(valid, np.float32, ("C", "W")),  # loops are not compiled for read-only ones
@@ -206,7 +216,7 @@ def _valid_points(cloud: object) -> tuple[Floats, Floats, Floats]:
         raise InvalidRequest("cloud", "no points", "Send points in metres.")
     low, high = (np.array([end(axis) for axis in cloud.T]) for end in (np.min, np.max))
     if not np.isfinite([low, high]).all():
-        finite = _finite(cloud)
+        finite = np.isfinite(cloud).all(axis=1)
         bad = int(np.argmin(finite))
         raise InvalidRequest(
             "cloud",
@@ -227,29 +237,6 @@ def _near_points(points: Floats) -> Int64:
             "Send metres: divide by 1000, or send a depth image with depth_scale 0.001.",
         )
     return np.flatnonzero(distance <= MAX_EXTENT / 2)
-
-
-def _check_place(count: int, furthest: float, num_approach_points: int) -> None:
-    """Refuse points too far from the origin, or fewer points than approach points."""
-    if furthest > MAX_DISTANCE:
-        raise InvalidRequest(
-            "cloud",
-            f"points {furthest:.4g} m from the origin, where float32 rounds away millimetres",
-            "Subtract an origin near the cloud from it and from every position of the request, and "
-            "add it to the grasps.",
-        )
-    if count < num_approach_points:
-        raise InvalidRequest(
-            "cloud",
-            f"{count} points for num_approach_points = {num_approach_points}",
-            "Send more points or lower options.num_approach_points.",
-        )
-
-
-def _finite(points: Floats) -> Bools:
-    """Which points (N, 3) have three finite coordinates."""
-    x, y, z = points.T
-    return np.asarray(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
 
 
 class Voxels(NamedTuple):

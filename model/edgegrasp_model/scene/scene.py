@@ -67,6 +67,9 @@ PLAN_CELL = 0.05  # metres
 CLOSE = 0.06  # metres; no camera measures closer
 SPARE = 0.0015  # metres that hands stay above a support plane that was found, not given
 CUT_OUT = 0.95  # confidence of clusters where a cloud was cut off above its support
+HELD_SHARE = 0.5  # share of a voxel's points that must be listed for rows to hold the voxel
+NEAR_POINT = 0.1  # most metres from a position to the object it names
+NEAR_PIXEL = 0.02  # the same from a pixel, as a share of the image's width
 
 
 @dataclass(frozen=True)
@@ -86,12 +89,6 @@ class Surroundings:
         if self.viewpoints is None or len(self.cloud.points) == 0:
             return []
         return [DepthMap.of_cloud(self.cloud.points, eye, self.up) for eye in self.viewpoints]
-
-    @property
-    def viewpoint(self) -> Float32 | None:
-        """The camera (3,), where there is exactly one."""
-        one = self.viewpoints is not None and len(self.viewpoints) == 1
-        return self.viewpoints[0] if self.viewpoints is not None and one else None
 
 
 @dataclass(frozen=True)
@@ -397,7 +394,7 @@ def _up(options: DetectOptions, support: Support | None, shown: Segmentation | N
     if options.up is not None:
         return unit(np.asarray(options.up, dtype=np.float64))
     if support is not None:
-        return support.normal
+        return np.asarray(support.frame.T_canonical_cloud[2, :3])
     return np.array([0.0, 0.0, 1.0]) if shown is None else shown.up
 
 
@@ -456,10 +453,6 @@ def camera_positions(sent: CheckedCloud, options: DetectOptions) -> Float64 | No
 
 
 # Regions, and objects that a request names
-
-HELD_SHARE = 0.5  # share of a voxel's points that must be listed for rows to hold the voxel
-NEAR_POINT = 0.1  # most metres from a position to the object it names
-NEAR_PIXEL = 0.02  # the same from a pixel, as a share of the image's width
 
 
 def check_regions(cloud: CheckedCloud, options: DetectOptions) -> None:

@@ -26,7 +26,7 @@ GIVEN_MARGIN = 0.005  # metres over a plane that is given
 DEVIATIONS = 4.0  # of its own points that still belong to it
 BOW = 0.025  # metres by which a bowed support may rise over its plane
 TILT = math.radians(30)  # between the plane and a given `up`
-MOST_BELOW = 0.1  # of the points of objects that may lie below what they stand on
+MOST_BELOW = 0.1  # of the points of objects may lie below what these stand on
 NEAR_OBJECTS, FAR_WEIGHT = 0.15, 0.1  # metres around an object; what points count elsewhere
 CLOSE, CLOSER = 0.08, (0.008, 0.005, 0.004)  # metres around an object; from the plane there
 FEWEST = 60  # points that a plane is fitted to, and by which its residual is measured
@@ -56,18 +56,13 @@ class Support:
     """A support plane and how well the points agree with it; cloud frame."""
 
     plane: SupportPlane
-    frame: CanonicalFrame  # its z is the height over the plane
+    frame: CanonicalFrame  # its z is the height over the plane, along the unit normal
     least: float  # metres above it that always belong to it
     residual: float | None = None  # metres, median distance of its points; None: it is not seen
     share: float = 0.0  # of the points that lie in it
     growth: float = math.nan  # noise of its points, metres per squared metre of distance
     # Rise over the plane at (x, y): of 1, x, y, x^2, x y, y^2.
     bow: Float64 = field(default_factory=lambda: np.zeros(6))
-
-    @property
-    def normal(self) -> Float64:
-        """(3,) unit."""
-        return np.asarray(self.frame.T_canonical_cloud[2, :3])
 
     def heights(self, seen: "Seen") -> tuple[Float32, Float32]:
         """Heights (N,) over the support, which may be bowed, and up to which points belong to it.
@@ -97,10 +92,6 @@ class Seen(NamedTuple):
             return np.full(len(self.points), USUAL_DISTANCE)
         apart = self.points - self.viewpoint
         return np.asarray(np.sqrt(np.einsum("nd,nd->n", apart, apart)))
-
-    def thickness(self) -> Float64:
-        """Metres (N,) from a plane within which points may belong to it."""
-        return THICK + GROWTH * np.square(self.distance())
 
 
 def choose_support(
@@ -172,23 +163,23 @@ def _fitted(
     apart = np.asarray(cKDTree(around).query(part.points, distance_upper_bound=NEAR_OBJECTS)[0])
     weight = np.where(np.isfinite(apart), 1.0, FAR_WEIGHT)
     up = shown.up if up is None else up
-    plane = fit_plane(part, weight, rng, up)
-    if plane is not None and _objects_below(plane, around):
+    for _ in range(2):
+        plane = fit_plane(part, weight, rng, up)
+        if plane is None:
+            return None
+        below = plane.heights(around) < -MOST_MARGIN
+        if len(below) == 0 or below.mean() <= MOST_BELOW:
+            break
         # This plane is the top of something larger, and the objects stand below it.
         weight[plane.heights(part.points) > -MOST_MARGIN] = 0.0
-        plane = fit_plane(part, weight, rng, up)
-    if plane is None or _objects_below(plane, around):
+    else:
         return None
     found = measured(part, _close_to(plane, part.points[apart < CLOSE]), THICK, True)
     places = found.frame.points(part.points)
-    if _area(places[np.abs(places[:, 2]) < MOST_MARGIN]) <= LEAST_AREA:
+    near = places[np.abs(places[:, 2]) < MOST_MARGIN]
+    if _occupied(near[:, :2], CELL) * CELL**2 <= LEAST_AREA:
         return None
     return replace(found, share=found.share * len(on) / len(seen.points))  # of all that is seen
-
-
-def _objects_below(plane: SupportPlane, around: Float32) -> bool:
-    """Whether too many points of objects (N, 3) lie below a plane for these to stand on it."""
-    return len(around) > 0 and bool((plane.heights(around) < -MOST_MARGIN).mean() > MOST_BELOW)
 
 
 def _assumed(
@@ -288,7 +279,7 @@ def fit_plane(
         held, min(SAMPLE, len(held)), replace=False, p=weight[held] / weight[held].sum()
     )
     sample = Seen(seen.points[chosen], seen.viewpoint)
-    points, thick = sample.points.astype(np.float64), sample.thickness()
+    points, thick = sample.points.astype(np.float64), THICK + GROWTH * sample.distance() ** 2
     corners = points[rng.integers(len(points), size=(TRIES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
@@ -326,7 +317,8 @@ def measured(seen: Seen, plane: SupportPlane, least: float, whole: bool) -> Supp
     frame = CanonicalFrame.of_scene(sample.points, plane.normal, seen.viewpoint)
     frame.T_canonical_cloud[2, 3] = -plane.offset / np.linalg.norm(plane.normal)
     x, y, height = frame.points(sample.points).T
-    thick, distance = sample.thickness(), sample.distance()
+    distance = sample.distance()
+    thick = THICK + GROWTH * np.square(distance)
     near = np.abs(height) < thick
     # If the cloud was cut off above the plane, only objects on it are near.
     if near.sum() < FEWEST or (not whole and (height[near] < 1e-4).mean() < 0.2):
@@ -423,12 +415,7 @@ def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> floa
 def _wide(points: Floats, plane: SupportPlane) -> bool:
     """Whether points (N, 3) cover more of a plane than an object's flat top."""
     frame = CanonicalFrame.of_scene(points, plane.normal, None)
-    return _area(frame.points(points)) > LEAST_SCALED_AREA
-
-
-def _area(places: Float64) -> float:
-    """Square metres that points (N, 3) cover, seen along z."""
-    return _occupied(places[:, :2], CELL) * CELL**2
+    return _occupied(frame.points(points)[:, :2], CELL) * CELL**2 > LEAST_SCALED_AREA
 
 
 def _occupied(points: Float64, side: float) -> int:
