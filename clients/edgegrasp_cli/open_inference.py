@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
-from types import SimpleNamespace
 from typing import Annotated, Any
 
 import grpc
@@ -23,7 +22,6 @@ from starlette.routing import Route
 from typer import Option
 
 from edgegrasp.oip import open_inference_pb2 as messages
-from edgegrasp.oip import open_inference_pb2_grpc as service
 from edgegrasp_camera.arrays import Array
 from edgegrasp_cli.flags import Server, takes_flags
 from edgegrasp_client import GraspClient, errors
@@ -200,12 +198,18 @@ def grpc_server(models: Models, address: str) -> Iterator[int]:
         "ModelMetadata": lambda asked, _: models.metadata(asked.name, asked.version),
         "ModelInfer": partial(_grpc_infer, models),
     }
-    methods = {name: partial(_grpc_answer, name, fields_of) for name, fields_of in calls.items()}
-    servicer: Any = SimpleNamespace(**methods)
+    handlers = {
+        name: grpc.unary_unary_rpc_method_handler(
+            partial(_grpc_answer, name, fields_of),
+            getattr(messages, f"{name}Request").FromString,
+            getattr(messages, f"{name}Response").SerializeToString,
+        )
+        for name, fields_of in calls.items()
+    }
+    service = grpc.method_handlers_generic_handler("inference.GRPCInferenceService", handlers)
     # Otherwise a second gateway at the port would get some of the calls.
     options = [("grpc.max_receive_message_length", MAX_BODY_BYTES), ("grpc.so_reuseport", 0)]
-    server = grpc.server(ThreadPoolExecutor(PARALLEL_CALLS), options=options)
-    service.add_GRPCInferenceServiceServicer_to_server(servicer, server)
+    server = grpc.server(ThreadPoolExecutor(PARALLEL_CALLS), [service], options=options)
     try:
         port = server.add_insecure_port(address)
     except RuntimeError as error:
