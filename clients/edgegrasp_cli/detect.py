@@ -103,7 +103,9 @@ def detect(
     fields = _options(options_file, options) | _robot_option(asked)
     _check_outputs(asked, fields)
     images = _depth_images(file, asked)
-    colors = None if asked.color is None else _colors(asked.color)
+    colors = None if asked.color is None else np.atleast_3d(pixels(asked.color))
+    if colors is not None:  # (H, W, 3); a grey image's are equal in all three
+        colors = colors[..., :3] if colors.shape[2] > 2 else colors[..., [0, 0, 0]]
     if asked.mask is not None:
         from edgegrasp_client import on_mask
 
@@ -275,12 +277,6 @@ def _depth_images(file: Path | None, asked: DetectFlags) -> "list[DepthImage] | 
         image |= {} if asked.depth_scale is None else {"depth_scale": asked.depth_scale}
         images.append(image)
     return images
-
-
-def _colors(file: Path) -> Any:
-    """The colours (H, W, 3) of an image file; a grey one's are equal in all three."""
-    values = np.atleast_3d(pixels(file))
-    return values[..., :3] if values.shape[2] > 2 else values[..., [0, 0, 0]]
 
 
 def _print_detection(detection: Any) -> None:
