@@ -198,12 +198,8 @@ async def test_an_agent_gets_the_joints_of_a_robot(dummy_server, folder, reaches
             found = answer(await agent.call_tool(DEPTH, call))
     assert planning.robot == robot | {"T_base_cloud": np.eye(4).ravel().tolist()}
     far = {"reachable": False}
-    near = {
-        "reachable": True,
-        "pregrasp_joints": [0.1235, -1.0],
-        "grasp_joints": [0.2469, -2.0],
-        "seconds": 2.5,
-    }
+    near = {"reachable": True, "seconds": 2.5}
+    near |= {"pregrasp_joints": [0.1235, -1.0], "grasp_joints": [0.2469, -2.0]}
     assert [grasp["arm"] for grasp in found["grasps"]] == [near if reaches else far, far]
     assert ("counts" in found) != reaches  # which say why no grasp is within reach
 

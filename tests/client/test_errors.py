@@ -175,23 +175,17 @@ def test_errors_of_proxies_and_other_servers_are_classified(row, transport, fail
     assert not client.ready() or code == 200
 
 
-@pytest.mark.parametrize("body", [[], {"grasps": [{}]}, {"grasps": 3}, {"detail": "Not Found"}])
-def test_json_of_another_server_is_a_protocol_error(
-    body: Any, make_client, monkeypatch, cloud
-) -> None:
-    put_in_place_of_http(monkeypatch, lambda request: httpx.Response(200, json=body))
-    client = make_client("http://elsewhere")
-    with pytest.raises(ProtocolError, match="not the answer of a grasp service"):
-        client.detect(cloud)
-
-
-def test_a_proxy_says_when_to_come_again(make_client, monkeypatch, cloud) -> None:
-    busy = httpx.Response(503, headers={"retry-after": "7"})
-    put_in_place_of_http(monkeypatch, lambda request: busy)
-    client = make_client("http://proxy", timeout=5)
+def test_answers_of_another_server_and_of_a_busy_proxy(make_client, monkeypatch, cloud) -> None:
+    answers = [httpx.Response(503, headers={"retry-after": "7"})]
+    put_in_place_of_http(monkeypatch, lambda request: answers[-1])
+    client = make_client("http://elsewhere", timeout=5)
     with pytest.raises(OverloadedError) as caught:
         client.detect(cloud)
     assert caught.value.retry_after == 7
+    for body in ([], {"grasps": [{}]}, {"grasps": 3}, {"detail": "Not Found"}):
+        answers.append(httpx.Response(200, json=body))
+        with pytest.raises(ProtocolError, match="not the answer of a grasp service"):
+            client.detect(cloud)
 
 
 @pytest.fixture(autouse=True)

@@ -424,13 +424,8 @@ def frame_only(turned: Turned) -> dict[str, object]:
 
 
 def found_plane(turned: Turned) -> dict[str, object]:
-    return {
-        "viewpoint": turned.point(*VIEW),
-        "up": turned.direction(0.0, 0.0, 1.0),
-        "support": {"kind": "ransac"},
-        "order": "highest",
-        "num_approach_points": 16,
-    }
+    plane = {"viewpoint": turned.point(*VIEW), "support": {"kind": "ransac"}}
+    return frame_only(turned) | plane | {"order": "highest"}
 
 
 @pytest.mark.parametrize("request_of", [constraints, frame_only, found_plane])
@@ -439,11 +434,9 @@ def test_a_turned_scene_has_the_same_grasps_turned(request_of, seed) -> None:
     still, turned = Turned(0), Turned(seed)
     still.turn, still.shift = Rotation.identity(), np.zeros(3)
     cloud = box_on_table(4000, table=request_of is found_plane)
-    here = detector().detect(
-        CloudInput(cloud.astype(np.float64)), DetectOptions.model_validate(request_of(still))
-    )
-    there = detector().detect(
-        CloudInput(turned.points(cloud)), DetectOptions.model_validate(request_of(turned))
+    here, there = (
+        detector().detect(way.points(cloud), DetectOptions.model_validate(request_of(way)))
+        for way in (still, turned)
     )
     assert len(here.grasps) >= 5
     for name, count in here.counts.items():  # a point on a border may fall on either side

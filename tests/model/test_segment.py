@@ -434,10 +434,8 @@ def test_a_mask_of_the_caller_wins() -> None:
 
 
 def test_segments_stand_on_what_lies_below_them_not_on_the_top_of_a_carton() -> None:
-    carton, small = (
-        box((-0.3, -0.3, 0.15), (0.4, 0.5, 0.15)),
-        box((0.3, 0.2, 0.05), (0.02, 0.02, 0.05)),
-    )
+    carton = box((-0.3, -0.3, 0.15), (0.4, 0.5, 0.15))
+    small = box((0.3, 0.2, 0.05), (0.02, 0.02, 0.05))
     boxes, pose = [small, carton, table(0.8, 0.7)], camera(0.9, -np.pi / 2, 0.9)
     segments = (seen_box(boxes, pose) == 0).astype(np.int32)
     found = detect(CloudInput(render(boxes, pose), segment_ids=segments))
