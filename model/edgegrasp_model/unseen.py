@@ -93,16 +93,14 @@ def leaves_image(
     places = np.stack(_palm_ways(gripper))  # (slices, S, 3)
     low, high = places.min(axis=(0, 1)), places.max(axis=(0, 1))
     P_image_hand = P_image_cloud @ T_cloud_hand.astype(np.float64)  # (E, 3, 4)
-
-    def outside(hands: Float64, points: Float32) -> Bools:
-        seen = hands[..., :3] @ points.swapaxes(-1, -2) + hands[..., 3:]
-        return np.asarray((np.abs(seen[..., :2, :]) > seen[..., 2:, :]).any(axis=-2))
-
-    # A hand whose box is within the image needs no closer look.
     corners = _grid(*zip(low, high, strict=True))
-    leaves: Bools = np.asarray(outside(P_image_hand, corners).any(axis=1))
-    share = outside(P_image_hand[leaves, None], places).mean(axis=2).max(axis=1)  # of a slice
-    leaves[leaves] = share > OUTSIDE_SHARE
+    seen = P_image_hand[:, :, :3] @ corners.T + P_image_hand[:, :, 3:]  # (E, 3, 8)
+    leaves: Bools = np.asarray((np.abs(seen[:, :2]) > seen[:, 2:]).any(axis=(1, 2)))
+    # A hand whose box is within the image needs no closer look.
+    hands = P_image_hand[leaves, None]
+    seen = hands[..., :3] @ places.swapaxes(1, 2) + hands[..., 3:]  # (L, slices, 3, S)
+    outside = (np.abs(seen[:, :, :2]) > seen[:, :, 2:]).any(axis=2)
+    leaves[leaves] = outside.mean(axis=2).max(axis=1) > OUTSIDE_SHARE
     return leaves
 
 
