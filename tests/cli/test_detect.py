@@ -96,9 +96,8 @@ def test_a_picture_shows_the_cloud_its_grasps_and_the_region(
     white = {name: (pixels.min(axis=2) > 250).mean() for name, pixels in pictures.items()}
     assert white["color"] > white["depth"]  # the mask's white is the image's
     assert 1 - white["cloud"] > 0.02
-    cyan = {
-        name: np.abs(pixels - (76, 201, 240)).max(axis=2) < 30 for name, pixels in pictures.items()
-    }
+    near = {name: np.abs(each - (76, 201, 240)).max(axis=2) for name, each in pictures.items()}
+    cyan = {name: apart < 30 for name, apart in near.items()}
     assert cyan["region"].sum() > 200 > cyan["cloud"].sum()
 
 

@@ -115,10 +115,10 @@ def test_a_package_missing_from_the_start_names_the_extra(missing, words, extra)
     assert f"pip install 'edgegrasp[{extra}]'" in said
 
 
-@pytest.mark.parametrize(
-    "words",
-    [("serve", "--http-port", 0, "--grpc-port", 0, "--robots", "fr3"), ("robot", "check", "fr3")],
-)
+SERVE = ("serve", "--http-port", 0, "--grpc-port", 0, "--robots", "fr3")
+
+
+@pytest.mark.parametrize("words", [SERVE, ("robot", "check", "fr3")])
 def test_arms_are_an_extra(words: tuple[object, ...], tmp_path: Path) -> None:
     absent = "raise ModuleNotFoundError('no arms', name='roboplan')"
     (tmp_path / "roboplan.py").write_text(absent)

@@ -109,11 +109,12 @@ def test_isaac_grasps_round_trip(cases, T_object_cloud, T_hand_gripper) -> None:
         assert each.pregrasp_cspace_position == {"thumb": 0.8 - 9.0 * width}
 
 
+def file() -> str:
+    return isaac_grasps([grasp(UP, 0.5)], object_frame="/World/mug #1", gripper_frame='"hand"')
+
+
 def test_an_isaac_file_says_what_the_format_asks_for() -> None:
-    text = isaac_grasps(
-        [grasp(UP, 0.5, 0.06)], object_frame="/World/mug #1", gripper_frame='"hand"'
-    )
-    assert text == (
+    assert file() == (
         "format: isaac_grasp\n"
         "format_version: 1.0\n"
         "object_frame_link: '/World/mug #1'\n"
@@ -167,7 +168,7 @@ grasps:
     ],
 )
 def test_what_is_no_isaac_file_is_refused(edit: tuple[str, str], message: str) -> None:
-    text = isaac_grasps([grasp(UP, 0.5)], object_frame="a", gripper_frame="b")
+    text = file()
     assert edit[0] in text
     with pytest.raises(ValueError, match=message):
         read_isaac_grasps(text.replace(*edit, 1))

@@ -133,7 +133,6 @@ def test_options_may_be_sequences_of_any_kind(client, cloud) -> None:
 
 
 SOME = np.zeros((40, 3), np.float32)
-CAMERA = {"fx": 60.0, "fy": 60.0, "cx": 2.0, "cy": 2.0}
 NEGATIVE = {"contact_region": {"include": [{"kind": "indices", "indices": [0, -1]}]}}
 
 
@@ -142,8 +141,7 @@ def mask(values: Any) -> dict[str, Any]:
 
 
 def image(**changes: Any) -> dict[str, Any]:
-    small = {"depth": np.full((4, 4), 0.3, np.float32), "intrinsics": CAMERA}
-    return {"depth_images": [depth_image(**small | changes)]}
+    return {"depth_images": [depth_image(**changes)]}
 
 
 OPTIONS: list[tuple[dict[str, Any], str]] = [

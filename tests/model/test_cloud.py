@@ -37,9 +37,8 @@ def test_holes_of_an_organised_cloud_are_dropped_with_all_that_belongs_to_them()
     organised[0, 1], organised[2, 3, 2] = np.nan, np.inf
     ids = np.arange(12).reshape(3, 4)
     normals = np.where(np.isfinite(organised), ids[..., None], np.nan)
-    checked = check_cloud(
-        CloudInput(organised, normals, segment_ids=ids, view_ids=ids.reshape(-1), colors=normals)
-    )
+    beside = {"segment_ids": ids, "view_ids": ids.reshape(-1), "colors": normals}
+    checked = check_cloud(CloudInput(organised, normals, **beside))
     kept = [row for row in range(12) if row not in (1, 11)]
     np.testing.assert_array_equal(checked.points, GOOD[kept])
     np.testing.assert_array_equal(checked.normals, np.repeat(kept, 3).reshape(-1, 3))

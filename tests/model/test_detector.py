@@ -179,9 +179,7 @@ def test_no_grasp_is_an_answer_that_says_why() -> None:
     assert detect(min_score=1.0).grasps == []
 
 
-@pytest.mark.parametrize(
-    ("mode", "returned"), [("avoid", False), ("penalise", True), ("ignore", True)]
-)
+@pytest.mark.parametrize(("mode", "returned"), [("avoid", 0), ("penalise", 1), ("ignore", 1)])
 def test_where_every_hand_collides_further_points_are_tried_and_hands_are_marked(mode, returned):
     collision = {"mode": mode, "obstacles": [WALL]}
     found = detect(collision=collision, num_approach_points=4, debug=True)

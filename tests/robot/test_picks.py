@@ -87,10 +87,8 @@ def test_the_hand_comes_to_the_grasp_and_limits_are_kept(robot, x, y, tilt):
         assert_pose(robot.hand_pose(plan.pregrasp_joints), before)
         motion = plan.trajectory
         assert motion is not None
-        np.testing.assert_allclose(
-            motion.positions[motion.pregrasp_row], plan.pregrasp_joints, atol=1e-6
-        )
-        np.testing.assert_allclose(motion.positions[motion.grasp_row], plan.grasp_joints, atol=1e-6)
+        rows = motion.positions[[motion.pregrasp_row, motion.grasp_row]]
+        np.testing.assert_allclose(rows, [plan.pregrasp_joints, plan.grasp_joints], atol=1e-6)
         assert_motion(robot, motion)
         for joints in motion.positions[motion.pregrasp_row : motion.grasp_row + 1]:
             off = robot.hand_pose(joints)[:3, 3] - T_base_hand[:3, 3]

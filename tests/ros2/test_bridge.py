@@ -108,11 +108,10 @@ def test_a_cloud_and_its_grasps_in_every_message(client, sent, make_cloud, cloud
         np.testing.assert_allclose(matrix(grasp.grasp_pose.pose), hand @ PANDA_LINK8, atol=1e-5)
         assert grasp.grasp_quality == pytest.approx(wanted.score)
         way = grasp.pre_grasp_approach.direction
+        direction = [way.vector.x, way.vector.y, way.vector.z]
+        np.testing.assert_allclose(direction, hand[:3, 2], atol=1e-5)
         for header in (way.header, grasp.grasp_pose.header):
             assert (header.frame_id, header.stamp.sec, header.stamp.nanosec) == ("base", 12, 345)
-        np.testing.assert_allclose(
-            [way.vector.x, way.vector.y, way.vector.z], hand[:3, 2], atol=1e-5
-        )
         assert grasp.pre_grasp_posture.points[0].positions.sum() == pytest.approx(wanted.width)
 
     fields = bridge.object_results(found, settings, "mug", most=2)
@@ -138,9 +137,8 @@ def test_the_first_pose_follows_its_object_from_message_to_message(real_server, 
             found = detect(client, scene, settings, tracker=tracker)
             poses = sent("geometry_msgs/msg/PoseArray", bridge.pose_array(found)).poses
             places.append(matrix(poses[0])[:3, 3])
-    np.testing.assert_allclose(
-        np.diff(places, axis=0), [(0, test_tracking.STEP, 0)] * 2, atol=0.003
-    )
+    steps = np.diff(places, axis=0)
+    np.testing.assert_allclose(steps, [(0, test_tracking.STEP, 0)] * 2, atol=0.003)
 
 
 def matrix(pose: Any) -> np.ndarray:
@@ -159,11 +157,8 @@ def test_a_depth_image_with_its_camera(client, make_image, camera, kind, encodin
     expected = client.detect(depth_images=[{"depth": depth, "intrinsics": MATRIX}]).grasps
     assert found.header["frame_id"] == "camera"
     assert bridge.trajectories(found) == []
-    np.testing.assert_allclose(
-        [grasp.T_cloud_hand for grasp in found.grasps],
-        [grasp.T_cloud_hand for grasp in expected],
-        atol=1e-6,
-    )
+    both = ([grasp.T_cloud_hand for grasp in grasps] for grasps in (found.grasps, expected))
+    np.testing.assert_allclose(*both, atol=1e-6)
 
 
 class Asked:
@@ -297,9 +292,8 @@ def test_every_option_is_a_parameter(client, make_cloud, cloud) -> None:
     assert options["workspace"]["max"] == [1, 1, 1]
     found = detect(client, Scene(make_cloud(cloud)), settings, options)
     assert len(found.grasps) == 2
-    wrong = options | {"top_k": "many"}
     with pytest.raises(InvalidRequestError, match="top_k"):
-        detect(client, Scene(make_cloud(cloud)), settings, wrong)
+        detect(client, Scene(make_cloud(cloud)), settings, options | {"top_k": "many"})
 
 
 def test_messages_that_cannot_be_used(client, sent, make_cloud, make_image, camera, cloud) -> None:
@@ -358,20 +352,14 @@ def test_the_best_pick_is_a_trajectory_of_the_arm(planning, sent, make_cloud, cl
         first = last
 
 
-def test_an_arm_is_where_it_is_before_the_first_scene(planning, make_cloud, cloud) -> None:
+def test_a_known_arm_is_where_it_is_before_a_scene(planning, make_cloud, cloud) -> None:
     """The cloud of an action's object may be the only one."""
     scene, options = Scene(joints={"a": 0.1, "b": 0.2}), {"robot": "arm"}
     detect(planning, scene, options=options, object_cloud=make_cloud(cloud))
     assert planning.given["robot"]["joints"] == [0.1, 0.2]
-
-
-@pytest.mark.parametrize(
-    ("name", "joints", "message"),
-    [("other", {}, "robots are arm"), ("arm", {"a": 0.1}, "joint_states: no position of 'b'")],
-)
-def test_an_arm_that_is_not_known_is_not_planned_for(
-    planning, make_cloud, cloud, name, joints, message
-) -> None:
-    scene = Scene(make_cloud(cloud), joints=joints)
-    with pytest.raises(ValueError, match=message):
-        detect(planning, scene, options={"robot": {"name": name}})
+    unknown, lacking = ("other", {}), ("arm", {"a": 0.1})
+    for (name, joints), said in ((unknown, "robots are arm"), (lacking, "no position of 'b'")):
+        with pytest.raises(ValueError, match=said):
+            detect(
+                planning, Scene(make_cloud(cloud), joints=joints), options={"robot": {"name": name}}
+            )

@@ -175,10 +175,9 @@ async def test_requests_and_results_of_streams_are_counted(running, cloud: np.nd
     assert found["edgegrasp_queue_depth", ()] == 0.0
     assert found["edgegrasp_requests_active", ()] == 0.0
     assert found["edgegrasp_ready", ()] == 1.0
-    info = [dict(labels) for name, labels in found if name == "edgegrasp_model_info"]
-    assert [(one["name"], one["default"], "digest" in one, one["device"]) for one in info] == [
-        ("dummy", "true", True, "cpu")
-    ]
+    (info,) = (dict(labels) for name, labels in found if name == "edgegrasp_model_info")
+    assert info.keys() >= {"name", "digest"}
+    assert (info["name"], info["default"], info["device"]) == ("dummy", "true", "cpu")
     requests = [StreamRequest(points) for points in (cloud, cloud[:0], cloud)]
     answers = [answer async for answer in running.ours("grpc").detect_stream(requests)]
     assert len(answers) == 3

@@ -9,17 +9,14 @@ import numpy as np
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 
 
-def request(name: str, points: np.ndarray, **options: Any) -> grasp_pb2.DetectGraspsStreamRequest:
-    detect = grasp_pb2.DetectGraspsRequest(
-        points=points.tobytes(), options=grasp_pb2.DetectOptions(**options)
-    )
-    return grasp_pb2.DetectGraspsStreamRequest(request_id=name, request=detect)
+def request(name: str, points: np.ndarray, timeout: float | None = None, **options: Any) -> Any:
+    detect = {"points": points.tobytes(), "options": options}
+    return grasp_pb2.DetectGraspsStreamRequest(request_id=name, request=detect, timeout=timeout)
 
 
 async def test_an_error_is_an_answer_and_the_stream_goes_on(running, cloud) -> None:
     stream = running.stub().DetectGraspsStream()
-    bad = request("negative", cloud)
-    bad.timeout = -1.0
+    bad = request("negative", cloud, timeout=-1.0)
     empty = grasp_pb2.DetectGraspsStreamRequest(request_id="empty")
     few = request("few", cloud[:5], num_approach_points=6)
     for message in (request("fine", cloud), empty, bad, few, request("again", cloud)):
@@ -40,9 +37,7 @@ async def test_an_error_is_an_answer_and_the_stream_goes_on(running, cloud) -> N
 async def test_a_request_of_a_stream_has_a_deadline_of_its_own(running, cloud) -> None:
     stream = running.stub().DetectGraspsStream()
     await running.hold(stream.write(request("patient", cloud)))
-    hasty = request("hasty", cloud)
-    hasty.timeout = 0.05
-    await stream.write(hasty)
+    await stream.write(request("hasty", cloud, timeout=0.05))
     await running.until(lambda: running.ended == ["deadline-exceeded"])
     running.stages.open("evaluate")
     assert (await stream.read()).WhichOneof("answer") == "detection"
