@@ -50,7 +50,7 @@ def add(
     try:
         check(output)
     except EdgeGraspError as error:
-        if not any(f": {field}: " in str(error) for field in TO_EDIT):
+        if getattr(error, "field", "") not in TO_EDIT:
             output.unlink()  # it needs other arguments, not an edit
         raise
     finally:

@@ -3,6 +3,7 @@
 import tomllib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import pairwise
@@ -38,7 +39,11 @@ Joints = Annotated[tuple[Finite, ...], Field(max_length=16)]
 
 
 class InvalidRobot(EdgeGraspError):  # noqa: N818
-    """A robot file cannot be used."""
+    """A robot file cannot be used: the field that is wrong, if it is one, and the fix."""
+
+    def __init__(self, field: str, said: object, file: str = "") -> None:
+        super().__init__(": ".join(filter(None, (file, field, str(said)))))
+        self.field, self.said = field, said
 
 
 class HandPose(Strict):
@@ -150,28 +155,29 @@ def load_robot(name_or_path: str | Path) -> Robot:
     if path.suffix != ".toml":
         path = ROBOT_FOLDER / f"{path.name}.toml"  # settings turn names into paths
     if not path.is_file():
-        raise InvalidRobot(
-            f"robot: got {str(name_or_path)!r}. Use one of {robot_names()} or a .toml file."
-        )
+        fix = f"Use one of {robot_names()} or a .toml file."
+        raise InvalidRobot("robot", f"got {str(name_or_path)!r}. {fix}")
     try:
         fields = tomllib.loads(path.read_text("utf-8", errors="replace"))
         return _load(path, RobotFile.model_validate(fields))
+    except InvalidRobot as error:
+        wrong = error
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        field = ".".join(map(str, first["loc"]))
-        raise InvalidRobot(f"{path.name}: {field}: {first['msg']}; see fr3.toml.") from None
+        wrong = InvalidRobot(".".join(map(str, first["loc"])), f"{first['msg']}; see fr3.toml.")
     except (InvalidGripper, tomllib.TOMLDecodeError) as error:
-        raise InvalidRobot(f"{path.name}: {error}") from None
+        wrong = InvalidRobot("", error)
     except (RuntimeError, ValueError) as error:
-        raise InvalidRobot(f"{path.name}: urdf: {error}") from None
+        wrong = InvalidRobot("urdf", error)
+    raise InvalidRobot(wrong.field, wrong.said, path.name)
 
 
 def _load(path: Path, file: RobotFile) -> Robot:
     packages = [str(path.parent / folder) for folder in file.packages]
     packages.append(str(get_package_share_dir()))
     urdf = _located(path, "urdf", file.urdf, packages)
-    root = _tree(path, "urdf", urdf)
-    joints = _chain(path, root, file)
+    root = _tree("urdf", urdf)
+    joints = _chain(root, file)
     joint_names = [str(joint.get("name")) for joint in joints]
     if not file.max_acceleration:
         file = file.model_copy(update={"max_acceleration": (CAREFUL,) * len(joints)})
@@ -179,7 +185,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
         given = getattr(file, field)
         if given and len(given) != len(joints):
             fix = f"The arm has {len(joints)} joints: {', '.join(joint_names)}."
-            raise InvalidRobot(f"{path.name}: {field}: got {len(given)} numbers. {fix}")
+            raise InvalidRobot(field, f"got {len(given)} numbers. {fix}")
     gripper_file = path.parent / file.gripper
     named = gripper_file if gripper_file.is_file() else file.gripper
     hand = GripperGeometry.model_validate(gripper_fields(named))
@@ -189,11 +195,11 @@ def _load(path: Path, file: RobotFile) -> Robot:
     _check_meshes(urdf, root, packages)
     arm = as_text(root)
     _add_hand(root, file, gripper)
-    _set_limits(path, root, joints, file)
+    _set_limits(root, joints, file)
     shaped = [link for link in root.findall("link") if link.find("collision") is not None]
     links = [str(link.get("name")) for link in shaped]
-    srdf = _located(path, "srdf", file.srdf, packages) if file.srdf else None
-    allowed = _allowed(_tree(path, "srdf", srdf) if srdf else None, links, beyond)
+    srdf = _tree("srdf", _located(path, "srdf", file.srdf, packages)) if file.srdf else root
+    allowed = _allowed(srdf, links, beyond)
     standing = [
         link for link in links if not any(one.get("type") in MOVING for one in _above(root, link))
     ]
@@ -202,8 +208,8 @@ def _load(path: Path, file: RobotFile) -> Robot:
     for name, link in zip(links, shaped, strict=True):
         shapes = link.findall("collision")
         if len(scenes[0].getCollisionGeometryIDs(name)) < len(shapes):  # the parser goes on without
-            fix = "Correct its size or scale."
-            raise InvalidRobot(f"{path.name}: urdf: a <collision> of {name} is wrong. {fix}")
+            said = f"a <collision> of {name} is wrong. Correct its size or scale."
+            raise InvalidRobot("urdf", said)
         for shape in shapes:
             link.remove(shape)
     bare = replace(model, urdf=as_text(root), allowed=[]).scene(file)
@@ -211,7 +217,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     home = np.array(file.home) if file.home else np.clip(0.0, lower, upper)
     if ((home < lower) | (home > upper)).any():
         fix = f"Give joints between {lower.tolist()} and {upper.tolist()}."
-        raise InvalidRobot(f"{path.name}: home: got {home.tolist()}. {fix}")
+        raise InvalidRobot("home", f"got {home.tolist()}. {fix}")
     robot = Robot(
         path.stem, gripper, hand, file.base_frame, file.flange_frame,
         scenes[0].forwardKinematics(home, HAND, file.flange_frame), joint_names, home, lower, upper,
@@ -221,7 +227,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     if scenes[0].hasCollisions(home):
         pair = touching(scenes[0], model, home)
         fix = "Name other joints, or the pair in the SRDF's disable_collisions"
-        raise InvalidRobot(f"{path.name}: home: {pair} touch there. {fix}.")
+        raise InvalidRobot("home", f"{pair} touch there. {fix}.")
     return robot
 
 
@@ -271,24 +277,24 @@ def _located(path: Path, field: str, name: str, packages: Sequence[str]) -> Path
     for place in places:
         if place.is_file():
             return place.absolute()
-    fix = "Name a file beside this one, or add the folder of its package to `packages`"
-    raise InvalidRobot(f"{path.name}: {field}: there is no {brief(name)}. {fix}.")
+    fix = f"Name a file beside {path.name}, or add the folder of its package to `packages`"
+    raise InvalidRobot(field, f"there is no {brief(name)}. {fix}.")
 
 
-def _tree(path: Path, field: str, file: Path) -> Element:
+def _tree(field: str, file: Path) -> Element:
     """The XML of a URDF or SRDF, xacro expanded with the defaults of its arguments."""
     try:
         text = file.read_text("utf-8")
         root = ElementTree.fromstring(text)
     except (ValueError, ElementTree.ParseError) as error:
-        raise InvalidRobot(f"{path.name}: {field}: {file.name} is not XML: {error}") from None
+        raise InvalidRobot(field, f"{file.name} is not XML: {error}") from None
     if "xacro:" not in text:
         return root
     try:
         return ElementTree.fromstring(xacro.process_file(str(file)).toxml())
     except (RuntimeError, xacro.XacroException) as error:
         fix = "Run xacro yourself, with the arguments that it needs, and name what it writes."
-        raise InvalidRobot(f"{path.name}: {field}: {error}. {fix}") from None
+        raise InvalidRobot(field, f"{error}. {fix}") from None
 
 
 def _link(joint: Element, which: str) -> str:
@@ -308,60 +314,57 @@ def _above(root: Element, link: str) -> list[Element]:
     return found
 
 
-def _chain(path: Path, root: Element, file: RobotFile) -> list[Element]:
+def _chain(root: Element, file: RobotFile) -> list[Element]:
     """The moving joints between base and flange, in order."""
     links = [str(link.get("name")) for link in root.findall("link")]
+    if not links:
+        raise InvalidRobot("urdf", "has no <link>. Name a file of a whole robot, not of macros.")
     for field in ("base_frame", "flange_frame"):
         if getattr(file, field) not in links:
             fix = f"Use a link of the URDF: {', '.join(links)}."
-            raise InvalidRobot(f"{path.name}: {field}: got {getattr(file, field)!r}. {fix}")
+            raise InvalidRobot(field, f"got {getattr(file, field)!r}. {fix}")
     above = _above(root, file.flange_frame)
     carrying = [file.flange_frame, *(_link(joint, "parent") for joint in above)]
     if file.base_frame not in carrying:
         fix = f"Name a link that carries {file.flange_frame!r}."
-        raise InvalidRobot(f"{path.name}: base_frame: got {file.base_frame!r}. {fix}")
+        raise InvalidRobot("base_frame", f"got {file.base_frame!r}. {fix}")
     between = above[: carrying.index(file.base_frame)]
     for joint in between:
-        _check_joint(path, joint)
+        _check_joint(joint)
     joints = [joint for joint in between if joint.get("type") in MOVING]
     if not joints:
-        raise InvalidRobot(f"{path.name}: flange_frame: no joint moves it. Name the last link.")
+        raise InvalidRobot("flange_frame", "no joint moves it. Name the last link.")
     return joints[::-1]
 
 
-def _check_joint(path: Path, joint: Element) -> None:
+def _check_joint(joint: Element) -> None:
     """Raise InvalidRobot for a joint of the arm that cannot be planned with."""
     kind, limit = joint.get("type"), joint.find("limit")
-    said = f"{path.name}: urdf: joint {joint.get('name')}"
+    said = f"joint {joint.get('name')}"
     if joint.find("mimic") is not None or kind not in (*MOVING, "fixed"):
         why = f"is {kind}" if joint.find("mimic") is None else "follows another one (mimic)"
         fix = f"Name a base and a flange between which joints are independent: {', '.join(MOVING)}."
-        raise InvalidRobot(f"{said} {why}. {fix}")
+        raise InvalidRobot("urdf", f"{said} {why}. {fix}")
     if kind in ("revolute", "prismatic"):
         ends = ["none" if limit is None else limit.get(end, "none") for end in ("lower", "upper")]
-        try:
-            usable = -np.inf < float(ends[0]) <= float(ends[1]) < np.inf
-        except ValueError:
-            usable = False
-        if not usable:
-            fix = "Give its <limit> both, lower below upper."
-            raise InvalidRobot(f"{said}: got limits {' and '.join(ends)}. {fix}")
+        with suppress(ValueError):
+            if -np.inf < float(ends[0]) <= float(ends[1]) < np.inf:
+                return
+        fix = "Give its <limit> both, lower below upper."
+        raise InvalidRobot("urdf", f"{said}: got limits {' and '.join(ends)}. {fix}")
 
 
 def _cut_beyond(root: Element, flange: str) -> set[str]:
-    """Remove the links beyond the flange and its own shape; the flange is named among them."""
+    """Keep links and joints as far as the flange, without its shape; names the links from it on."""
     names = [str(link.get("name")) for link in root.findall("link")]
     carriers = {name: [_link(joint, "parent") for joint in _above(root, name)] for name in names}
     beyond = {name for name in names if flange in (name, *carriers[name])}
     for part in list(root):
-        if part.tag == "link" and part.get("name") == flange:
-            for shape in [*part.findall("collision"), *part.findall("visual")]:
+        link = _link(part, "parent") if part.tag == "joint" else part.get("name")
+        if part.tag == "link" and link == flange:
+            for shape in part.findall("collision"):
                 part.remove(shape)
-        elif (
-            part.tag not in ("link", "joint", "material")
-            or (part.tag == "link" and part.get("name") in beyond)
-            or (part.tag == "joint" and _link(part, "parent") in beyond)
-        ):
+        elif part.tag not in ("link", "joint") or link in beyond:
             root.remove(part)
     return beyond
 
@@ -395,7 +398,7 @@ def _add_hand(root: Element, file: RobotFile, gripper: Gripper) -> None:
     ElementTree.SubElement(joint, "origin", xyz=place, rpy=_numbers(turn))
 
 
-def _set_limits(path: Path, root: Element, joints: Sequence[Element], file: RobotFile) -> None:
+def _set_limits(root: Element, joints: Sequence[Element], file: RobotFile) -> None:
     """Limit the joints' velocities and accelerations as the robot file does."""
     root.set("version", "1.2")  # of URDF, which has accelerations from then on
     limits = [limit for joint in joints for limit in joint.findall("limit")]
@@ -405,7 +408,7 @@ def _set_limits(path: Path, root: Element, joints: Sequence[Element], file: Robo
         most = [float(limit.get(name, "0")) for limit in limits]
         if min(most, default=1.0) <= 0.0:  # some exporters of URDFs write 0
             fix = "Give what each joint can do, above 0."
-            raise InvalidRobot(f"{path.name}: max_{name}: got {most}. {fix}")
+            raise InvalidRobot(f"max_{name}", f"got {most}. {fix}")
 
 
 def _numbers(values: ArrayLike) -> str:
@@ -421,10 +424,10 @@ def _check_meshes(urdf: Path, root: Element, packages: Sequence[str]) -> None:
             link.remove(visual)
 
 
-def _allowed(srdf: Element | None, links: Sequence[str], beyond: set[str]) -> list[tuple[str, str]]:
+def _allowed(srdf: Element, links: Sequence[str], beyond: set[str]) -> list[tuple[str, str]]:
     """Pairs of links that may touch; links beyond the flange count as the hand."""
     pairs = set()
-    for one in () if srdf is None else srdf.findall("disable_collisions"):
+    for one in srdf.findall("disable_collisions"):
         names = [str(one.get(which)) for which in ("link1", "link2")]
         first, second = sorted(HAND if name in beyond else name for name in names)
         if first != second and {first, second} <= set(links):

@@ -19,7 +19,9 @@ LINKS = ("--base", "base_link", "--flange", "tool0")
 
 def test_a_robot_file_of_a_urdf_loads(run, refused, tmp_path: Path) -> None:
     file = tmp_path / "mine.toml"
-    assert "got 'tool9'" in refused("robot", "add", UR5, *LINKS[:3], "tool9", "--output", file)
+    for unknown in ("tool9", "tool: home: 9"):  # the file goes again, whatever the name
+        said = refused("robot", "add", UR5, *LINKS[:3], unknown, "--output", file)
+        assert f"got '{unknown}'" in said
     shown = run("robot", "add", UR5, *LINKS, "--gripper", "robotiq-2f-85", "--output", file)
     assert "hand at home: 0.817 0.191" in shown
     assert load_robot(file).joint_names == load_robot("ur5").joint_names
