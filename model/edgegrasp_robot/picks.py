@@ -396,11 +396,9 @@ def _told(
         )
     if 2 in tiers:
         warnings.append("time ran out before the arm was planned for every grasp.")
-    names = ["on_arm", "hand_collision", "out_of_reach", "arm_collision", "reachable"]
-    if asked.place is not None:
-        names.insert(-1, "no_place")
+    names = "on_arm", "hand_collision", "out_of_reach", "arm_collision", "no_place", "reachable"
     counts = {name: n for name, n in detection.counts.items() if name != "returned"}
-    counts |= {name: outcomes[name] for name in names}
+    counts |= {name: outcomes[name] for name in names if asked.place or name != "no_place"}
     if asked.plan == "motion":
         counts["with_trajectory"] = moving
     counts["returned"] = len(grasps)
