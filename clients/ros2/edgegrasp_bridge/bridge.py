@@ -63,11 +63,10 @@ class Settings:
     @property
     def joints(self) -> conversions.FingerJoints:
         """The gripper's joints."""
-
-        def at(opening: float) -> tuple[float, ...]:
-            return (self.joint_closed + self.joint_per_metre * opening,) * len(self.joint_names)
-
-        return conversions.FingerJoints(self.joint_names, at)
+        closed, names = self.joint_closed, self.joint_names
+        return conversions.FingerJoints(
+            names, lambda opening: (closed + self.joint_per_metre * opening,) * len(names)
+        )
 
 
 def parameters() -> dict[str, Any]:
@@ -101,8 +100,7 @@ class Scene(NamedTuple):
     @property
     def header(self) -> Any:
         """The header of the message that the points come from; None before the first one."""
-        source = self.cloud if self.cloud is not None else self.depth
-        return None if source is None else source.header
+        return getattr(self.depth if self.cloud is None else self.cloud, "header", None)
 
 
 class Inbox:
@@ -319,8 +317,7 @@ def object_results(found: Found, settings: Settings, object_id: str = "", most: 
 def failed_result(object_id: str, why: Exception) -> Message:
     """Result of GenerateGrasps whose goal is aborted."""
     message = f"{type(why).__name__}: {why}"
-    failure = {"object_id": object_id, "success": False, "message": message, "candidates": []}
-    return {"results": [failure]}
+    return {"results": [{"object_id": object_id, "success": False, "message": message}]}
 
 
 def depth_array(image: Any) -> Array:

@@ -83,8 +83,7 @@ class EdgeGraspNode(Node):
         return bridge.read_parameters(dict(zip(names, values, strict=True)))
 
     def _take(self, field: str, message: Any) -> None:
-        mask_age = self.get_parameter("mask_age").value
-        new = self._inbox.take(field, message, mask_age)
+        new = self._inbox.take(field, message, self.get_parameter("mask_age").value)
         if new and self.get_parameter("on_message").value:
             self._news.trigger()
 
