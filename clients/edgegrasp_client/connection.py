@@ -15,7 +15,7 @@ from edgegrasp_client.errors import OverloadedError, ServerUnavailableError, inv
 DEFAULT_ADDRESS = "127.0.0.1:50051"
 HTTP_OVER_UNIX = "http+unix:"
 
-RETRIES = 4  # attempts for a server that is away; a busy one is retried until the timeout
+RETRIES = 8  # for a server that is away, as long as a restart takes; a busy one: until the timeout
 FIRST_DELAY, LONGEST_DELAY = 0.1, 2.0  # seconds; each is twice the one before
 STOP_SECONDS = 15.0  # for a local server to drain
 LONGEST_TIMEOUT = 1e6  # seconds; gRPC cannot count much longer ones
