@@ -24,6 +24,7 @@ from typing_extensions import Unpack
 from edgegrasp_camera.arrays import Array
 from edgegrasp_client.connection import (
     DEFAULT_ADDRESS,
+    FEW_RETRIES,
     RETRIES,
     Tls,
     is_rest,
@@ -81,7 +82,7 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
         tls: Tls | None = None,
     ) -> None:
         self._timeout = seconds_of(timeout)
-        self._retry, self._closed = retry, False
+        self._retry, self._closed, self._answered = retry, False, False
         kind: type[GrpcTransport | RestTransport]
         kind = RestTransport if is_rest(address) else GrpcTransport
         self._transport = kind(address, token, tls)
@@ -203,9 +204,12 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
         attempt = 0
         while True:
             try:
-                return await call(left)
+                answer = await call(left)
+                self._answered = True
+                return answer
             except ServerUnavailableError as error:
-                delay = retry_delay(error, attempt)
+                # A server that never answered is probably not there at all.
+                delay = retry_delay(error, attempt, RETRIES if self._answered else FEW_RETRIES)
                 if not self._retry or delay is None or time.monotonic() + delay >= end:
                     raise
                 # The request itself may have killed the worker, so it is retried only once.

@@ -15,7 +15,8 @@ from edgegrasp_client.errors import OverloadedError, ServerUnavailableError, inv
 DEFAULT_ADDRESS = "127.0.0.1:50051"
 HTTP_OVER_UNIX = "http+unix:"
 
-RETRIES = 8  # for a server that is away, as long as a restart takes; a busy one: until the timeout
+# Of a call while the server is away: as long as a restart takes, or before its first answer.
+RETRIES, FEW_RETRIES = 8, 4
 FIRST_DELAY, LONGEST_DELAY = 0.1, 2.0  # seconds; each is twice the one before
 STOP_SECONDS = 15.0  # for a local server to drain
 LONGEST_TIMEOUT = 1e6  # seconds; gRPC cannot count much longer ones
@@ -51,7 +52,7 @@ def seconds_of(timeout: float) -> float:
     return min(seconds, LONGEST_TIMEOUT)
 
 
-def retry_delay(error: ServerUnavailableError, attempt: int) -> float | None:
+def retry_delay(error: ServerUnavailableError, attempt: int, retries: int) -> float | None:
     """Seconds to wait after a failed attempt, counted from 0; None after the last one.
 
     Delays double and are randomised, so that clients refused together do not return together.
@@ -60,7 +61,7 @@ def retry_delay(error: ServerUnavailableError, attempt: int) -> float | None:
     jittered = random.uniform(longest / 2, longest)
     if isinstance(error, OverloadedError):
         return error.retry_after + jittered
-    return jittered if attempt < RETRIES else None
+    return jittered if attempt < retries else None
 
 
 def token_metadata(token: str | None) -> tuple[tuple[str, str], ...]:
