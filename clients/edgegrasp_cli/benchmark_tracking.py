@@ -176,8 +176,8 @@ def benchmark_tracking(
 ) -> None:
     """Follow a grasp at 30 images a second, then execute it in simulation.
 
-    The scene moves on while an answer is computed, and images that come meanwhile are dropped. An
-    answer takes the processor's time of this process; with --server, the time until it is there.
+    The scene moves on while an answer is computed, and images that arrive meanwhile are dropped.
+    An answer takes the processor time of its computation; with --server, the time until it arrives.
     """
     names = motion or (["still"] if scenes else list(MOTIONS))
     if unknown := [name for name in names if name not in MOTIONS]:

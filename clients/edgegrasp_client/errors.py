@@ -97,6 +97,12 @@ def error_of_kind(
     return error(message)
 
 
+def unreachable(address: str, why: str) -> ServerUnavailableError:
+    """The exception for a call whose connection was not made or broke."""
+    hint = "Check the address, and that `edgegrasp serve` runs there."
+    return ServerUnavailableError(f"No connection to {address} ({why}). {hint}")
+
+
 def invalid(field: str, value: str, fix: str) -> InvalidRequestError:
     """The exception for a request that the client refuses before sending it."""
     return InvalidRequestError(f"{field}: got {value}. {fix}", field, value, fix)

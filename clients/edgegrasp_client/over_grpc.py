@@ -48,7 +48,6 @@ _BY_CODE: dict[grpc.StatusCode, type[GraspClientError]] = {
     grpc.StatusCode.RESOURCE_EXHAUSTED: errors.PayloadTooLargeError,
     grpc.StatusCode.UNAUTHENTICATED: errors.AccessDeniedError,
     grpc.StatusCode.PERMISSION_DENIED: errors.AccessDeniedError,
-    grpc.StatusCode.UNAVAILABLE: errors.ServerUnavailableError,
     grpc.StatusCode.CANCELLED: errors.ServerUnavailableError,
     grpc.StatusCode.INTERNAL: errors.ServerUnavailableError,  # of a proxy; ours send more detail
     grpc.StatusCode.UNKNOWN: errors.ServerFailedError,
@@ -59,6 +58,7 @@ class GrpcTransport:
     """Calls over one channel; raises GraspClientErrors."""
 
     def __init__(self, address: str, token: str | None, tls: Tls | None) -> None:
+        self._address = address
         if tls is None:
             self._channel = grpc.aio.insecure_channel(address, CHANNEL_OPTIONS)
         else:
@@ -114,7 +114,7 @@ class GrpcTransport:
                     error = _described(answer.error.message, answer.error.detail)
                     yield StreamAnswer(answer.request_id, error=error)
         except grpc.RpcError as error:
-            raise _error_of(error) from None
+            raise _error_of(error, self._address) from None
         finally:
             call.cancel()
         if failed:
@@ -143,7 +143,7 @@ class GrpcTransport:
         try:
             return await method(request, timeout=timeout, metadata=self._metadata)
         except grpc.RpcError as error:
-            raise _error_of(error) from None
+            raise _error_of(error, self._address) from None
 
 
 # Answers
@@ -155,13 +155,15 @@ def read_field(message: Message, name: str) -> Any:
     return None if absent else getattr(message, name)
 
 
-def _error_of(error: Any) -> GraspClientError:
+def _error_of(error: Any, address: str) -> GraspClientError:
     """The exception for a failed call, as the server describes it or by its status code."""
     code, message = error.code(), error.details() or ""
     metadata = dict(error.trailing_metadata() or ())
     try:
         detail = grasp_pb2.ErrorDetail.FromString(metadata[ERROR_METADATA])
     except (DecodeError, KeyError):
+        if code == grpc.StatusCode.UNAVAILABLE:
+            return errors.unreachable(address, message)
         return _BY_CODE.get(code, errors.ProtocolError)(f"{code.name}: {message}")
     return _described(message, detail)
 

@@ -100,8 +100,7 @@ class RestTransport:
         except httpx.TimeoutException as error:
             raise errors.DeadlineError(f"No answer in time ({type(error).__name__}).") from None
         except (httpx.HTTPError, RuntimeError) as error:  # the latter of a closed client
-            why = f"No connection to {self._address}: {error or type(error).__name__}"
-            raise errors.ServerUnavailableError(why) from None
+            raise errors.unreachable(self._address, str(error) or type(error).__name__) from None
         try:
             body = response.json()
         except ValueError:

@@ -233,9 +233,10 @@ def test_requests_of_a_stream_are_sent_once(failing, cloud) -> None:
 
 @pytest.mark.parametrize("scheme", ["", "http://"])
 def test_without_a_server_calls_fail_and_waiting_ends(scheme: str, make_client, cloud) -> None:
-    client = make_client(f"{scheme}127.0.0.1:{free_ports(1)[0]}")
+    address = f"{scheme}127.0.0.1:{free_ports(1)[0]}"
+    client = make_client(address)
     for call in (client.models, lambda: client.detect(cloud)):
-        with pytest.raises(ServerUnavailableError):
+        with pytest.raises(ServerUnavailableError, match=f"{address} .*`edgegrasp serve`"):
             call()
     assert not client.ready()
     with pytest.raises(DeadlineError, match=r"not ready within 0\.2 s"):

@@ -143,7 +143,7 @@ def choose_support(
         if found is None:
             warnings.append(
                 "no support plane is seen: objects are returned without one, and hands may reach "
-                "under them. Send support or up."
+                "under them. Send support, or up in the cloud's frame."
             )
     if found is not None and seen.viewpoint is not None and found.plane.heights(seen.viewpoint) < 0:
         warnings.append(
