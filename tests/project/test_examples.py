@@ -98,7 +98,7 @@ def test_pick_and_place(real_server) -> None:
     pytest.importorskip("pybullet", reason="pybullet is not installed")
     pytest.importorskip("roboplan", reason="the extra robot is not installed")
     shown = example("pick_and_place.py", real_server.grpc_address)
-    inside = re.search(r"(\d) of 4 objects in the tray", shown)
+    inside = re.search(r"(\d) of 3 objects in the tray", shown)
     assert inside is not None
     assert int(inside[1]) >= 2
 

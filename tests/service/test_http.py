@@ -29,6 +29,7 @@ async def test_the_front_page_is_the_playground_or_that_of_the_api(serve, tmp_pa
         front = await http.get("/", follow_redirects=True)
         assert front.url.path == path
         assert "default-src 'none'" in front.headers["content-security-policy"] or not playground
+        assert (await http.get("/playground", follow_redirects=True)).status_code == status
         assert (await http.get("/playground/")).status_code == status
     with pytest.raises(InvalidSettings, match=r"samples: got '.*none', which is not a folder"):
         await serve(samples=tmp_path / "none")

@@ -241,6 +241,7 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
             if not folder.is_dir():
                 raise InvalidSettings(f"samples: got {str(folder)!r}, which is not a folder.")
             routes.append(Mount(f"{PLAYGROUND}samples", StaticFiles(directory=folder)))
+        routes.append(Route(PLAYGROUND.rstrip("/"), index, methods=["GET"]))
         routes.append(_file(PLAYGROUND, PLAYGROUND_FILES / "index.html"))
         routes += _files(PLAYGROUND, PLAYGROUND_FILES)
     return Router(routes, redirect_slashes=False)
