@@ -741,8 +741,8 @@ class DetectOptions(Strict):
     )
     order: Literal["score", "highest", "clearance"] = Field(
         default="score",
-        description="score: first one grasp of each object that has one of 0.5 or more, top-down "
-        "if hardly worse; then by score, and by the pose of the hand where scores are close. "
+        description="score: first, for each object with a grasp of 0.5 or more, one surrounded by "
+        "other good ones; then by score, and by the pose of the hand where scores are close. "
         "highest: scores of 0.9 or more by height of the TCP along up, then the others by score. "
         "clearance: by clearance",
     )

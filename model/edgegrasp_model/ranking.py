@@ -2,16 +2,18 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Array, Bools, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import FINGER_CLEARANCE, clearances, met_first
 from edgegrasp_model.candidates.edge_grasps import Candidates
-from edgegrasp_model.candidates.sample import CODE, Sample, smallest_rectangle
+from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import mean_of_alike, non_max_suppression
 from edgegrasp_model.options import DetectOptions
@@ -26,7 +28,6 @@ SURE_SCORE = 0.9  # score from which the order `highest` goes by height (the pap
 HIDDEN = 0.004  # metres of unseen space into which an object may extend
 FLAT = 0.012  # metres of visible height below which the support may block grasps
 DRAWBACK, FAR = 0.02, 0.1  # of a rating; metres from an object's middle
-AS_GOOD = 0.02  # of a rating, by which a top-down grasp may be worse than the best
 # Best hands that are compared; weight of the logarithm of how many good ones are around each; loss
 # of rating by which a good one counts 1/e as much.
 BEST, SURROUNDED, LESS = 100, 0.1, 0.02
@@ -85,10 +86,8 @@ def select(
     order, dropped = order[good], order[:0]
     counts["above_min_score"] = len(order)
     if options.order == "score":
-        number = scene.object_of_point[contact]
-        surrounded = surrounded_first(order, worth, T_cloud_tcp)
-        liked = steady_first(order, surrounded, worth, candidates, number)
-        order = objects_first(order, liked, rating, number)
+        liked = surrounded_first(order, worth, T_cloud_tcp)
+        order = objects_first(order, liked, rating, scene.object_of_point[contact])
     if (rule := options.suppression) is not None:
         near = rule.translation, rule.rotation
         order, dropped = non_max_suppression(T_cloud_tcp, order, *near, options.top_k)
@@ -96,24 +95,6 @@ def select(
     outcome[dropped], outcome[order] = CODE[Outcome.SUPPRESSED], CODE[Outcome.RETURNED]
     counts["suppressed"], counts["returned"] = len(dropped), len(order)
     return order, outcome
-
-
-def steady_first(
-    order: Int64, surrounded: Int64, worth: Floats, candidates: Candidates, number: Int64
-) -> Int64:
-    """The rows `order`, the first of each object (E,) replaced by one that noise hardly moves.
-
-    That is a top-down grasp if one is as good, else the object's first one in `surrounded`.
-    """
-    liked = order.copy()
-    _, place, row = np.unique(number[order], return_index=True, return_inverse=True)
-    liked[place] = surrounded[np.unique(number[surrounded], return_index=True)[1]]
-    as_good = worth[order] >= worth[order[place]][row] - AS_GOOD
-    as_good &= candidates.pair[order] < 0  # top-down
-    found, which = order[as_good], row[as_good]
-    last = np.argsort(candidates.pair[found], kind="stable")  # the preferred ones overwrite others
-    liked[place[which[last]]] = found[last]
-    return liked
 
 
 def surrounded_first(order: Int64, worth: Floats, T_cloud_tcp: Floats) -> Int64:
@@ -242,13 +223,7 @@ def detected_objects(
     objects = []
     for row in np.argsort(-count, kind="stable"):
         which = int(number[row])
-        points = scene.cloud.points[scene.object_of_point == which].astype(np.float64)
-        axes, middle, size = smallest_rectangle(points[:, :2])
-        bottom, top = points[:, 2].min(), points[:, 2].max()
-        T_canonical_box = np.eye(4)
-        T_canonical_box[:2, :2], T_canonical_box[:3, 3] = axes.T, [*middle, (bottom + top) / 2]
-        T_cloud_box = scene.frame.poses_in_cloud(T_canonical_box)
-        half = np.array([*size, top - bottom], dtype=np.float32) / np.float32(2)
+        T_cloud_box, half = _upright_box(scene, scene.object_of_point == which)
         turn = Rotation.from_matrix(T_cloud_box[:3, :3])
         good = best.get(which, 0.0) >= GOOD_SCORE
         objects.append(
@@ -294,6 +269,30 @@ def _why(
     met = met_first(scene.cloud, hands, gripper)
     hidden = _far_side_hidden(scene, hands, met, gripper)
     return Ungraspable.HIDDEN if hidden.mean() > 0.5 else None
+
+
+def _upright_box(scene: Scene, held: Bools) -> tuple[Float32, Float32]:
+    """Pose T_cloud_box (4, 4) and half extents (3,) of the smallest upright box around points."""
+    points = scene.cloud.points[held].astype(np.float64)
+    corners = plan = points[:, :2]
+    with suppress(QhullError, ValueError):  # too few points, or all on a line
+        corners = plan[ConvexHull(plan).vertices]
+    edges = np.roll(corners, -1, axis=0) - corners
+    edges = edges[np.linalg.norm(edges, axis=1) > 0] if len(corners) > 1 else edges[:0]
+    edges = np.concatenate([edges, [[1.0, 0.0]]])
+    edges /= np.linalg.norm(edges, axis=1, keepdims=True)
+    # The smallest rectangle around them has a side along an edge of their hull.
+    axes = np.stack([edges, np.stack([-edges[:, 1], edges[:, 0]], axis=1)], axis=1)  # (K, 2, 2)
+    turned = np.einsum("kad,cd->kca", axes, corners)
+    size = np.ptp(turned, axis=1)
+    best = int(size.prod(axis=1).argmin())
+    bottom, top = points[:, 2].min(), points[:, 2].max()
+    T_canonical_box = np.eye(4)
+    T_canonical_box[:2, :2] = axes[best].T
+    middle = axes[best].T @ (turned[best].min(axis=0) + size[best] / 2)
+    T_canonical_box[:3, 3] = [*middle, (bottom + top) / 2]
+    half: Float32 = np.array([*size[best], top - bottom], dtype=np.float32) / np.float32(2)
+    return scene.frame.poses_in_cloud(T_canonical_box), half
 
 
 def debug_info(

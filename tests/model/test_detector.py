@@ -1,7 +1,6 @@
 """A cloud in, ranked grasps out; and the catalogue of models."""
 
 from collections import Counter
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +10,13 @@ from tests.checks import refusal
 
 from edgegrasp_camera.depth import DepthView, Intrinsics, fuse_depth_images
 from edgegrasp_model.candidates.collision import collides
-from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue, choose_device
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, UnknownModel
 from edgegrasp_model.kernels import mean_of_alike
 from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, parse_options
-from edgegrasp_model.ranking import steady_first, surrounded_first
+from edgegrasp_model.ranking import surrounded_first
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene import network
 from edgegrasp_model.scene.cloud import CloudInput
@@ -359,31 +357,6 @@ def test_a_hand_among_good_ones_comes_before_a_lone_one_that_is_hardly_better() 
     for lone, first in ((0.92, 1), (0.99, 3)):
         worth = np.array([0.9, 0.91, 0.9, lone])
         assert surrounded_first(order, worth, poses)[0] == first
-
-
-@pytest.mark.parametrize(("worth", "first"), [(0.94, 1), (0.92, 3)])
-def test_a_top_down_grasp_comes_first_if_it_is_hardly_worse(worth: float, first: int) -> None:
-    rows = np.arange(5)
-    pair = np.array([-2, -1, 0, 0, 0])  # the second is preferred to the first
-    poses = hands([0.0] * 5, [0.0] * 5)
-    candidates = Candidates(pair, rows, rows, *np.zeros((2, 5), np.float32), poses)
-    rating, number = np.array([worth, worth, 0.7, 0.95, 0.99]), np.array([0, 0, 1, 0, 2])
-    order = np.array([4, 3, 0, 1, 2])
-    liked = steady_first(order, order, rating, candidates, number)
-    assert liked[:2].tolist() == [4, first]
-
-
-def test_new_noise_mostly_keeps_the_first_grasp_of_an_object(catalogue: ModelCatalogue) -> None:
-    network, kept = catalogue.get("edgegrasp-plus"), []
-    for number, one in enumerate(boxes_on_table(3)):
-        pose = camera(0.6, -1.3 - number, 0.8)
-        views = [render([table(), one], pose, seed) for seed in range(4)]
-        hands = [network.detect(view).grasps[0].T_cloud_tcp for view in views]
-        for first, second in combinations(hands, 2):
-            near = np.linalg.norm(first[:3, 3] - second[:3, 3]) < 0.02
-            cosine = np.abs((first[:3, 1:3] * second[:3, 1:3]).sum(axis=0))  # of either half turn
-            kept.append(near and cosine.min() > np.cos(np.radians(10)))
-    assert np.mean(kept) > 0.9
 
 
 # Grasps across an outline: seen from straight above, where no side of an object is seen.

@@ -88,7 +88,7 @@ def crop_balls(
 class Candidates:
     """Edge grasps of one cloud (paper section III)."""
 
-    pair: Int64  # (E,) which of the given pairs of points; below 0: a top-down grasp
+    pair: Int64  # (E,) which of the given pairs of points
     approach_index: Int64  # (E,) p_a, rows of the cloud
     contact_index: Int64  # (E,) p_c, rows of the cloud
     depth: Float32  # (E,) d, metres the contact lies ahead of the approach point
@@ -352,10 +352,10 @@ def outline_grasps(
     pose[:, 3, 3] = 1.0
     depth = np.maximum(edge[2][row], 0.0)
     hands = Candidates(pair[row], approach[row], contact, depth, width, pose)
-    return inserted(points, hands, support, gripper, margin)
+    return _inserted(points, hands, support, gripper, margin)
 
 
-def inserted(
+def _inserted(
     points: Float32,
     candidates: Candidates,
     support: SupportPlane | None,

@@ -2,26 +2,20 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import ConvexHull, QhullError
 
-from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
+from edgegrasp_camera.arrays import Bools, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.candidates.edge_grasps import (
-    EDGE_MARGIN,
-    GAP,
     Candidates,
     centred_grasps,
     crop_balls,
     edge_grasps,
-    inserted,
     outline_grasps,
     outlines,
     retract,
@@ -46,14 +40,6 @@ PRESET_ANGLE = math.radians(30)  # between a hand's direction and straight down,
 MIN_APPROACH_UP = -0.1  # where nothing is asked for: cosine of the outward approach and up
 NOTHING = np.empty(0, dtype=np.int64)
 APPROACH_STREAM, CANDIDATE_STREAM = 0, 1  # random streams of one request
-# Of top-down grasps:
-FEWEST = 20  # points of an object
-ELONGATED = 1.25  # length over width from which an object has a short side
-ACROSS_SIGHT, ALONG_SIGHT = np.array([0.0, 1.0]), np.array([1.0, 0.0])  # x points to the camera
-FRONT = 0.01  # metres behind the point nearest to the camera: these points are its front
-RIM = 0.02, 0.006  # metres behind the front and below the highest point there, at most
-TOP = 95  # percentile of heights that counts as the highest point
-END = 0.005  # metres from where a finger touches
 
 
 @dataclass(frozen=True)
@@ -136,9 +122,8 @@ class Sampler:
         new = free | (options.collision.mode != "avoid")
         new[new] = different(drawn.T_cloud_hand[row[new]], free[new], self.gripper, options)
         most = options.num_candidates - self.counts["scored"]
-        first = int((drawn.pair[row[free & new]] < 0).sum())  # top-down grasps
         clear = np.flatnonzero(new & (free | (options.collision.mode == "ignore")))
-        scored = clear[random_rows(len(clear), most, self._rng, first)]
+        scored = clear[random_rows(len(clear), most, self._rng)]
         if options.collision.mode == "penalise":  # then those that collide
             hit = np.flatnonzero(new & ~free)
             rest = random_rows(len(hit), most - len(scored), self._rng)
@@ -184,9 +169,6 @@ class Sampler:
                 for each in outlines(points, scene.viewpoints, contacts, leaning=leaning)
             ]
             candidates = Candidates.concatenate([candidates, *across])
-        if self.sees_hands and self._round == 1:  # first, so that none is left out
-            top_down = top_down_grasps(scene, gripper, margin)
-            candidates = Candidates.concatenate([top_down, candidates])
         self.counts["candidates"] += len(candidates)
         outcome = np.full(len(candidates), CODE[Outcome.RETURNED])
         if scene.support is not None:
@@ -204,8 +186,7 @@ class Sampler:
         rule = self.options.collision
         passed = np.flatnonzero(outcome == CODE[Outcome.RETURNED])
         most = OVERSAMPLING * self.options.num_candidates
-        first = int((candidates.pair[passed] < 0).sum())  # top-down grasps
-        row = passed[random_rows(len(passed), most, self._rng, first)]
+        row = passed[random_rows(len(passed), most, self._rng)]
         outcome[passed] = CODE[Outcome.NOT_CHECKED]
         checked = candidates.take(row)
         hands = checked.T_cloud_hand, checked.opening
@@ -246,13 +227,11 @@ def different(
     return kept
 
 
-def random_rows(size: int, limit: int, rng: np.random.Generator, first: int = 0) -> Int64:
-    """Ascending rows of at most `limit` out of `size`; up to a quarter are the `first` ones."""
+def random_rows(size: int, limit: int, rng: np.random.Generator) -> Int64:
+    """Ascending rows of at most `limit` out of `size`."""
     if size <= limit:
         return np.arange(size, dtype=np.int64)
-    first = min(first, limit // 4)
-    others = first + np.sort(rng.choice(size - first, limit - first, replace=False))
-    return np.concatenate([np.arange(first), others]).astype(np.int64)
+    return np.sort(rng.choice(size, limit, replace=False)).astype(np.int64)
 
 
 def allowed_directions(
@@ -273,103 +252,3 @@ def allowed_directions(
     if constraint.preset == "side":
         allowed |= np.abs(rise) <= math.sin(PRESET_ANGLE)
     return allowed
-
-
-# Top-down grasps
-
-
-def top_down_grasps(scene: Scene, gripper: Gripper, margin: float = 0.0) -> Candidates:
-    """Hands that move straight down, up to four on each object, as deep as those across outlines.
-
-    They close across the short side, across and along the camera's line of sight, and across the
-    front rim. `pair` is -1, -2, -3 or -4, in this order: the first are preferred. They follow from
-    all points of an object, so that new noise hardly moves them; sampled hands differ from image to
-    image.
-    """
-    found: list[tuple[int, np.int64, np.int64, float, Float32]] = []
-    for number in np.unique(scene.object_of_point[scene.object_of_point >= 0]):
-        rows = np.flatnonzero(scene.object_of_point == number)
-        points = scene.cloud.points[rows].astype(np.float64)
-        for pair, held in _between_pads(points, gripper.pad_half_width):
-            top, height = held.middle[2], points[:, 2]
-            approach = held.strip & scene.approach_allowed[rows]
-            contact = held.strip & scene.contact_allowed[rows] & (height > top - END)
-            narrow = held.width < gripper.max_opening - 2 * EDGE_MARGIN
-            if not (narrow and approach.any() and contact.any()):
-                continue
-            away = np.linalg.norm(points - held.middle, axis=1)
-            beside = np.abs(points[:, :2] @ held.way - held.last) + (top - height).clip(0.0)
-            a = rows[np.where(approach, away, np.inf).argmin()]
-            c = rows[np.where(contact, beside, np.inf).argmin()]
-            y, pose = np.append(held.way, 0.0), np.eye(4, dtype=np.float32)
-            pose[:3, :3] = np.stack([np.cross(y, -UP), y, -UP], axis=1)
-            pose[:3, 3] = held.middle + gripper.contact_z * UP
-            found.append((pair, a, c, held.width, pose))
-    if not found:
-        return Candidates.none()
-    pairs, on_axis, touched, width, poses = map(np.array, zip(*found, strict=True))
-    depth = (scene.cloud.points[on_axis, 2] - scene.cloud.points[touched, 2]).clip(0.0)
-    hands = Candidates(pairs, on_axis, touched, depth, width.astype(np.float32), poses)
-    return inserted(scene.cloud.points, hands, scene.support, gripper, margin)
-
-
-class _Held(NamedTuple):
-    """What pads close on."""
-
-    way: Float64  # (2,) unit, the closing direction
-    strip: Bools  # (P,) points of the object between the pads
-    middle: Float64  # (3,) between the fingers, as high as the higher touched point
-    width: float  # metres
-    last: float  # metres along the closing direction, where one finger touches
-
-
-def _between_pads(points: Float64, half: float) -> Iterator[tuple[int, _Held]]:
-    """What pads of a half width close on in each way at an object's points (P, 3), by `pair`."""
-    if len(points) < FEWEST:
-        return
-    plan, height = points[:, :2], points[:, 2]
-    axes, middle, size = smallest_rectangle(plan)
-    short = axes[size.argmin()] if size.max() > ELONGATED * size.min() else None
-    for pair, way in ((-1, short), (-2, ACROSS_SIGHT), (-3, ALONG_SIGHT), (-4, ALONG_SIGHT)):
-        if way is None:
-            continue
-        across, rim = np.array([-way[1], way[0]]), pair == -4
-        along, aside = plan @ way, plan @ across
-        centre = middle @ across
-        if rim:
-            centre = float(np.median(aside[along > along.max() - FRONT]))
-        strip = np.abs(aside - centre) < half
-        if rim:
-            strip &= along > along[strip].max(initial=-np.inf) - RIM[0]
-        if not strip.any():
-            continue
-        top = float(np.percentile(height[strip], TOP))
-        if rim:
-            strip &= height > top - RIM[1]
-        reach = np.sort(along[strip])[::-1]
-        if rim and (gaps := np.flatnonzero(-np.diff(reach) > GAP)).size:
-            reach = reach[: gaps[0] + 1]
-        first, last = float(reach[-1]), float(reach[0])
-        level = way * (first + last) / 2 + across * centre
-        # A round object is touched below its top.
-        ends = [strip & (np.abs(along - end) < END) for end in (first, last)]
-        top = max(float(np.percentile(height[end], TOP)) for end in ends)
-        yield pair, _Held(way, strip, np.append(level, top), last - first, last)
-
-
-def smallest_rectangle(plan: Float64) -> tuple[Float64, Float64, Float64]:
-    """The smallest rectangle around points (N, 2): its axes (2, 2), middle (2,) and size (2,)."""
-    corners = plan
-    with suppress(QhullError, ValueError):  # too few points, or all on a line
-        corners = plan[ConvexHull(plan).vertices]
-    edges = np.roll(corners, -1, axis=0) - corners
-    edges = edges[np.linalg.norm(edges, axis=1) > 0] if len(corners) > 1 else edges[:0]
-    edges = np.concatenate([edges, [[1.0, 0.0]]])
-    edges /= np.linalg.norm(edges, axis=1, keepdims=True)
-    # It has a side along an edge of their hull.
-    axes = np.stack([edges, np.stack([-edges[:, 1], edges[:, 0]], axis=1)], axis=1)  # (K, 2, 2)
-    turned = np.einsum("kad,cd->kca", axes, corners)
-    size = np.ptp(turned, axis=1)
-    best = int(size.prod(axis=1).argmin())
-    middle = axes[best].T @ (turned[best].min(axis=0) + size[best] / 2)
-    return axes[best], middle, size[best]
