@@ -65,7 +65,7 @@ def test_training_pauses_goes_on_and_is_recalibrated(data, run, tmp_path) -> Non
         (("benchmark", "--ray", "10.0.0.1:6379"), "pass --server"),
         (("benchmark", "--model", "absent.safetensors"), "no such file"),
         (("benchmark", "--model", "a.safetensors", "--server", ":1"), "server's own weights"),
-        (("benchmark", "--server", "127.0.0.1:1"), "UNAVAILABLE"),
+        (("benchmark", "--server", "127.0.0.1:1"), "`edgegrasp serve`"),
         (("benchmark", "--planner", "json:loads", "--gate", "gone.json"), "gone.json"),
         (("benchmark-tracking", "--motion", "fast"), "Choose one of still, pushed"),
     ],
