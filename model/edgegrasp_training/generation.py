@@ -131,7 +131,8 @@ def generate(
         )
     made = folder / f"seed_{options.seed}.json"
     given = options.model_dump(mode="json", exclude={"scenes", "views_per_scene"})
-    before = json.loads(made.read_text()) if made.is_file() else given
+    begun = made.is_file() and any(folder.glob(f"*_{options.seed}-*.npz"))
+    before = json.loads(made.read_text()) if begun else given
     if changed := [name for name, value in given.items() if before.get(name) != value]:
         raise ValueError(
             f"{', '.join(changed)}: {folder} holds scenes of seed {options.seed} that were made "

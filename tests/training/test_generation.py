@@ -84,6 +84,10 @@ def test_labels_of_two_engines_are_not_mixed(data: Path) -> None:
 
 def test_scenes_of_a_seed_are_all_made_with_the_same_options(tmp_path: Path) -> None:
     asked = {"scene": "packed", "views_per_scene": 1, "grasps_per_view": 4}
+    next(generate(tmp_path / "none", None, small(**asked)))
+    for first in (tmp_path / "none").glob("*.npz"):
+        first.unlink()
+    list(generate(tmp_path / "none", None, small(scenes=1, **asked | {"grasps_per_view": 5})))
     list(generate(tmp_path, None, small(scenes=1, **asked)))
     with pytest.raises(ValueError, match=r"grasps_per_view: .*holds scenes of seed 5"):
         list(generate(tmp_path, None, small(scenes=2, **asked | {"grasps_per_view": 5})))
