@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
-from edgegrasp_cli.planners import request_options
+from edgegrasp_lab.planners import request_options
 from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.candidates.edge_grasps import spread
 from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector

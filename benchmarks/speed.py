@@ -19,7 +19,7 @@ import torch
 from benchmarks.measuring import RESULTS, RUNS, interleaved, machine, memory, served, write_results
 from examples.your_planner import plan
 
-from edgegrasp_cli.real_scenes import load_scenes
+from edgegrasp_lab.real_scenes import load_scenes
 from edgegrasp_model.candidates.sample import Sampler
 from edgegrasp_model.detector import ModelCatalogue
 from edgegrasp_model.options import DetectOptions

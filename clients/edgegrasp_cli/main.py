@@ -13,25 +13,26 @@ try:
 except ModuleNotFoundError:
     sys.exit("edgegrasp: the command line is not installed. pip install 'edgegrasp[cli]'")
 
-# Command: its module, the extra it needs, one-line help. `generate-data` is generate_data().
+# Command: its module after `edgegrasp_`, the extra it needs, one-line help. `generate-data` is
+# generate_data(). Those of `edgegrasp_lab` are the laboratory's.
 COMMANDS = {
-    "serve": ("serve", "service", "Answer requests over HTTP and gRPC."),
-    "detect": ("detect", "service,view", "Find grasps in a cloud or a depth image."),
-    "view": ("serve", "service", "Look at a scene and its grasps in the browser."),
-    "models": ("detect", "service", "List the weights that can be used."),
-    "robot": ("robot", "robot,view", "Make a robot file from a URDF, and check one."),
-    "mcp": ("mcp", "mcp", "Serve grasps to language-model agents."),
-    "open-inference": ("open_inference", "open-inference", "Serve the Open Inference Protocol."),
-    "benchmark": ("benchmark", "train", "Clear simulated clutter with a planner; count successes."),
-    "benchmark-real": ("benchmark_real", "service,view", "Judge grasps in scenes of real cameras."),
-    "benchmark-tracking": ("benchmark_tracking", "train,view", "Follow grasps of moving objects."),
-    "compare": ("benchmark", "train", "Compare two benchmarks scene by scene."),
-    "replay": ("replay", "service,sim", "Repeat a recorded attempt or request."),
-    "generate-data": ("train", "train", "Make labelled edge grasps in simulation."),
-    "train": ("train", "train", "Train weights on generated data."),
-    "generate-scenes": ("train", "open3d,robot,train", "Make images to train the scene network."),
-    "train-scene": ("train", "open3d,train", "Train the network that recognises objects."),
-    "import-checkpoint": ("train", "model", "Convert the authors' checkpoints to safetensors."),
+    "serve": ("cli.serve", "service", "Answer requests over HTTP and gRPC."),
+    "detect": ("cli.detect", "service,view", "Find grasps in a cloud or a depth image."),
+    "view": ("cli.serve", "service", "Look at a scene and its grasps in the browser."),
+    "models": ("cli.detect", "service", "List the weights that can be used."),
+    "robot": ("cli.robot", "robot,view", "Make a robot file from a URDF, and check one."),
+    "mcp": ("cli.mcp", "mcp", "Serve grasps to language-model agents."),
+    "open-inference": ("cli.open_inference", "open-inference", "Serve Open Inference clients."),
+    "benchmark": ("lab.benchmark", "train", "Clear simulated clutter with a planner."),
+    "benchmark-real": ("lab.benchmark_real", "service,view", "Judge grasps in real scenes."),
+    "benchmark-tracking": ("lab.benchmark_tracking", "train,view", "Follow moving objects."),
+    "compare": ("lab.benchmark", "train", "Compare two benchmarks scene by scene."),
+    "replay": ("lab.replay", "service,sim", "Repeat a recorded attempt or request."),
+    "generate-data": ("lab.train", "train", "Make labelled edge grasps in simulation."),
+    "train": ("lab.train", "train", "Train weights on generated data."),
+    "generate-scenes": ("lab.train", "open3d,robot,train", "Make images for train-scene."),
+    "train-scene": ("lab.train", "open3d,train", "Train the network that recognises objects."),
+    "import-checkpoint": ("lab.train", "model", "Convert the authors' checkpoints to safetensors."),
 }
 
 
@@ -63,7 +64,7 @@ def load_command(name: str) -> Any:
     """Import a command; raises SystemExit where packages that it needs are not installed."""
     module, _, _ = COMMANDS[name]
     try:
-        found = importlib.import_module(f"edgegrasp_cli.{module}")
+        found = importlib.import_module(f"edgegrasp_{module}")
     except ModuleNotFoundError as error:
         sys.exit(_missing(name, error))
     program = getattr(found, name.replace("-", "_"))

@@ -144,7 +144,7 @@ def test_a_recorded_request_is_answered_again(transport, run, refused, monkeypat
             return job, Answer(b"", facts, first), Answer(b"", facts, second)
         return job, Answer(body("plus", 1.0), facts), Answer(body(path.stem, 2.0), facts)
 
-    monkeypatch.setattr("edgegrasp_cli.replay.answer_again", replay)
+    monkeypatch.setattr("edgegrasp_lab.replay.answer_again", replay)
     assert "7 grasps\nthe answer is the same" in run("replay", "request", "plus.job")
     for differing in ("small.job", "errors.job"):
         assert "differs" in refused("replay", "request", differing)

@@ -14,8 +14,8 @@ import pytest
 from benchmarks.dummy import DummyCatalogue
 from tests.cloud_files import npy
 
-from edgegrasp_cli.replay import answer_again
 from edgegrasp_client import GraspClient, InvalidRequestError
+from edgegrasp_lab.replay import answer_again
 from edgegrasp_service.errors import DiskFull, InvalidSettings
 from edgegrasp_service.front.http import DOCUMENT
 from edgegrasp_service.front.service import Admission

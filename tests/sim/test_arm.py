@@ -8,7 +8,7 @@ pytest.importorskip("roboplan", reason="the extra robot is not installed")
 
 from tests.robot.arms import picks_of
 
-from edgegrasp_cli.benchmark import benchmark_arm
+from edgegrasp_lab.benchmark import benchmark_arm
 from edgegrasp_robot import load_robot
 from edgegrasp_sim.engine import make_world
 from edgegrasp_sim.hand import ArmGripper, FailureCause, hand_of, panda, run_grasp

@@ -17,7 +17,7 @@ from edgegrasp_camera.arrays import Int64
 from edgegrasp_camera.picture import Picture
 from edgegrasp_cli.detect import DetectorFlags, open_client
 from edgegrasp_cli.flags import option_flags, parse_option_flags, takes_flags
-from edgegrasp_cli.real_scenes import BEST, RealScene, SceneFigures, judge, load_scenes, renumbered
+from edgegrasp_lab.real_scenes import BEST, RealScene, SceneFigures, judge, load_scenes, renumbered
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import choose_gripper, load_gripper
 from edgegrasp_model.options import parse_options
@@ -49,7 +49,7 @@ def benchmark_real(
     A request contains the image and its intrinsics, or the cloud with the camera at its origin, and
     the options given as flags; nothing else about the scene.
     """
-    from edgegrasp_cli.planners import model_used
+    from edgegrasp_lab.planners import model_used
 
     fields, loaded = parse_option_flags(options), load_scenes(scenes)
     output.mkdir(parents=True, exist_ok=True)

@@ -11,8 +11,8 @@ from typing import Annotated
 from rich.progress import Progress, track
 from typer import Argument, Option
 
-from edgegrasp_cli.benchmark import Cluster, interruptible
 from edgegrasp_cli.flags import takes_flags
+from edgegrasp_lab.benchmark import Cluster, interruptible
 from edgegrasp_training.options import GenerationOptions, TrainingOptions
 
 

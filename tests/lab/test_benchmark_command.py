@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.cli.conftest import invoke
 
-from edgegrasp_cli.benchmark import benchmark_arm
 from edgegrasp_cli.flags import PlannerFlags
-from edgegrasp_cli.planners import named_planner, open_planner, request_options
+from edgegrasp_lab.benchmark import benchmark_arm
+from edgegrasp_lab.planners import named_planner, open_planner, request_options
 from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_sim.camera import Observation
@@ -27,8 +28,6 @@ from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trial import PlannedGrasp, RoundDriver, StartCollides
-
-from .conftest import invoke
 
 TOP_DOWN = "examples.your_planner:plan"
 SMOKE_GATE = Path(__file__).parent / "smoke_gate.json"

@@ -17,7 +17,7 @@ from typer import Option
 from edgegrasp_camera.arrays import Float64
 from edgegrasp_cli.detect import DetectorFlags, open_client
 from edgegrasp_cli.flags import takes_flags
-from edgegrasp_cli.real_scenes import RealScene, load_scenes
+from edgegrasp_lab.real_scenes import RealScene, load_scenes
 from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.sensor import STRUCTURED_LIGHT

@@ -219,7 +219,7 @@ def run_rounds(
     folder: "ResultFolder | None",
 ) -> "tuple[list[Round], dict[str, Any]]":
     """Run the remaining rounds, with a progress bar; returns all, and `run` of the manifest."""
-    from edgegrasp_cli.planners import open_planner
+    from edgegrasp_lab.planners import open_planner
     from edgegrasp_sim.benchmark import manifest, run_benchmark
     from edgegrasp_sim.results import below_gate, count, summary_of
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from tests.model.rendered import FOCAL_LENGTH, HEIGHT, WIDTH, box, camera, render, seen_box, table
 
-from edgegrasp_cli.benchmark_tracking import MOTIONS, follow, simulated
 from edgegrasp_cli.detect import OwnDetector
-from edgegrasp_cli.real_scenes import SceneFigures, compare_labels, judge, load_scene, renumbered
+from edgegrasp_lab.benchmark_tracking import MOTIONS, follow, simulated
+from edgegrasp_lab.real_scenes import SceneFigures, compare_labels, judge, load_scene, renumbered
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_results import Grasp
 
