@@ -20,7 +20,7 @@ from edgegrasp_client.requests import (
     is_point_cloud2,
     point_cloud2_fields,
 )
-from edgegrasp_client.results import Answer, Model, StreamAnswer, read_as
+from edgegrasp_client.results import Answer, Model, StreamAnswer, field_of, read_as
 from edgegrasp_results import Detection
 
 CHANNEL_OPTIONS = (
@@ -75,13 +75,13 @@ class GrpcTransport:
         """The answer to a request."""
         name = "ScoreGrasps" if request.scores else "DetectGrasps"
         answer = await self._call(name, b"".join(wire_of(request)), timeout)
-        return read_as(kind, answer, read_field)
+        return read_as(kind, answer)
 
     async def listed(self, kind: type[Answer], timeout: float) -> list[Answer]:
         """The server's models or robots."""
         name = f"{kind.__name__}s"
         answer = await self._call(f"List{name}", b"", timeout)
-        return [read_as(kind, each, read_field) for each in getattr(answer, name.lower())]
+        return [read_as(kind, each) for each in getattr(answer, name.lower())]
 
     async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
         """Refused: gRPC has no such call."""
@@ -108,7 +108,7 @@ class GrpcTransport:
         try:
             async for answer in call:
                 if answer.HasField("detection"):
-                    detection = read_as(Detection, answer.detection, read_field)
+                    detection = read_as(Detection, answer.detection)
                     yield StreamAnswer(answer.request_id, detection)
                 else:
                     error = _described(answer.error.message, answer.error.detail)
@@ -146,13 +146,7 @@ class GrpcTransport:
             raise _error_of(error, self._address) from None
 
 
-# Answers
-
-
-def read_field(message: Message, name: str) -> Any:
-    """A field of an answer; None if absent. Used by the parsers in `results`."""
-    absent = message.DESCRIPTOR.fields_by_name[name].has_presence and not message.HasField(name)
-    return None if absent else getattr(message, name)
+# Errors
 
 
 def _error_of(error: Any, address: str) -> GraspClientError:
@@ -169,7 +163,7 @@ def _error_of(error: Any, address: str) -> GraspClientError:
 
 
 def _described(message: str, detail: grasp_pb2.ErrorDetail) -> GraspClientError:
-    retry_after = read_field(detail, "retry_after")
+    retry_after = field_of(detail, "retry_after")
     return error_of_kind(detail.kind, message, detail.field, detail.value, detail.fix, retry_after)
 
 

@@ -2,7 +2,6 @@
 
 import base64
 import json
-import operator
 import ssl
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
 from functools import partial
@@ -55,14 +54,14 @@ class RestTransport:
 
     async def ask(self, kind: type[Answer], request: Request, timeout: float) -> Answer:
         """The answer to a request."""
-        return await self._call(partial(read_json_as, kind), call_of(request), timeout)
+        return await self._call(partial(read_as, kind), call_of(request), timeout)
 
     async def listed(self, kind: type[Answer], timeout: float) -> list[Answer]:
         """The server's models or robots."""
         name = f"{kind.__name__.lower()}s"
         call = {"method": "GET", "url": f"/v1/{name}"}
         return await self._call(
-            lambda body: [read_json_as(kind, each) for each in body[name]], call, timeout
+            lambda body: [read_as(kind, each) for each in body[name]], call, timeout
         )
 
     async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
@@ -75,7 +74,7 @@ class RestTransport:
     ) -> AsyncGenerator[StreamAnswer, None]:
         """An answer to each of the named requests with their timeouts, one after the other."""
         async for name, request, seconds in requests:
-            call, read = call_of(request), partial(read_json_as, Detection)
+            call, read = call_of(request), partial(read_as, Detection)
             try:
                 yield StreamAnswer(name, await self._call(read, call, seconds))
             except GraspClientError as error:
@@ -111,13 +110,8 @@ class RestTransport:
             raise _described(body, response)
         try:
             return read(body)
-        except (KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise _foreign(response) from error
-
-
-def read_json_as(kind: type[Answer], body: Any) -> Answer:
-    """An object of an answer as one of the dataclasses of `results`."""
-    return read_as(kind, body, operator.getitem)
 
 
 def call_of(request: Request) -> Call:

@@ -1,6 +1,6 @@
 """The server's answers as typed values, and their parser for both transports."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, is_dataclass
 from functools import cache, partial
 from types import NoneType
@@ -75,14 +75,20 @@ _STAGES = (
 )
 
 Answer = TypeVar("Answer")
-Read = Callable[[Any, str], Any]
-"""read(answer, name): the field of that name of an object in an answer; None if it is absent."""
 
 
-def read_as(kind: type[Answer], answer: Any, read: Read) -> Answer:
+def field_of(answer: Any, name: str) -> Any:
+    """A field of a JSON object, which has it, or of a message; None if it is absent."""
+    if isinstance(answer, Mapping):
+        return answer[name]
+    absent = answer.DESCRIPTOR.fields_by_name[name].has_presence and not answer.HasField(name)
+    return None if absent else getattr(answer, name)
+
+
+def read_as(kind: type[Answer], answer: Any) -> Answer:
     """An answer, or an object in one, as one of the dataclasses above."""
     fields = _fields(cast("Any", kind))
-    values = {name: value(read(answer, name), read) for name, value in fields}
+    values = {name: value(field_of(answer, name)) for name, value in fields}
     if kind is ArmTrajectory:  # gRPC has rows one behind the other
         for name in ("positions", "velocities"):
             values[name] = values[name].reshape(-1, len(values["joint_names"]))
@@ -90,35 +96,33 @@ def read_as(kind: type[Answer], answer: Any, read: Read) -> Answer:
 
 
 @cache
-def _fields(kind: type[Any]) -> list[tuple[str, Callable[[Any, Read], Any]]]:
+def _fields(kind: type[Any]) -> list[tuple[str, Callable[[Any], Any]]]:
     """Each field of a dataclass, and how its value is read."""
     hints = get_type_hints(kind, include_extras=True)
     return [(name, _value(hint)) for name, hint in hints.items()]
 
 
-def _value(hint: Any) -> Callable[[Any, Read], Any]:
+def _value(hint: Any) -> Callable[[Any], Any]:
     """How a field of such a type is read; arrays in the shape of the annotation."""
     parts = [part for part in get_args(hint) if part is not NoneType]
     if NoneType in get_args(hint):
         given = _value(parts[0])
         scalar = parts[0] in (bool, float, int, str) or is_dataclass(parts[0])
         # Of lists, gRPC sends none.
-        return lambda value, read: (
-            None if value is None or not (scalar or len(value)) else given(value, read)
-        )
+        return lambda value: None if value is None or not (scalar or len(value)) else given(value)
     if is_dataclass(hint):
         return partial(read_as, cast("type[Any]", hint))
     if get_origin(hint) is list:
         one = _value(parts[0])
-        return lambda value, read: [one(part, read) for part in value]
+        return lambda value: [one(part) for part in value]
     if get_origin(hint) is dict:  # in the order of the stages; those of a newer server come last
-        return lambda value, _: {
+        return lambda value: {
             name: value[name] for name in (*_STAGES, *sorted(value)) if name in value
         }
     if get_origin(hint) is Annotated:
         array, shape = _value(parts[0]), hint.__metadata__[0]
-        return lambda value, read: array(value, read).reshape(shape)
+        return lambda value: array(value).reshape(shape)
     if get_origin(hint) is np.ndarray:
         (dtype,) = get_args(get_args(hint)[1])
-        return lambda value, _: np.array(value, dtype=dtype)  # null in JSON becomes NaN
-    return lambda value, _: value
+        return lambda value: np.array(value, dtype=dtype)  # null in JSON becomes NaN
+    return lambda value: value

@@ -182,7 +182,7 @@ def test_answers_of_another_server_and_of_a_busy_proxy(make_client, monkeypatch,
     with pytest.raises(OverloadedError) as caught:
         client.detect(cloud)
     assert caught.value.retry_after == 7
-    for body in ([], {"grasps": [{}]}, {"grasps": 3}, {"detail": "Not Found"}):
+    for body in ([], {"grasps": [{}]}, {"grasps": [3]}, {"grasps": 3}, {"detail": "Not Found"}):
         answers.append(httpx.Response(200, json=body))
         with pytest.raises(ProtocolError, match="not the answer of a grasp service"):
             client.detect(cloud)

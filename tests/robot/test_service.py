@@ -1,7 +1,6 @@
 """A worker with a robot: the arm's plans as either transport carries them."""
 
 import json
-import operator
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +15,7 @@ from tests.robot.arms import BOXES, TURNED, scene_of
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client import GraspClient
-from edgegrasp_client.over_grpc import read_field, wire_of
+from edgegrasp_client.over_grpc import wire_of
 from edgegrasp_client.requests import Request
 from edgegrasp_client.results import read_as
 from edgegrasp_model.results import Pace
@@ -71,9 +70,8 @@ def ask(robot, transport, settings=SETTINGS, **changes):
 
 def read(transport, body):
     if transport == "grpc":
-        message = grasp_pb2.DetectGraspsResponse.FromString(body)
-        return read_as(Detection, message, read_field)
-    return read_as(Detection, json.loads(body), operator.getitem)
+        return read_as(Detection, grasp_pb2.DetectGraspsResponse.FromString(body))
+    return read_as(Detection, json.loads(body))
 
 
 def test_the_client_reads_the_best_pick(robot, transport):
