@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from mcp.server import MCPServer
     from mcp.server.mcpserver.tools.base import Tool
 
-    from edgegrasp_client import DepthImage, Detection, GraspClient
+    from edgegrasp_client import Detection, GraspClient
     from edgegrasp_results import ArmPlan
 
 MOST_GRASPS = 20  # in one answer: some 5,000 characters
@@ -122,8 +122,8 @@ class _Tools:
 
         `viewpoint` is the camera's position: give it if you know it.
         """
-        asked = _asked(options, num_grasps, robot, viewpoint)
-        return _short(self._client.detect(self._path(point_cloud_file), **asked))
+        asked = self._request(options, num_grasps, robot, viewpoint, point_cloud_file)
+        return _short(self._client.detect(**asked))
 
     def generate_grasps_from_depth(
         self,
@@ -143,9 +143,9 @@ class _Tools:
         unit of the image (0.001 for whole numbers). With `T_base_camera` all that is asked and
         answered is in the base frame.
         """
-        image = self._image(depth_file, intrinsics, depth_scale, T_base_camera)
-        asked = self._in_image(_asked(options, num_grasps, robot), mask_file, T_base_camera)
-        return _short(self._client.detect(depth_images=[image], **asked))
+        image = (depth_file, intrinsics, mask_file, depth_scale, T_base_camera)
+        asked = self._request(options, num_grasps, robot, image=image)
+        return _short(self._client.detect(**asked))
 
     def visualize_grasps(
         self,
@@ -168,22 +168,15 @@ class _Tools:
         """
         from mcp.server.mcpserver import Image
 
-        asked = _asked(options, num_grasps, robot, viewpoint)
-        of_image = any(
-            each is not None for each in (intrinsics, mask_file, depth_scale, T_base_camera)
-        )
-        if (point_cloud_file is None) == (depth_file is None) or (depth_file is None and of_image):
+        image = (depth_file, intrinsics, mask_file, depth_scale, T_base_camera)
+        given = depth_file is None and any(part is not None for part in image)
+        if (point_cloud_file is None) == (depth_file is None) or given:
             raise ValueError("Give point_cloud_file alone, or depth_file and intrinsics.")
-        file, images = None, None
-        if point_cloud_file is not None:
-            file = self._path(point_cloud_file)
-        else:
-            images = [self._image(str(depth_file), intrinsics or [], depth_scale, T_base_camera)]
-            asked = self._in_image(asked, mask_file, T_base_camera)
-        found = self._client.detect(file, depth_images=images, **asked)
+        asked = self._request(options, num_grasps, robot, viewpoint, point_cloud_file, image)
+        found = self._client.detect(**asked)
+        sent, pictures = sent_cloud(asked.get("cloud"), asked.get("depth_images")), []
         best = found.grasps[0].score if found.grasps else 0.0
         text = f"{len(found.grasps)} grasps, the best {best:.2f}. {' '.join(found.warnings)}"
-        sent, pictures = sent_cloud(file, images), []
         for from_above in (False, True):
             drawn = io.BytesIO()
             draw_detection(drawn, found, sent, asked, from_above=from_above)
@@ -206,26 +199,36 @@ class _Tools:
         ]
         return json.dumps({"models": models, "robots": robots})
 
-    def _image(
-        self, name: str, intrinsics: list[float], scale: float | None, pose: Matrix | None
-    ) -> "DepthImage":
-        file = self._path(name)
-        image: DepthImage = {"depth": file, "intrinsics": intrinsics, "depth_scale": scale}
-        if pose is not None:
-            image["T_cloud_camera"] = pose
-        return image
-
-    def _in_image(
-        self, asked: dict[str, Any], mask: str | None, pose: Matrix | None
+    def _request(
+        self,
+        options: dict[str, Any] | None,
+        num_grasps: int,
+        robot: dict[str, Any] | None,
+        viewpoint: list[float] | None = None,
+        cloud_file: str | None = None,
+        image: tuple[Any, ...] = (),  # in place of a cloud: file, intrinsics, mask, scale, pose
     ) -> dict[str, Any]:
-        """The options for a depth image: limited to its mask, with z up in a base frame."""
+        """The arguments of `GraspClient.detect`; a tool's own ones come before its options."""
         from edgegrasp_client import on_mask
 
+        if "top_k" in (options or {}):
+            raise ValueError("options.top_k: got num_grasps beside it. Give num_grasps alone.")
+        asked = {**(options or {}), "top_k": num_grasps}
+        if viewpoint:
+            asked["viewpoint"] = viewpoint
+        if robot:
+            asked["robot"] = {"T_base_cloud": IN_BASE, **robot}
+        if cloud_file is not None:
+            return asked | {"cloud": self._path(cloud_file)}
+        depth_file, intrinsics, mask_file, scale, pose = image
+        view = {"depth": self._path(depth_file), "intrinsics": intrinsics, "depth_scale": scale}
         if pose is not None:
-            asked = {"up": [0.0, 0.0, 1.0], **asked}
+            asked, view["T_cloud_camera"] = {"up": [0.0, 0.0, 1.0], **asked}, pose
         elif (asked.get("robot") or {}).get("T_base_cloud") is IN_BASE:
             raise ValueError("robot: give T_base_camera, in the arm's base frame.")
-        return asked if mask is None else dict(on_mask(pixels(self._path(mask)), asked))
+        if mask_file is not None:
+            asked = dict(on_mask(pixels(self._path(mask_file)), asked))
+        return asked | {"depth_images": [view]}
 
     def _path(self, name: str) -> Path:
         path = (self._folder / name).resolve()
@@ -259,37 +262,20 @@ def _tool(function: Callable[..., Any], folder: Path) -> "Tool":
 def _schema_of_options() -> tuple[dict[str, Any], dict[str, Any]]:
     """The JSON Schema of options, without grippers as boxes, and what it refers to."""
     document = resources.files("edgegrasp.v1").joinpath("openapi.json").read_text()
-    text = document.replace("#/components/schemas/", "#/$defs/")
-    schemas = json.loads(text)["components"]["schemas"]
-    options = schemas["DetectOptions"]
-    options["properties"]["gripper"] = {"type": ["string", "null"], "description": "its name"}
+    schemas = json.loads(document.replace("#/components/schemas/", "#/$defs/"))
+    schemas = schemas["components"]["schemas"]
+    gripper = {"type": ["string", "null"], "description": "its name"}
+    schemas["DetectOptions"]["properties"]["gripper"] = gripper
     definitions: dict[str, Any] = {}
-    todo = [options]
-    while todo:
-        for name in re.findall(r'"#/\$defs/(\w+)"', json.dumps(todo.pop())):
-            if name not in definitions:
-                definitions[name] = schemas[name]
-                todo.append(schemas[name])
+    names = ["DetectOptions"]
+    while names:
+        if (name := names.pop()) not in definitions:
+            definitions[name] = schemas[name]
+            names += re.findall(r'"#/\$defs/(\w+)"', json.dumps(schemas[name]))
+    options = definitions.pop("DetectOptions")
     del options["properties"]["robot"], options["properties"]["top_k"]  # arguments of their own
     definitions["RobotArm"]["required"].remove("T_base_cloud")
     return options, definitions
-
-
-def _asked(
-    options: dict[str, Any] | None,
-    num_grasps: int,
-    robot: dict[str, Any] | None,
-    viewpoint: list[float] | None = None,
-) -> dict[str, Any]:
-    """The options of a request; a tool's own arguments take precedence."""
-    if "top_k" in (options or {}):
-        raise ValueError("options.top_k: got num_grasps beside it. Give num_grasps alone.")
-    asked = {**(options or {}), "top_k": num_grasps}
-    if viewpoint:
-        asked["viewpoint"] = viewpoint
-    if robot:
-        asked["robot"] = {"T_base_cloud": IN_BASE, **robot}
-    return asked
 
 
 def _with_sentences(function: Callable[..., Any], folder: Path) -> Callable[..., Any]:
@@ -302,10 +288,7 @@ def _with_sentences(function: Callable[..., Any], folder: Path) -> Callable[...,
     def run(**arguments: Any) -> Any:
         try:
             return function(**arguments)
-        except OSError as error:  # its own text contains the whole path
-            name = Path(str(error.filename or "")).name
-            raise ToolError(f"{name}: {error.strerror}.") from error
-        except (EdgeGraspError, GraspClientError, ValueError) as error:
+        except (EdgeGraspError, GraspClientError, OSError, ValueError) as error:
             raise ToolError(str(error).replace(f"{folder}/", "")) from error
 
     return run
