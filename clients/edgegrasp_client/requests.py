@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import NotRequired, TypedDict, Unpack
 
 from edgegrasp_camera.arrays import Array, Float32
-from edgegrasp_camera.clouds import PointCloud2
+from edgegrasp_camera.clouds import PointCloud2, PointField
 from edgegrasp_camera.depth import ENCODINGS, intrinsics_of
 from edgegrasp_camera.files import FILE_FORMATS
 from edgegrasp_client.connection import seconds_of
@@ -256,16 +256,13 @@ def point_cloud2_fields(cloud: PointCloud2) -> dict[str, Any]:
     data = cloud.data
     if not isinstance(data, bytes):
         data = np.asarray(data, dtype=np.uint8).tobytes()
-    own = {"height": int, "width": int, "is_bigendian": bool, "point_step": int, "row_step": int}
-    of_field = {"name": str, "offset": int, "datatype": int, "count": int}
-    return {
-        **{name: kind(getattr(cloud, name)) for name, kind in own.items()},
-        "fields": [
-            {name: kind(getattr(field, name)) for name, kind in of_field.items()}
-            for field in cloud.fields
-        ],
-        "data": data,
-    }
+    names = PointCloud2.__annotations__.keys() - {"data", "fields"}
+    own = {name: _plain(getattr(cloud, name)) for name in names}
+    of_each = [
+        {name: _plain(getattr(field, name)) for name in PointField.__annotations__}
+        for field in cloud.fields
+    ]
+    return own | {"fields": of_each, "data": data}
 
 
 def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
@@ -345,12 +342,10 @@ def _sent(name: str, array: object) -> Array:
     kinds, sides, wanted = ARRAYS[name]
     if not isinstance(array, np.ndarray):
         raise invalid(name, f"a {type(array).__name__}", f"Give {wanted}.")
-    if array.dtype.kind not in kinds:
-        raise invalid(name, f"dtype {array.dtype}", f"Give {wanted}.")
     to_score = name in ("edges", "hand_poses")
-    fits = array.shape[array.ndim - len(sides) :] == sides
-    if not fits or (to_score and array.ndim != len(sides) + 1):
-        raise invalid(name, f"shape {array.shape}", f"Give {wanted}.")
+    fits = array.shape[1 if to_score else array.ndim - len(sides) :] == sides
+    if not fits or array.dtype.kind not in kinds:
+        raise invalid(name, f"shape {array.shape}, dtype {array.dtype}", f"Give {wanted}.")
     if to_score:
         return array
     if sides:
