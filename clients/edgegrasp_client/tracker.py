@@ -10,7 +10,6 @@ from typing_extensions import Unpack
 
 from edgegrasp_client.client import GraspClient
 from edgegrasp_client.options import DetectOptions, Previous
-from edgegrasp_client.requests import StreamRequest
 from edgegrasp_results import DetectedObject, Detection
 
 FOLLOWED = 4  # grasps on one object, of which the first is the one to keep
@@ -43,7 +42,7 @@ class GraspTracker:
     def follow(
         self, client: GraspClient, images: Iterable[Mapping[str, Any]]
     ) -> Iterator[tuple[Mapping[str, Any], Detection]]:
-        """Find grasps in one image after the other, over one stream.
+        """Find grasps in one image after the other.
 
         `images` are what `GraspClient.detect` gets, such as {"depth_images": [image]}. Of those
         that come while one is at work, only the latest is sent.
@@ -52,26 +51,17 @@ class GraspTracker:
             An image and its answer. Raises GraspClientError, and whatever `images` raises.
         """
         latest: queue.Queue[Any] = queue.Queue(1)
-        requests: queue.Queue[StreamRequest | None] = queue.Queue()
         stopped = threading.Event()
         threading.Thread(target=_read, args=(images, latest, stopped), daemon=True).start()
-        answers = client.detect_stream(iter(requests.get, None))
         try:
-            while True:
-                image = latest.get()
+            while (image := latest.get()) is not None:
                 if isinstance(image, Exception):
                     raise image
-                requests.put(
-                    None if image is None else StreamRequest(**{**image, **self.options()})
-                )
-                if (answer := next(answers, None)) is None:
-                    return
-                detection = answer.result()
+                detection = client.detect(**{**image, **self.options()})
                 self.take(detection)
                 yield image, detection
         finally:
             stopped.set()
-            requests.put(None)
             with suppress(queue.Empty):  # the end of the images waits for its place
                 latest.get_nowait()
 

@@ -26,7 +26,6 @@ from edgegrasp_client import (
     GraspTracker,
     GripperOutline,
     InvalidRequestError,
-    StreamAnswer,
     StreamRequest,
     Tracking,
     object_in_scene,
@@ -307,10 +306,9 @@ def test_images_that_come_while_one_is_at_work_are_dropped_but_for_the_latest() 
     """And an error of the camera is raised."""
     read, seen = threading.Event(), []
 
-    def stream(requests: Any) -> Iterator[StreamAnswer]:
-        for _ in requests:
-            read.wait()
-            yield StreamAnswer("", answer("started"))
+    def detect(**_: Any) -> Detection:
+        read.wait()
+        return answer("started")
 
     def camera() -> Iterator[dict[str, Any]]:
         for number in range(10):
@@ -318,7 +316,7 @@ def test_images_that_come_while_one_is_at_work_are_dropped_but_for_the_latest() 
         read.set()
         raise OSError("unplugged")
 
-    client: Any = SimpleNamespace(detect_stream=stream)
+    client: Any = SimpleNamespace(detect=detect)
     with pytest.raises(OSError, match="unplugged"):
         seen.extend(image["cloud"][0, 0] for image, _ in GraspTracker().follow(client, camera()))
     assert seen[-1] == 9
