@@ -7,6 +7,7 @@ requests, and chooses, adds and replaces replicas. It has no streams, tokens or 
 """
 
 import asyncio
+from collections.abc import Awaitable, Callable
 from typing import Any, cast, get_args
 
 from grpc import StatusCode
@@ -23,6 +24,23 @@ from edgegrasp_service.front.http import METHODS, requested_timeout
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer, load_catalogue, load_robots
 from edgegrasp_service.worker.process import Answer, Facts, Job, Method
+
+
+def _rpc(method: Method) -> Callable[..., Awaitable[Any]]:
+    """A method of Grasps that answers over gRPC."""
+
+    async def rpc(self: Any, request: Any, grpc_context: RayServegRPCContext) -> Any:
+        seconds = self._settings.max_request_seconds
+        found = await self._answer(Job(method, "grpc", request.SerializeToString(), seconds))
+        if (problem := found.error) is not None:
+            grpc_context.set_code(StatusCode[problem.code])
+            grpc_context.set_details(problem.detail)
+            detail = error_detail(problem).SerializeToString()
+            trailing = [(ERROR_METADATA, detail)]
+            grpc_context.set_trailing_metadata(trailing)  # type: ignore[arg-type]
+        return getattr(grasp_pb2, f"{method}Response").FromString(found.body)
+
+    return rpc
 
 
 @serve.deployment(max_ongoing_requests=1, user_config={})
@@ -60,19 +78,7 @@ class Grasps:
         document = problem_document(found.error)
         return Response(document, found.error.status, media_type="application/problem+json")
 
-    async def DetectGrasps(  # noqa: N802  # as the RPC
-        self, request: grasp_pb2.DetectGraspsRequest, grpc_context: RayServegRPCContext
-    ) -> grasp_pb2.DetectGraspsResponse:
-        """Answer over gRPC."""
-        body = await self._answer_call("DetectGrasps", request, grpc_context)
-        return grasp_pb2.DetectGraspsResponse.FromString(body)
-
-    async def ScoreGrasps(  # noqa: N802  # as the RPC
-        self, request: grasp_pb2.ScoreGraspsRequest, grpc_context: RayServegRPCContext
-    ) -> grasp_pb2.ScoreGraspsResponse:
-        """Answer over gRPC."""
-        body = await self._answer_call("ScoreGrasps", request, grpc_context)
-        return grasp_pb2.ScoreGraspsResponse.FromString(body)
+    DetectGrasps, ScoreGrasps = _rpc("DetectGrasps"), _rpc("ScoreGrasps")
 
     async def ListModels(  # noqa: N802  # as the RPC
         self, request: grasp_pb2.ListModelsRequest
@@ -90,18 +96,6 @@ class Grasps:
 
     def _robots(self) -> list[dict[str, Any]]:
         return [robot.describe() for robot in load_robots(self._settings).values()]
-
-    async def _answer_call(
-        self, method: Method, request: Any, context: RayServegRPCContext
-    ) -> bytes:
-        seconds = self._settings.max_request_seconds
-        found = await self._answer(Job(method, "grpc", request.SerializeToString(), seconds))
-        if (problem := found.error) is not None:
-            context.set_code(StatusCode[problem.code])
-            context.set_details(problem.detail)
-            detail = error_detail(problem).SerializeToString()
-            context.set_trailing_metadata([(ERROR_METADATA, detail)])  # type: ignore[list-item]
-        return found.body
 
     async def _answer(self, job: Job) -> Answer:
         return await asyncio.to_thread(answer, job, self._catalogue, self._settings)
