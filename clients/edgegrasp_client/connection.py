@@ -73,16 +73,6 @@ def token_metadata(token: str | None) -> tuple[tuple[str, str], ...]:
     return (("authorization", f"Bearer {token}"),)
 
 
-def read_pem(name: str, path: str | Path | None) -> bytes | None:
-    """What is in a file of a Tls; raises InvalidRequestError if it cannot be read."""
-    if path is None:
-        return None
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise invalid(name, repr(str(path)), f"{error.strerror}.") from None
-
-
 class Addresses(NamedTuple):
     """Where a local server listens."""
 

@@ -1,6 +1,8 @@
 """The gRPC transport: requests, answers and errors as messages."""
 
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping, Sequence
+from dataclasses import astuple
+from pathlib import Path
 from typing import Any
 
 import grpc.aio
@@ -10,7 +12,7 @@ from google.protobuf.message import DecodeError, Message
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_camera.arrays import Array
 from edgegrasp_client import errors
-from edgegrasp_client.connection import Tls, read_pem, token_metadata
+from edgegrasp_client.connection import Tls, token_metadata
 from edgegrasp_client.errors import GraspClientError, error_of_kind, invalid
 from edgegrasp_client.requests import (
     Request,
@@ -62,11 +64,11 @@ class GrpcTransport:
         if tls is None:
             self._channel = grpc.aio.insecure_channel(address, CHANNEL_OPTIONS)
         else:
-            credentials = grpc.ssl_channel_credentials(
-                root_certificates=read_pem("tls.ca", tls.ca),
-                private_key=read_pem("tls.key", tls.key),
-                certificate_chain=read_pem("tls.certificate", tls.certificate),
-            )
+            try:
+                ca, certificate, key = (file and Path(file).read_bytes() for file in astuple(tls))
+            except OSError as error:
+                raise invalid("tls", f"{tls} ({error})", "Give PEM files.") from None
+            credentials = grpc.ssl_channel_credentials(ca, key, certificate)
             self._channel = grpc.aio.secure_channel(address, credentials, CHANNEL_OPTIONS)
         self._metadata = token_metadata(token)
         self._check = self._channel.unary_unary(HEALTH_CHECK, bytes, bytes)
@@ -289,9 +291,8 @@ def _target(message: Any, value: Any, path: str) -> tuple[Any, Any]:
             return message, {names[0]: value}
         case "Edge" | "HandBox" | "Pixel" | "Vector" | "Quaternion" as kind:
             if not isinstance(value, Sequence) or len(value) != len(names):
-                count = {2: "two", 3: "three", 4: "four"}[len(names)]
                 parts = "corners" if kind == "HandBox" else "numbers"
-                raise invalid(path, repr(value)[:80], f"Give {count} {parts}: {', '.join(names)}.")
+                raise invalid(path, repr(value)[:80], f"Give {parts}: {', '.join(names)}.")
             return message, dict(zip(names, value, strict=True))
         case "GripperChoice":
             named = isinstance(value, str)

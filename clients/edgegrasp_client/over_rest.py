@@ -12,7 +12,7 @@ import numpy as np
 
 from edgegrasp_camera.depth import ENCODINGS
 from edgegrasp_client import errors
-from edgegrasp_client.connection import HTTP_OVER_UNIX, Tls, read_pem, token_metadata
+from edgegrasp_client.connection import HTTP_OVER_UNIX, Tls, token_metadata
 from edgegrasp_client.errors import GraspClientError, error_of_kind, invalid
 from edgegrasp_client.requests import (
     Request,
@@ -206,12 +206,10 @@ def _ssl_context(tls: Tls | None) -> ssl.SSLContext | bool:
     """For httpx; raises InvalidRequestError for files that cannot be used."""
     if tls is None:
         return True
-    for name in ("ca", "certificate", "key"):
-        read_pem(f"tls.{name}", getattr(tls, name))
     try:
         context = ssl.create_default_context(cafile=tls.ca)
         if tls.certificate is not None:
             context.load_cert_chain(tls.certificate, tls.key)
-    except ssl.SSLError as error:
-        raise invalid("tls", f"files that do not hold it ({error})", "Give PEM files.") from None
+    except OSError as error:  # also of a file that holds none
+        raise invalid("tls", f"{tls} ({error})", "Give PEM files.") from None
     return context
