@@ -225,7 +225,7 @@ async def _sent(
     number = 0
     async for each in requests:
         seconds = timeout if each.timeout is None else each.timeout
-        yield each.request_id or str(number), each.request, seconds
+        yield each.request_id or str(number), each, seconds
         number += 1
 
 

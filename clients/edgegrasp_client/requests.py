@@ -106,7 +106,7 @@ class Request:
         }
 
 
-class StreamRequest:
+class StreamRequest(Request):
     """One request of a stream; `cloud` and `fields` as of `GraspClient.detect`.
 
     Raises:
@@ -121,7 +121,7 @@ class StreamRequest:
         timeout: float | None = None,  # seconds until it is no longer wanted; None: the stream's
         **fields: Unpack[RequestFields],
     ) -> None:
-        self.request = Request(cloud, fields)
+        super().__init__(cloud, fields)
         self.request_id = request_id
         self.timeout = None if timeout is None else seconds_of(timeout)
 
