@@ -122,7 +122,7 @@ def read_point_cloud2(cloud: PointCloud2, max_points: int = sys.maxsize) -> Clou
 
 def _record(cloud: PointCloud2) -> np.dtype[Any]:
     """The dtype of a point, with the fields that are read."""
-    fix = f"Send each field once, within point_step = {cloud.point_step}."
+    fix = f"Send each field once, of a type from 1 to 8, within {cloud.point_step} bytes."
     order = ">" if cloud.is_bigendian else "<"
     found = [field for field in cloud.fields if field.name in PCL_FIELDS and field.count <= 1]
     kinds = {field.name: field.datatype for field in found}
@@ -131,12 +131,10 @@ def _record(cloud: PointCloud2) -> np.dtype[Any]:
         wanted = f"Send {', '.join(missing)} too, as 7 (float32) or 8 (float64), metres."
         raise InvalidRequest("point_cloud2.fields", value[:80], wanted)
     for field in found:  # NumPy adds them in 32 bits
-        if field.datatype not in POINT_TYPES:
-            value = f"{field.name} of type {field.datatype}"
-            raise InvalidRequest("point_cloud2.fields", value, "Send types from 1 to 8.")
-        end = field.offset + np.dtype(POINT_TYPES[field.datatype]).itemsize
-        if end > cloud.point_step:
-            raise InvalidRequest("point_cloud2.fields", f"{field.name} up to byte {end}", fix)
+        size = np.dtype(POINT_TYPES.get(field.datatype, "V")).itemsize
+        if not size or field.offset + size > cloud.point_step:
+            value = f"{field.name} of type {field.datatype} at byte {field.offset}"
+            raise InvalidRequest("point_cloud2.fields", value, fix)
     try:
         return np.dtype(
             {
