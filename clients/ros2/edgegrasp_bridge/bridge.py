@@ -79,7 +79,6 @@ def parameters() -> dict[str, Any]:
 def read_parameters(given: Mapping[str, Any]) -> tuple[Settings, dict[str, Any]]:
     """Settings, and options of a detection; text of an option that is JSON stands for its value."""
     own = {each.name: given[each.name] for each in fields(Settings)}
-    own["joint_names"] = tuple(own["joint_names"])
     options = {}
     for name, value in given.items():
         if name.startswith(OPTION) and not (isinstance(value, str) and value == ""):
@@ -107,8 +106,7 @@ class Inbox:
     """The messages that came last, and which of them belong together."""
 
     def __init__(self) -> None:
-        self._clouds: deque[Any] = deque(maxlen=KEPT)
-        self._depths: deque[Any] = deque(maxlen=KEPT)
+        self._sources = {field: deque[Any](maxlen=KEPT) for field in ("cloud", "depth")}
         self._cameras: dict[str, Any] = {}  # by their frames
         self._mask: Any = None
         self._joints: dict[str, float] = {}
@@ -122,9 +120,9 @@ class Inbox:
         elif field == "joints":  # an arm's and a gripper's may come apart
             self._joints |= zip(message.name, map(float, message.position), strict=False)
         else:
-            (self._clouds if field == "cloud" else self._depths).append(message)
+            self._sources[field].append(message)
         masked = self._mask is not None and mask_age > 0
-        return field == "mask" if masked else field in ("cloud", "depth")
+        return field == "mask" if masked else field in self._sources
 
     def scene(self, mask_age: float) -> Scene:
         """The newest cloud, or else depth image of each camera; or that of the mask, if any comes.
@@ -132,7 +130,8 @@ class Inbox:
         Raises:
             ValueError: The mask is too old, or the image that it was made of has not come.
         """
-        sources = list(self._clouds or self._depths)  # others may come meanwhile
+        clouds, depths = map(list, self._sources.values())  # others may come meanwhile
+        sources = clouds or depths
         if not sources:
             return Scene(joints=self._joints)
         source, mask = sources[-1], self._mask if mask_age > 0 else None
@@ -145,7 +144,7 @@ class Inbox:
             if not same:
                 raise ValueError("No image has the stamp of the mask. Copy the image's header.")
             source = same[-1]
-        if self._clouds:
+        if clouds:
             return Scene(cloud=source, mask=mask, joints=self._joints)
         latest = {each.header.frame_id: each for each in sources} if mask is None else {}
         latest.pop(source.header.frame_id, None)
