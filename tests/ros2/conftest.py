@@ -1,12 +1,10 @@
 """Messages as ROS 2 has them on the wire: rosbags serialises them, and reads them back."""
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 PACKAGE = Path(__file__).parents[2] / "clients" / "ros2"
 sys.path.insert(0, str(PACKAGE))
@@ -72,10 +70,3 @@ class Types:
         """The message as it arrives: serialised as CDR and read again."""
         data = self._store.serialize_cdr(self.make(name, fields), name)
         return self._store.deserialize_cdr(data, name)
-
-
-@pytest.fixture(scope="session")
-def sent() -> Callable[[str, dict[str, Any]], Any]:
-    """sent(type, fields): a message that went through CDR."""
-    pytest.importorskip("rosbags", reason="the extra `ros2` is not installed")
-    return Types().sent

@@ -1,6 +1,6 @@
 """The node's logic, with messages that went through CDR and a server behind the client."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +17,11 @@ from edgegrasp_client import GraspClient, GraspTracker, InvalidRequestError, Rob
 from edgegrasp_client.conversions import PANDA_LINK8, matrix_from_quaternion
 from edgegrasp_client.options import DetectOptions
 from edgegrasp_results import ArmPlan, ArmTrajectory
+
+from .conftest import Types
+
+pytest.importorskip("rosbags", reason="the extra `ros2` is not installed")
+sent = Types().sent  # a message of a type and fields, as it arrives
 
 STAMP = {"sec": 12, "nanosec": 345}
 HEADER = {"stamp": STAMP, "frame_id": "camera"}
@@ -47,41 +52,30 @@ def client(dummy_server) -> Iterator[GraspClient]:
         yield client
 
 
-@pytest.fixture
-def make_cloud(sent) -> Callable[..., Any]:
-    def make_cloud(points: np.ndarray, frame_id: str = "camera", bigendian: bool = False) -> Any:
-        """x, y, z and a colour in 20 bytes, rows padded by 4 more."""
-        kind = np.dtype([*((name, "f4") for name in ("x", "y", "z", "rgb")), ("more", "u4")])
-        rows = np.zeros(points.shape[:-1], kind)
-        rows["x"], rows["y"], rows["z"] = np.moveaxis(points, -1, 0)
-        layout = point_cloud2(np.atleast_2d(rows), padding=4, big=bigendian)
-        layout["data"] = np.frombuffer(layout["data"], np.uint8)
-        header = HEADER | {"frame_id": frame_id}
-        return sent("sensor_msgs/msg/PointCloud2", layout | {"header": header})
-
-    return make_cloud
+def make_cloud(points: np.ndarray, frame_id: str = "camera", bigendian: bool = False) -> Any:
+    """x, y, z and a colour in 20 bytes, rows padded by 4 more."""
+    kind = np.dtype([*((name, "f4") for name in ("x", "y", "z", "rgb")), ("more", "u4")])
+    rows = np.zeros(points.shape[:-1], kind)
+    rows["x"], rows["y"], rows["z"] = np.moveaxis(points, -1, 0)
+    layout = point_cloud2(np.atleast_2d(rows), padding=4, big=bigendian)
+    layout["data"] = np.frombuffer(layout["data"], np.uint8)
+    return sent("sensor_msgs/msg/PointCloud2", layout | {"header": HEADER | {"frame_id": frame_id}})
 
 
-@pytest.fixture
-def make_image(sent) -> Callable[..., Any]:
-    def make_image(pixels: np.ndarray, encoding: str, padding: int = 0) -> Any:
-        flat = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
-        rows = np.pad(flat, ((0, 0), (0, padding)))
-        size = {"height": pixels.shape[0], "width": pixels.shape[1], "step": rows.shape[1]}
-        fields = {"header": HEADER, "encoding": encoding, "data": rows.ravel()}
-        return sent("sensor_msgs/msg/Image", size | fields)
-
-    return make_image
+def make_image(pixels: np.ndarray, encoding: str = "16UC1", padding: int = 0) -> Any:
+    flat = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
+    rows = np.pad(flat, ((0, 0), (0, padding)))
+    size = {"height": pixels.shape[0], "width": pixels.shape[1], "step": rows.shape[1]}
+    fields = {"header": HEADER, "encoding": encoding, "data": rows.ravel()}
+    return sent("sensor_msgs/msg/Image", size | fields)
 
 
-@pytest.fixture
-def camera(sent) -> Any:
-    projection = np.insert(np.reshape(MATRIX, (3, 3)), 3, 0.0, axis=1).ravel()
-    size = {"header": HEADER, "height": 24, "width": 32}
-    return sent("sensor_msgs/msg/CameraInfo", size | {"k": [9.0] * 9, "p": projection})
+PROJECTION = np.insert(np.reshape(MATRIX, (3, 3)), 3, 0.0, axis=1).ravel()
+SIZE = {"header": HEADER, "height": 24, "width": 32}
+CAMERA = sent("sensor_msgs/msg/CameraInfo", SIZE | {"k": [9.0] * 9, "p": PROJECTION})
 
 
-def test_a_cloud_and_its_grasps_in_every_message(client, sent, make_cloud, cloud) -> None:
+def test_a_cloud_and_its_grasps_in_every_message(client, cloud) -> None:
     settings = Settings(target_frame="base", hand_frame="hand", parent_link="link8")
     options = {"seed": 3, "top_k": 5}
     found = detect(client, Scene(make_cloud(cloud)), settings, options)
@@ -128,7 +122,7 @@ def shifted(z: float) -> np.ndarray:
     return np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, z], [0, 0, 0, 1]])
 
 
-def test_the_first_pose_follows_its_object_from_message_to_message(real_server, sent, make_cloud):
+def test_the_first_pose_follows_its_object_from_message_to_message(real_server):
     tracker, places = GraspTracker(max_object_size=0.3), []
     settings = Settings(camera_frame="camera")
     with GraspClient(real_server.grpc_address) as client:
@@ -150,9 +144,9 @@ def matrix(pose: Any) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("kind", "encoding"), [(np.uint16, "16UC1"), (np.float32, "32FC1")])
-def test_a_depth_image_with_its_camera(client, make_image, camera, kind, encoding) -> None:
+def test_a_depth_image_with_its_camera(client, kind, encoding) -> None:
     depth = DEPTH if kind == np.uint16 else DEPTH.astype(kind) / 1000
-    scene = Scene(depth=make_image(depth, encoding, padding=6), camera=camera)
+    scene = Scene(depth=make_image(depth, encoding, padding=6), camera=CAMERA)
     found = detect(client, scene)
     expected = client.detect(depth_images=[{"depth": depth, "intrinsics": MATRIX}]).grasps
     assert found.header["frame_id"] == "camera"
@@ -177,7 +171,7 @@ def asked(client, cloud) -> Asked:
     return Asked(replace(client.detect(cloud, top_k=1), grasps=[]))
 
 
-def test_frames_say_where_the_camera_stands_and_what_is_up(asked, make_cloud, cloud) -> None:
+def test_frames_say_where_the_camera_stands_and_what_is_up(asked, cloud) -> None:
     settings = Settings(camera_frame="camera", gravity_frame="base")
     detect(asked, Scene(make_cloud(cloud, "base")), settings)
     np.testing.assert_allclose(asked.given["viewpoint"], [0.4, 0.0, 0.7])
@@ -193,20 +187,20 @@ def test_frames_say_where_the_camera_stands_and_what_is_up(asked, make_cloud, cl
 
 
 @pytest.mark.parametrize("encoding", ["mono8", "32SC1", "rgb8"])
-def test_a_mask_says_where(asked, make_image, camera, encoding) -> None:
+def test_a_mask_says_where(asked, encoding) -> None:
     wanted = DEPTH > 550
     kinds = {"mono8": np.uint8, "32SC1": np.int32}
     pixels = wanted.astype(kinds.get(encoding, np.uint8)) * 7
     if encoding == "rgb8":
         pixels = np.stack([pixels * 0, pixels, pixels * 0], axis=-1)
-    scene = Scene(None, make_image(DEPTH, "16UC1"), camera, make_image(pixels, encoding))
+    scene = Scene(None, make_image(DEPTH), CAMERA, make_image(pixels, encoding))
     detect(asked, scene)
     (outside,) = asked.given["contact_region"]["exclude"]
     np.testing.assert_array_equal(outside["mask"], ~wanted)
 
 
 @pytest.mark.parametrize("bigendian", [False, True])
-def test_an_object_and_its_scene_come_apart(asked, make_cloud, make_image, camera, bigendian):
+def test_an_object_and_its_scene_come_apart(asked, bigendian):
     organised = np.full((4, 50, 3), np.nan, np.float32)
     organised[1:] = np.random.default_rng(0).uniform(0.3, 0.4, (3, 50, 3))
     wanted = organised[2, :20]
@@ -218,7 +212,7 @@ def test_an_object_and_its_scene_come_apart(asked, make_cloud, make_image, camer
     np.testing.assert_allclose(asked.cloud[segment_ids == 1], wanted, atol=1e-5)
     assert len(wanted) + 100 < len(asked.cloud) <= 150
 
-    detect(asked, Scene(depth=make_image(DEPTH, "16UC1"), camera=camera), object_cloud=cluster)
+    detect(asked, Scene(depth=make_image(DEPTH), camera=CAMERA), object_cloud=cluster)
     around = asked.cloud[asked.given["segment_ids"] == 0]
     assert len(around) == DEPTH.size
     column = 60.0 * around[:, 0] / around[:, 2] + 15.5
@@ -228,7 +222,7 @@ def test_an_object_and_its_scene_come_apart(asked, make_cloud, make_image, camer
     assert asked.cloud is cluster
 
 
-def test_no_grasp_and_an_aborted_goal_say_why(asked, sent, make_cloud, cloud) -> None:
+def test_no_grasp_and_an_aborted_goal_say_why(asked, cloud) -> None:
     found = detect(asked, Scene(make_cloud(cloud)))
     for fields, message in (
         (bridge.object_results(found, Settings(), "mug"), "No grasp: 500 points"),
@@ -239,7 +233,7 @@ def test_no_grasp_and_an_aborted_goal_say_why(asked, sent, make_cloud, cloud) ->
         assert message in each.message
 
 
-def test_a_mask_is_of_the_image_it_was_made_of_and_grows_old(make_image, camera) -> None:
+def test_a_mask_is_of_the_image_it_was_made_of_and_grows_old() -> None:
     def at(second: int, pixels: np.ndarray, encoding: str) -> Any:
         image = make_image(pixels, encoding)
         image.header.stamp.sec = second
@@ -247,28 +241,28 @@ def test_a_mask_is_of_the_image_it_was_made_of_and_grows_old(make_image, camera)
 
     inbox, mask = Inbox(), np.ones((24, 32), np.uint8)
     assert inbox.scene(1.5) == Scene()
-    assert not inbox.take("camera", camera, 1.5)
+    assert not inbox.take("camera", CAMERA, 1.5)
     first, second, third = (at(sec, DEPTH, "16UC1") for sec in (1, 2, 9))
     assert inbox.take("depth", first, 1.5)
     assert inbox.take("depth", second, 1.5)
-    assert inbox.scene(1.5) == Scene(depth=second, camera=camera)
+    assert inbox.scene(1.5) == Scene(depth=second, camera=CAMERA)
     of_first = at(1, mask, "mono8")
     assert inbox.take("mask", of_first, 1.5)
-    assert inbox.scene(1.5) == Scene(depth=first, camera=camera, mask=of_first)
+    assert inbox.scene(1.5) == Scene(depth=first, camera=CAMERA, mask=of_first)
     assert not inbox.take("depth", third, 1.5)  # its mask is still to come
     with pytest.raises(ValueError, match="mask is 8 s older than the newest image"):
         inbox.scene(2.0)
-    assert inbox.scene(0.0) == Scene(depth=third, camera=camera)
+    assert inbox.scene(0.0) == Scene(depth=third, camera=CAMERA)
     inbox.take("mask", at(8, mask, "mono8"), 1.5)
     with pytest.raises(ValueError, match="No image has the stamp of the mask"):
         inbox.scene(1.5)
 
 
-def test_images_of_several_cameras_are_one_cloud(asked, make_image, camera) -> None:
-    inbox, aside = Inbox(), make_image(DEPTH, "16UC1")
+def test_images_of_several_cameras_are_one_cloud(asked) -> None:
+    inbox, aside = Inbox(), make_image(DEPTH)
     aside.header.frame_id = "link8"
-    inbox.take("camera", camera, 0.0)
-    for image in (aside, make_image(DEPTH, "16UC1")):
+    inbox.take("camera", CAMERA, 0.0)
+    for image in (aside, make_image(DEPTH)):
         inbox.take("depth", image, 0.0)
     detect(asked, inbox.scene(0.0))
     poses = [image["T_cloud_camera"] for image in asked.given["depth_images"]]
@@ -276,7 +270,7 @@ def test_images_of_several_cameras_are_one_cloud(asked, make_image, camera) -> N
     np.testing.assert_allclose(poses, expected, atol=1e-12)
 
 
-def test_every_option_is_a_parameter(client, make_cloud, cloud) -> None:
+def test_every_option_is_a_parameter(client, cloud) -> None:
     parameters = bridge.parameters()
     assert {f"options.{name}" for name in DetectOptions.__annotations__} < set(parameters)
     given = parameters | {
@@ -296,8 +290,8 @@ def test_every_option_is_a_parameter(client, make_cloud, cloud) -> None:
         detect(client, Scene(make_cloud(cloud)), settings, options | {"top_k": "many"})
 
 
-def test_messages_that_cannot_be_used(client, sent, make_cloud, make_image, camera, cloud) -> None:
-    image = make_image(DEPTH, "16UC1")
+def test_messages_that_cannot_be_used(client, cloud) -> None:
+    image = make_image(DEPTH)
     empty = sent("sensor_msgs/msg/CameraInfo", {"header": HEADER})
     flat = make_cloud(cloud)
     flat.fields[0].name = "intensity"
@@ -305,8 +299,8 @@ def test_messages_that_cannot_be_used(client, sent, make_cloud, make_image, came
         (Scene(), None, "No cloud and no depth image has arrived yet"),
         (Scene(depth=image), None, "no CameraInfo yet"),
         (Scene(depth=image, camera=empty), None, "p and k are 0"),
-        (Scene(depth=make_image(DEPTH, "bayer"), camera=camera), None, "encoding: got 'bayer'"),
-        (Scene(depth=make_image(DEPTH.astype("i4"), "32SC1"), camera=camera), None, "'32SC1' for"),
+        (Scene(depth=make_image(DEPTH, "bayer"), camera=CAMERA), None, "encoding: got 'bayer'"),
+        (Scene(depth=make_image(DEPTH.astype("i4"), "32SC1"), camera=CAMERA), None, "'32SC1' for"),
         (Scene(make_cloud(cloud)), flat, "Send x too, as 7"),
     ):
         with pytest.raises((ValueError, InvalidRequest), match=message):
@@ -331,7 +325,7 @@ def planning(client, cloud) -> Asked:
     return asked
 
 
-def test_the_best_pick_is_a_trajectory_of_the_arm(planning, sent, make_cloud, cloud) -> None:
+def test_the_best_pick_is_a_trajectory_of_the_arm(planning, cloud) -> None:
     inbox = Inbox()
     inbox.take("cloud", make_cloud(cloud), 1.0)
     for names, positions in ((["b", "finger"], [0.2, 0.04]), (["a"], [0.1])):
@@ -352,7 +346,7 @@ def test_the_best_pick_is_a_trajectory_of_the_arm(planning, sent, make_cloud, cl
         first = last
 
 
-def test_a_known_arm_is_where_it_is_before_a_scene(planning, make_cloud, cloud) -> None:
+def test_a_known_arm_is_where_it_is_before_a_scene(planning, cloud) -> None:
     """The cloud of an action's object may be the only one."""
     scene, options = Scene(joints={"a": 0.1, "b": 0.2}), {"robot": "arm"}
     detect(planning, scene, options=options, object_cloud=make_cloud(cloud))
