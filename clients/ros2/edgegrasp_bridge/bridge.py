@@ -20,7 +20,7 @@ from edgegrasp_client import GraspClient, GraspTracker, conversions, object_in_s
 from edgegrasp_client.conversions import Message, pose_fields, xyz_fields
 from edgegrasp_client.options import DetectOptions
 from edgegrasp_client.requests import option_of_text
-from edgegrasp_results import Detection, Grasp
+from edgegrasp_results import Detection
 
 Lookup = Callable[[str, str, Any], Float64]
 """lookup(target, source, stamp): T_target_source (4, 4), as tf2 has it; stamp None: the latest."""
@@ -158,12 +158,10 @@ class Inbox:
         return self._cameras.get(depth.header.frame_id, only)
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
-    """Grasps in one frame."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Found(Detection):
+    """A detection whose grasps' T_cloud_hand and approach_direction are in the header's frame."""
 
-    grasps: list[Grasp]  # T_cloud_hand and approach_direction are in the header's frame
-    detection: Detection  # as the server answered it, in the frame of the cloud
     header: Message  # std_msgs/Header
 
 
@@ -225,8 +223,8 @@ def detect(
     for grasp in found.grasps:
         pose = (T_target_cloud @ grasp.T_cloud_hand).astype(np.float32)
         grasps.append(replace(grasp, T_cloud_hand=pose, approach_direction=pose[:3, 2]))
-    taken = {"sec": stamp.sec, "nanosec": stamp.nanosec}
-    return Found(grasps, found, {"stamp": taken, "frame_id": target})
+    header = {"stamp": {"sec": stamp.sec, "nanosec": stamp.nanosec}, "frame_id": target}
+    return Found(**vars(found) | {"grasps": grasps}, header=header)
 
 
 def pose_array(found: Found, back: float = 0.0) -> Message:
@@ -238,9 +236,9 @@ def pose_array(found: Found, back: float = 0.0) -> Message:
 def marker_array(found: Found) -> Message:
     """visualization_msgs/MarkerArray: a fork for each grasp, red to green by its score."""
     markers: list[Message] = [{"header": found.header, "action": DELETE_ALL}]
-    gripper = found.detection.gripper
+    palm_and_tip = found.gripper.palm_z, found.gripper.tip_z
     for number, grasp in enumerate(found.grasps):
-        pieces = fork(grasp.T_cloud_hand, grasp.width, (gripper.palm_z, gripper.tip_z))
+        pieces = fork(grasp.T_cloud_hand, grasp.width, palm_and_tip)
         score = float(grasp.score)
         marker = {
             "header": found.header,
@@ -257,9 +255,9 @@ def marker_array(found: Found) -> Message:
 
 def trajectories(found: Found) -> list[Message]:
     """The motion to the best pick and on, as trajectory_msgs/JointTrajectory; empty without one."""
-    pick = found.detection.best_pick
-    motion = None if pick is None or pick.arm is None else pick.arm.trajectory
-    return [] if motion is None else conversions.joint_trajectories(motion)
+    pick = found.best_pick
+    motion = pick and pick.arm and pick.arm.trajectory
+    return conversions.joint_trajectories(motion) if motion else []
 
 
 def moveit_grasps(found: Found, settings: Settings, lookup: Lookup) -> Message:
@@ -287,15 +285,14 @@ def object_results(found: Found, settings: Settings, object_id: str = "", most: 
 
     `object_id` names the object whose cloud was sent; empty: all, by their numbers.
     """
-    detection = found.detection
     groups = {
         str(thing.number): [each for each in found.grasps if each.object == thing.number]
-        for thing in detection.objects
+        for thing in found.objects
     }
     if object_id or not groups:
         groups = {object_id: found.grasps}
-    stages = ", ".join(f"{count} {stage}" for stage, count in detection.counts.items())
-    why = " ".join([f"No grasp: {stages}.", *detection.warnings])
+    stages = ", ".join(f"{count} {stage}" for stage, count in found.counts.items())
+    why = " ".join([f"No grasp: {stages}.", *found.warnings])
     results: list[Message] = []
     for name, grasps in groups.items():
         candidates = [

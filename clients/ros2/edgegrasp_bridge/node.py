@@ -103,7 +103,7 @@ class EdgeGraspNode(Node):
         found = bridge.detect(
             self._client, scene, settings, options, self._lookup, object_cloud, tracker
         )
-        for warning in found.detection.warnings:
+        for warning in found.warnings:
             self.get_logger().warning(warning)
         motions = zip(self._motions, bridge.trajectories(found), strict=False)
         for publisher, message, fields in (
