@@ -76,15 +76,11 @@ def sent_cloud(file: Path | None, images: Sequence[Any] | None) -> CloudInput:
     """The cloud of a request: that of a file, or of depth images whose depths are files."""
     if file is not None:
         return read_file(file.suffix[1:].lower(), file.read_bytes(), sys.maxsize)
-    views = [
-        DepthView(
-            intrinsics_of(image["intrinsics"]),
-            image.get("T_cloud_camera", np.eye(4)),
-            image.get("depth_scale"),
-        )
-        for image in images or ()
-    ]
-    depths = [pixels(Path(str(image["depth"]))) for image in images or ()]
+    depths, views = [], []
+    for image in images or ():
+        camera = {name: value for name, value in image.items() if name != "depth"}
+        depths.append(pixels(Path(str(image["depth"]))))
+        views.append(DepthView(**camera | {"intrinsics": intrinsics_of(image["intrinsics"])}))
     return fuse_depth_images(depths, views)
 
 
