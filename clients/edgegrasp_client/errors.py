@@ -72,7 +72,6 @@ _BY_KIND: dict[str, type[GraspClientError]] = {
     "headers-too-large": InvalidRequestError,
     "unauthenticated": AccessDeniedError,
     "permission-denied": AccessDeniedError,
-    "reload-failed": ServerFailedError,
     "detector-failed": ServerFailedError,
     "disk-full": ServerFailedError,
     "not-ready": ServerUnavailableError,

@@ -264,8 +264,7 @@ def _extend(container: Any, values: object, path: str, messages: bool) -> None:
     try:
         container.extend(values)
     except (TypeError, ValueError) as error:
-        nested = any(isinstance(value, (list, tuple, np.ndarray)) for value in values)
-        fix = "Give one list without lists in it, or an array of bool." if nested else f"{error}."
+        fix = f"Give one flat list, or an array of bool. {error}."
         raise invalid(path, repr(values)[:80], fix) from None
 
 
