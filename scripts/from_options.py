@@ -123,8 +123,10 @@ def client_options() -> str:
     schema = DetectOptions.model_json_schema()
     schemas = {**schema.pop("$defs"), "DetectOptions": schema}
     named = {name: re.findall(r"#/\$defs/(\w+)", str(each)) for name, each in schemas.items()}
-    order = TopologicalSorter(named).static_order()
-    return HEAD + "".join(class_of(name, schemas[name]) for name in order)
+    order = list(TopologicalSorter(named).static_order())
+    names = "".join(f'    "{name}",\n' for name in sorted(order))
+    exported = f"\n__all__ = [\n{names}]\n"
+    return HEAD + exported + "".join(class_of(name, schemas[name]) for name in order)
 
 
 if __name__ == "__main__":

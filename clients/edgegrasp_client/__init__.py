@@ -24,26 +24,7 @@ from edgegrasp_client.errors import ServerUnavailableError as ServerUnavailableE
 from edgegrasp_client.errors import StartCollisionError as StartCollisionError
 from edgegrasp_client.errors import UnknownModelError as UnknownModelError
 from edgegrasp_client.errors import WorkerLostError as WorkerLostError
-from edgegrasp_client.options import ApproachDirection as ApproachDirection
-from edgegrasp_client.options import Box as Box
-from edgegrasp_client.options import Collision as Collision
-from edgegrasp_client.options import Cone as Cone
-from edgegrasp_client.options import DetectOptions as DetectOptions
-from edgegrasp_client.options import GripperGeometry as GripperGeometry
-from edgegrasp_client.options import HalfSpace as HalfSpace
-from edgegrasp_client.options import HandPart as HandPart
-from edgegrasp_client.options import Indices as Indices
-from edgegrasp_client.options import Linkage as Linkage
-from edgegrasp_client.options import Mask as Mask
-from edgegrasp_client.options import ObjectChoice as ObjectChoice
-from edgegrasp_client.options import OrientedBox as OrientedBox
-from edgegrasp_client.options import RansacPlane as RansacPlane
-from edgegrasp_client.options import Region as Region
-from edgegrasp_client.options import Segments as Segments
-from edgegrasp_client.options import Sphere as Sphere
-from edgegrasp_client.options import SupportPlane as SupportPlane
-from edgegrasp_client.options import Suppression as Suppression
-from edgegrasp_client.options import Workspace as Workspace
+from edgegrasp_client.options import *  # noqa: F403  # the names of its `__all__`
 from edgegrasp_client.requests import DepthImage as DepthImage
 from edgegrasp_client.requests import Intrinsics as Intrinsics
 from edgegrasp_client.requests import RequestFields as RequestFields

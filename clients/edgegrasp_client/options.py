@@ -12,6 +12,36 @@ from typing_extensions import NotRequired, TypedDict
 
 Numbers = Sequence[float] | NDArray[Any]
 
+__all__ = [
+    "ApproachDirection",
+    "AutoPlane",
+    "Box",
+    "Collision",
+    "Cone",
+    "DetectOptions",
+    "GripperGeometry",
+    "HalfSpace",
+    "HandPart",
+    "Indices",
+    "Linkage",
+    "Mask",
+    "ObjectChoice",
+    "OrientedBox",
+    "Place",
+    "PlaceRegion",
+    "Previous",
+    "PreviousGrasp",
+    "PreviousObject",
+    "RansacPlane",
+    "Region",
+    "RobotArm",
+    "Segments",
+    "Sphere",
+    "SupportPlane",
+    "Suppression",
+    "Workspace",
+]
+
 
 class Cone(TypedDict):
     """Directions within an angle of a given one."""
