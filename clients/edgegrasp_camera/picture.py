@@ -150,6 +150,7 @@ class Picture:
         self._axes: Any = self._figure.add_axes((0, self._foot, 1, 1 - self._foot))
         self._axes.set_axis_off()
         self._axes.imshow(image)
+        self._axes.autoscale(False)
         self._point = 72 * WIDTH / columns  # points that a pixel is wide
         self._figure.text(0.015, self._foot / 2, title, fontsize=10, va="center")
 
@@ -192,11 +193,10 @@ class Picture:
 
         They have a score, a T_cloud_hand (4, 4) and a width in metres, as the server's have.
         """
-        from matplotlib import colormaps
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import Normalize
 
-        scale: Any = ScalarMappable(Normalize(0.0, 1.0), colormaps[MAP])
+        scale: Any = ScalarMappable(Normalize(0.0, 1.0), MAP)
         for rank, grasp in reversed(list(enumerate(grasps))):
             pieces = fork(grasp.T_cloud_hand, grasp.width, palm_and_tip)
             self._fork(pieces, scale.to_rgba(grasp.score))
@@ -217,23 +217,18 @@ class Picture:
 
     def _fork(self, pieces: Float64, color: Any) -> None:
         """Draw a fork, (4, 2, 3), faintly where the cloud hides it."""
-        _, depth = self.view.project(pieces)
+        along = np.linspace(pieces[:, 0], pieces[:, 1], 17, axis=1)  # (4, 17, 3)
+        pixels, depth = self.view.project(along)
+        hidden = depth > self._depth_at(pixels) + BEHIND
         bar = float(np.clip(BAR * self.view.fy / np.median(depth) * self._point, *BARS))
         for width, shade in ((bar + 1.6, OUTLINE), (bar, color)):
-            for start, end in pieces:
-                along = start + np.linspace(0, 1, 17)[:, None] * (end - start)
-                pixels, far = self.view.project(along)
-                hidden = far > self._depth_at(pixels) + BEHIND
-                for solid in (True, False):
-                    part = np.where((hidden ^ solid)[:, None], pixels, np.nan)
-                    alpha, cap = (1.0, "round") if solid else (0.25, "butt")
-                    self._axes.plot(
-                        *part.T, color=shade, linewidth=width, alpha=alpha, solid_capstyle=cap
-                    )
+            for solid, alpha, cap in ((True, 1.0, "round"), (False, 0.25, "butt")):
+                x, y = np.where((hidden ^ solid)[..., None], pixels, np.nan).T
+                self._axes.plot(x, y, color=shade, linewidth=width, alpha=alpha, solid_capstyle=cap)
 
     def _depth_at(self, pixels: Float64) -> Float64:
-        """Distance of the cloud at pixels (K, 2); NaN where there is no point."""
-        column, row = np.rint(pixels).astype(int).T
+        """Distance of the cloud at pixels (..., 2); NaN where there is no point."""
+        column, row = np.moveaxis(np.rint(pixels).astype(int), -1, 0)
         rows, columns = self.view.shape
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         at = np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
@@ -241,8 +236,6 @@ class Picture:
 
     def save(self, path: Path | BinaryIO) -> None:
         """Write it: a `.png` or `.jpg` file, whose folder must exist, or a PNG to a stream."""
-        rows, columns = self.view.shape
-        self._axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
         self._figure.savefig(path)
 
 
