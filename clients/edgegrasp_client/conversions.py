@@ -23,11 +23,7 @@ from edgegrasp_results import ArmTrajectory, Grasp
 
 Message = dict[str, Any]
 
-_AXES = {
-    sign + axis: direction * np.eye(3)[row]
-    for sign, direction in (("", 1.0), ("-", -1.0))
-    for row, axis in enumerate("xyz")
-}
+_AXES = dict(zip(("x", "y", "z", "-x", "-y", "-z"), [*np.eye(3), *-np.eye(3)], strict=True))
 
 
 @dataclass(frozen=True)
@@ -43,11 +39,9 @@ class HandFrame:
     origin_z: float = 0.0  # metres from our hand frame's origin to its own, along our z
 
     def __post_init__(self) -> None:
-        for axis in (self.approach, self.closing):
-            if axis not in _AXES:
-                raise ValueError(f"got {axis!r}. Use one of: {', '.join(_AXES)}.")
-        if self.approach[-1] == self.closing[-1]:
-            raise ValueError(f"approach and closing are both along {self.approach[-1]}.")
+        axes = self.approach, self.closing
+        if not _AXES.keys() >= {*axes} or len({axis[-1] for axis in axes}) < 2:
+            raise ValueError(f"got {axes}. Use one of {', '.join(_AXES)}, and one across it.")
 
     @property
     def T_hand_frame(self) -> Float64:  # noqa: N802
