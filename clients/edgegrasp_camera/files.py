@@ -300,8 +300,6 @@ def _read_pcd(data: bytes, max_points: int) -> CloudInput:
     """Read x, y, z of the points, and normals, rgb and the viewpoint if present."""
     lines, end = _read_header(data, PCD_HEADER_END)
     header = {words[0]: words[1:] for words in lines if words}
-    if missing := {"FIELDS", "TYPE", "SIZE", "POINTS"} - header.keys():
-        raise ValueError(f"no line {', '.join(missing)}")
     names = header["FIELDS"]
     counts = header.get("COUNT", ["1"] * len(names))
     kinds = [kind + size for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
