@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,7 @@ class PointField(Protocol):
     count: int
 
 
+@runtime_checkable
 class PointCloud2(Protocol):
     """The attributes of sensor_msgs/PointCloud2, metres; ROS itself is not needed."""
 

@@ -166,10 +166,10 @@ class OwnDetector:
         fields: dict[str, Any] = {
             name: File("npy", npy_bytes(array)) for name, array in request.arrays.items()
         }
-        if request.depth_images is None:
-            fields["cloud"] = File(*cloud_file(cloud))
+        if request.cloud is not None:
+            fields["cloud"] = File(*cloud_file(request.cloud))
         else:
-            images = enumerate(request.depth_images)
+            images = enumerate(request.depth_images or ())
             fields["depth_images"] = [depth_image_fields(image, row) for row, image in images]
         sent, parsed = decode_cloud(fields, parse_options(request.options), sys.maxsize)
         detector = self._catalogue.get(parsed.model)

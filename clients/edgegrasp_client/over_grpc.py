@@ -19,8 +19,6 @@ from edgegrasp_client.requests import (
     cloud_file,
     depth_image_fields,
     float32_points,
-    is_point_cloud2,
-    point_cloud2_fields,
 )
 from edgegrasp_client.results import Answer, Model, StreamAnswer, field_of, read_as
 from edgegrasp_results import Detection
@@ -188,11 +186,6 @@ def wire_of(request: Request) -> list[bytes | memoryview]:
             fill(view, fields, f"depth_images.{which}")
             whole = view.SerializeToString(), *_field(view, "depth", *data)
             long += _field(message, "depth_images", *whole)
-    elif is_point_cloud2(cloud):
-        fields = point_cloud2_fields(cloud)
-        data = _field(message.point_cloud2, "data", fields.pop("data"))
-        fill(message.point_cloud2, fields, "point_cloud2")
-        long += _field(message, "point_cloud2", *data)
     elif (points := float32_points(cloud)) is not None:
         long += _field(message, "points", _little_endian(points))
     else:

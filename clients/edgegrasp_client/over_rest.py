@@ -18,9 +18,7 @@ from edgegrasp_client.requests import (
     Request,
     cloud_file,
     depth_image_fields,
-    is_point_cloud2,
     npy_bytes,
-    point_cloud2_fields,
 )
 from edgegrasp_client.results import Answer, StreamAnswer, read_as
 from edgegrasp_results import Detection
@@ -123,7 +121,7 @@ def call_of(request: Request) -> Call:
     cloud = request.cloud
     query = {name: _text(f"options.{name}", value) for name, value in request.options.items()}
     short = sum(map(len, query.values())) < MAX_QUERY
-    if short and not (cloud is None or is_point_cloud2(cloud) or request.arrays):
+    if short and cloud is not None and not request.arrays:
         file_format, data = cloud_file(cloud)
         headers = {"content-type": f"application/x-{file_format}"}
         post = {"method": "POST", "url": "/v1/grasps", "headers": headers}
@@ -144,8 +142,6 @@ def call_of(request: Request) -> Call:
             parts |= {name: _json_part(name, value) for name, value in image.items()}
         else:
             parts["depth_images"] = _json_part("depth_images", fields)
-    elif is_point_cloud2(cloud):
-        parts["point_cloud2"] = _json_part("point_cloud2", point_cloud2_fields(cloud))
     else:
         file_format, data = cloud_file(cloud)
         parts["cloud"] = (f"cloud.{file_format}", data, f"application/x-{file_format}")

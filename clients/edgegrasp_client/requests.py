@@ -10,14 +10,15 @@ from collections.abc import Mapping, Sequence
 from numbers import Real
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeGuard, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import NotRequired, TypedDict, Unpack
 
+from edgegrasp_camera import InvalidRequest
 from edgegrasp_camera.arrays import Array, Float32
-from edgegrasp_camera.clouds import PointCloud2, PointField
+from edgegrasp_camera.clouds import PointCloud2, read_point_cloud2
 from edgegrasp_camera.depth import ENCODINGS, intrinsics_of
 from edgegrasp_camera.files import FILE_FORMATS
 from edgegrasp_client.connection import seconds_of
@@ -90,7 +91,7 @@ class Request:
         # edges and hand_poses, one of them None
         to_score: Mapping[str, Array | None] | None = None,
     ) -> None:
-        given, self.cloud, self.scores = dict(fields), cloud, to_score is not None
+        given, self.scores = dict(fields), to_score is not None
         self.depth_images: Sequence[DepthImage] | None = given.pop("depth_images", None)
         beside = {name: given.pop(name, None) for name in BESIDE} | dict(to_score or {})
         self.options = plain_options(given)
@@ -100,6 +101,10 @@ class Request:
         if to_score and (to_score["edges"] is None) == (to_score["hand_poses"] is None):
             value = "nothing" if to_score["edges"] is None else "edges beside hand_poses"
             raise invalid("edges", value, "Give edges or hand_poses.")
+        if isinstance(cloud, PointCloud2):
+            cloud, normals = _points_and_normals(cloud)
+            beside["normals"] = normals if beside["normals"] is None else beside["normals"]
+        self.cloud = cloud
         # (N, 3) float32 or (N,) int32; edges (M, 2) and hand poses (M, 4, 4) as they were given.
         self.arrays = {
             name: _sent(name, array) for name, array in beside.items() if array is not None
@@ -246,23 +251,13 @@ def npy_bytes(array: Array) -> bytes:
     return b"".join([head.getvalue(), array.reshape(-1).view(np.uint8).data])
 
 
-def is_point_cloud2(cloud: object) -> TypeGuard[PointCloud2]:
-    """Whether an object has the attributes of sensor_msgs/PointCloud2."""
-    return all(hasattr(cloud, name) for name in PointCloud2.__annotations__)
-
-
-def point_cloud2_fields(cloud: PointCloud2) -> dict[str, Any]:
-    """The fields of edgegrasp.v1.PointCloud2; `data` as bytes."""
-    data = cloud.data
-    if not isinstance(data, bytes):
-        data = np.asarray(data, dtype=np.uint8).tobytes()
-    names = PointCloud2.__annotations__.keys() - {"data", "fields"}
-    own = {name: _plain(getattr(cloud, name)) for name in names}
-    of_each = [
-        {name: _plain(getattr(field, name)) for name in PointField.__annotations__}
-        for field in cloud.fields
-    ]
-    return own | {"fields": of_each, "data": data}
+def _points_and_normals(message: PointCloud2) -> tuple[Array, Array | None]:
+    """What a grasp depends on; raises InvalidRequestError for a message that contradicts itself."""
+    try:
+        found: Any = read_point_cloud2(message)
+    except InvalidRequest as error:
+        raise invalid(error.field, error.value, error.fix) from None
+    return found.points, found.normals
 
 
 def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:

@@ -54,7 +54,7 @@ def test_organised_clouds_may_have_holes(client, cloud) -> None:
     assert found.counts["points"] == 499
 
 
-def test_point_cloud2_messages_are_sent_as_they_are(client, cloud) -> None:
+def test_point_cloud2_messages_are_read(client, cloud) -> None:
     expected = contacts(client.detect(cloud))
     assert contacts(client.detect(ros_message(cloud))) == expected
     listed = ros_message(cloud, data=list(cloud.tobytes()))
