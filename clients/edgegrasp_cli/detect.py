@@ -160,12 +160,10 @@ class OwnDetector:
 
     def detect(self, cloud: Any = None, **asked: Any) -> Any:
         """Find grasps in a cloud, as `GraspClient.detect`; raises also as the detector."""
-        from edgegrasp_client.requests import Request, cloud_file, depth_image_fields, npy_bytes
+        from edgegrasp_client.requests import Request, cloud_file, depth_image_fields
 
         request = Request(cloud, asked)
-        fields: dict[str, Any] = {
-            name: File("npy", npy_bytes(array)) for name, array in request.arrays.items()
-        }
+        fields: dict[str, Any] = {name: array.tobytes() for name, array in request.arrays.items()}
         if request.cloud is not None:
             fields["cloud"] = File(*cloud_file(request.cloud))
         else:
