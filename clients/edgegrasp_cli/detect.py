@@ -160,15 +160,14 @@ class OwnDetector:
 
     def detect(self, cloud: Any = None, **asked: Any) -> Any:
         """Find grasps in a cloud, as `GraspClient.detect`; raises also as the detector."""
-        from edgegrasp_client.requests import Request, cloud_file, depth_image_fields
+        from edgegrasp_client.requests import Request, cloud_file
 
         request = Request(cloud, asked)
         fields: dict[str, Any] = {name: array.tobytes() for name, array in request.arrays.items()}
-        if request.cloud is not None:
-            fields["cloud"] = File(*cloud_file(request.cloud))
+        if request.cloud is None:
+            fields["depth_images"] = request.depth_images
         else:
-            images = enumerate(request.depth_images or ())
-            fields["depth_images"] = [depth_image_fields(image, row) for row, image in images]
+            fields["cloud"] = File(*cloud_file(request.cloud))
         sent, parsed = decode_cloud(fields, parse_options(request.options), sys.maxsize)
         detector = self._catalogue.get(parsed.model)
         if parsed.robot is None:

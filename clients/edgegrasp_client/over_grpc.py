@@ -14,12 +14,7 @@ from edgegrasp_camera.arrays import Array
 from edgegrasp_client import errors
 from edgegrasp_client.connection import Tls, token_metadata
 from edgegrasp_client.errors import GraspClientError, error_of_kind, invalid
-from edgegrasp_client.requests import (
-    Request,
-    cloud_file,
-    depth_image_fields,
-    float32_points,
-)
+from edgegrasp_client.requests import Request, cloud_file, float32_points
 from edgegrasp_client.results import Answer, Model, StreamAnswer, field_of, read_as
 from edgegrasp_results import Detection
 
@@ -180,10 +175,10 @@ def wire_of(request: Request) -> list[bytes | memoryview]:
     long: list[bytes | memoryview] = []
     cloud = request.cloud
     if cloud is None:
-        for which, image in enumerate(request.depth_images or ()):
-            view, fields = grasp_pb2.DepthImage(), depth_image_fields(image, which)
-            data = _field(view.depth, "data", fields["depth"].pop("data"))
-            fill(view, fields, f"depth_images.{which}")
+        for which, image in enumerate(request.depth_images):
+            view, depth = grasp_pb2.DepthImage(), dict(image["depth"])
+            data = _field(view.depth, "data", depth.pop("data"))
+            fill(view, image | {"depth": depth}, f"depth_images.{which}")
             whole = view.SerializeToString(), *_field(view, "depth", *data)
             long += _field(message, "depth_images", *whole)
     elif (points := float32_points(cloud)) is not None:

@@ -3,7 +3,7 @@
 import base64
 import json
 import ssl
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -14,12 +14,7 @@ from edgegrasp_camera.depth import ENCODINGS
 from edgegrasp_client import errors
 from edgegrasp_client.connection import HTTP_OVER_UNIX, Tls, token_metadata
 from edgegrasp_client.errors import GraspClientError, error_of_kind, invalid
-from edgegrasp_client.requests import (
-    Request,
-    cloud_file,
-    depth_image_fields,
-    npy_bytes,
-)
+from edgegrasp_client.requests import Request, cloud_file, npy_bytes
 from edgegrasp_client.results import Answer, StreamAnswer, read_as
 from edgegrasp_results import Detection
 
@@ -118,37 +113,35 @@ def call_of(request: Request) -> Call:
     Sends a point cloud file as the body and options as query parameters, or a form if there is
     more.
     """
-    cloud = request.cloud
     query = {name: _text(f"options.{name}", value) for name, value in request.options.items()}
-    short = sum(map(len, query.values())) < MAX_QUERY
-    if short and cloud is not None and not request.arrays:
-        file_format, data = cloud_file(cloud)
-        headers = {"content-type": f"application/x-{file_format}"}
-        post = {"method": "POST", "url": "/v1/grasps", "headers": headers}
-        return {**post, "params": query, "content": data}
     parts: dict[str, Part] = {"options": _json_part("options", request.options)}
-    if cloud is None:
-        images = enumerate(request.depth_images or ())
-        fields = [depth_image_fields(image, number) for number, image in images]
-        if len(fields) == 1:
-            (image,) = fields
-            depth = image.pop("depth")
-            if depth["encoding"] == "png":
-                parts["depth"] = ("depth.png", depth["data"], "image/png")
-            else:
-                pixels = np.frombuffer(depth["data"], ENCODINGS[depth["encoding"]])
-                content = npy_bytes(pixels.reshape(depth["height"], depth["width"]))
-                parts["depth"] = ("depth.npy", content, "application/x-npy")
-            parts |= {name: _json_part(name, value) for name, value in image.items()}
-        else:
-            parts["depth_images"] = _json_part("depth_images", fields)
+    if request.cloud is None:
+        parts |= _image_parts(request.depth_images)
     else:
-        file_format, data = cloud_file(cloud)
-        parts["cloud"] = (f"cloud.{file_format}", data, f"application/x-{file_format}")
+        file_format, data = cloud_file(request.cloud)
+        media = f"application/x-{file_format}"
+        if not request.arrays and sum(map(len, query.values())) < MAX_QUERY:
+            post = {"method": "POST", "url": "/v1/grasps", "headers": {"content-type": media}}
+            return {**post, "params": query, "content": data}
+        parts["cloud"] = (f"cloud.{file_format}", data, media)
     for name, array in request.arrays.items():
         parts[name] = (f"{name}.npy", npy_bytes(array), "application/x-npy")
     path = "/v1/grasps:score" if request.scores else "/v1/grasps"
     return {"method": "POST", "url": path, "files": parts}
+
+
+def _image_parts(images: Sequence[Mapping[str, Any]]) -> dict[str, Part]:
+    """The parts of one image, whose depths are a file; of several, one of JSON."""
+    if len(images) != 1:
+        return {"depth_images": _json_part("depth_images", images)}
+    camera = dict(images[0])
+    depth = camera.pop("depth")
+    file_format, data = depth["encoding"], depth["data"]
+    if file_format != "png":
+        pixels = np.frombuffer(data, ENCODINGS[file_format])
+        file_format, data = "npy", npy_bytes(pixels.reshape(depth["height"], depth["width"]))
+    file = f"depth.{file_format}", data, f"application/x-{file_format}"
+    return {"depth": file} | {name: _json_part(name, value) for name, value in camera.items()}
 
 
 def _json_part(name: str, value: object) -> Part:

@@ -92,10 +92,10 @@ class Request:
         to_score: Mapping[str, Array | None] | None = None,
     ) -> None:
         given, self.scores = dict(fields), to_score is not None
-        self.depth_images: Sequence[DepthImage] | None = given.pop("depth_images", None)
+        images: Sequence[DepthImage] | None = given.pop("depth_images", None)
         beside = {name: given.pop(name, None) for name in BESIDE} | dict(to_score or {})
         self.options = plain_options(given)
-        if (cloud is None) == (self.depth_images is None):
+        if (cloud is None) == (images is None):
             value = "nothing" if cloud is None else "a cloud beside depth_images"
             raise invalid("cloud", value, "Give a cloud or depth_images.")
         if to_score and (to_score["edges"] is None) == (to_score["hand_poses"] is None):
@@ -105,6 +105,9 @@ class Request:
             cloud, normals = _points_and_normals(cloud)
             beside["normals"] = normals if beside["normals"] is None else beside["normals"]
         self.cloud = cloud
+        self.depth_images = [
+            depth_image_fields(image, row) for row, image in enumerate(images or ())
+        ]
         # (N, 3) float32 or (N,) int32; edges (M, 2) and hand poses (M, 4, 4) as they were given.
         self.arrays = {
             name: _sent(name, array) for name, array in beside.items() if array is not None
