@@ -95,13 +95,8 @@ class RestTransport:
             raise errors.unreachable(self._address, str(error) or type(error).__name__) from None
         try:
             body = response.json()
-        except ValueError:
-            body = None
-        if not isinstance(body, dict):
-            raise _foreign(response)
-        if not response.is_success:
-            raise _described(body, response)
-        try:
+            if not response.is_success:
+                raise _described(body, response)
             return read(body)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise _foreign(response) from error
