@@ -15,7 +15,6 @@ from edgegrasp_model.networks.config import (
     NetworkConfig,
 )
 from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
-from edgegrasp_model.networks.hand import HandNet
 from edgegrasp_model.networks.vn_edgegrasp import VNEdgeGraspNet
 
 CROP_RADIUS = 0.04  # metres; half the gripper's opening, as in the paper
@@ -48,27 +47,13 @@ def prepare_to_train(network: nn.Module) -> None:
                     module.weight.mul_(GAIN)
 
 
-def start_from(network: nn.Module, start: nn.Module) -> int:
-    """Copy trained weights into a new network, whose hand description may be longer.
-
-    Additional numbers start with weight 0. Returns how many `start`, which takes lengths in metres,
-    reads; 0 for networks of balls. ValueError: the networks differ in more than that.
-    """
-    weights, known = rescaled(start, LENGTH_UNIT).state_dict(), 0
-    if isinstance(network, HandNet) and isinstance(start, HandNet):
-        known = start.config.description_size
-        for name in ("mean", "std"):
-            weights[name] = torch.cat((weights[name], network.get_buffer(name)[known:].cpu()))
-        first = weights["classifier.0.weight"]
-        further = first.new_zeros(len(first), max(network.config.description_size - known, 0))
-        parts = first[:, :known], further, first[:, known:]
-        weights["classifier.0.weight"] = torch.cat(parts, dim=1)
+def start_from(network: nn.Module, start: nn.Module) -> None:
+    """Copy the weights of a network that takes lengths in metres; ValueError: another model."""
     try:
-        network.load_state_dict(weights)
+        network.load_state_dict(rescaled(start, LENGTH_UNIT).state_dict())
     except RuntimeError:  # which lists dozens of layers
         found = f"{type(start).__name__} to train {type(network).__name__}"
         raise ValueError(f"start_from: got {found}. Give weights of the same model.") from None
-    return known
 
 
 def rescaled(network: nn.Module, factor: float) -> nn.Module:

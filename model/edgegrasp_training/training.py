@@ -81,7 +81,8 @@ class Trainer:
         self.network = build_network(metadata.network, generator).to(device)
         prepare_to_train(self.network)
         self.start = None if start is None else load_checkpoint(start)
-        known = 0 if self.start is None else start_from(self.network, self.start[0])
+        if self.start is not None:
+            start_from(self.network, self.start[0])
         self.average = deepcopy(self.network).requires_grad_(False).eval()
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), options.learning_rate, weight_decay=WEIGHT_DECAY
@@ -97,8 +98,8 @@ class Trainer:
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).is_file():
             self._resume(torch.load(folder / STATE_FILE, weights_only=True, map_location=device))
-        else:
-            self._standardise(known)
+        elif self.start is None and isinstance(self.network, HandNet):
+            self._standardise(self.network)
 
     @property
     def finished(self) -> bool:
@@ -252,17 +253,13 @@ class Trainer:
             return pack_hands(grasps, balls, network, rng if vary else None)
         return pack_balls(grasps, balls, network, taught)
 
-    def _standardise(self, known: int) -> None:
-        """Fit mean and spread of the hand descriptions to the training views, but the first few."""
-        if not isinstance(self.network, HandNet):
-            return
+    def _standardise(self, network: HandNet) -> None:
+        """Fit mean and spread of the hand descriptions to the training views."""
         seen = [self._tried(path, True).seen for path in self.train_paths]
         values = np.concatenate([hands.description.numpy() for hands in seen if hands is not None])
         mean, std = values.mean(axis=0, dtype=np.float64), values.std(axis=0, dtype=np.float64)
-        # Weights that were trained with other statistics keep them.
-        mean[:known], std[:known] = self.network.mean[:known].cpu(), self.network.std[:known].cpu()
-        self.network.set_statistics(torch.from_numpy(mean), torch.from_numpy(std))
-        self.average.load_state_dict(self.network.state_dict())
+        network.set_statistics(torch.from_numpy(mean), torch.from_numpy(std))
+        self.average.load_state_dict(network.state_dict())
 
     def _save_average(self, metadata: CheckpointMetadata) -> None:
         """Write the running mean of the weights, for lengths in metres."""
