@@ -115,8 +115,11 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
 
 def constants(engine: str) -> dict[str, float]:
     """The simulator's own constants, the same under every protocol."""
-    panda = hand.panda()
-    return engines.world_type(engine).constants | {
+    panda, world = hand.panda(), engines.world_type(engine)
+    return world.constants | {
+        "time_step": engines.TIME_STEP,
+        "gravity": engines.GRAVITY,
+        "collision_depth": world.collision_depth,
         "table_friction": surroundings.TABLE_FRICTION,
         "packed_attempts": scene.PACKED_ATTEMPTS,
         "pile_drop_height": scene.PILE_DROP_HEIGHT,

@@ -125,7 +125,7 @@ class World(Protocol):
     """A physics world; a process may have several. Removed bodies cannot be restored."""
 
     name: ClassVar[str]  # of the engine
-    constants: ClassVar[dict[str, float]]  # for the record of a result
+    constants: ClassVar[dict[str, float]]  # its own, for the record of a result
     collision_depth: ClassVar[float]  # metres; a finger sliding along an object overlaps it by less
     # How a hand is shaken while it holds an object: to either side and back, along x and y.
     shake_distance: ClassVar[float]  # metres to either side

@@ -49,10 +49,7 @@ class MujocoWorld(World):
 
     name = "mujoco"
     constants: ClassVar = {
-        "time_step": engine.TIME_STEP,
         "substeps": SUBSTEPS,
-        "gravity": engine.GRAVITY,
-        "collision_depth": COLLISION_DEPTH,
         "contact_seconds": CONTACT_SECONDS,
         "friction_impedance": FRICTION_IMPEDANCE,
         "arm_inertia": ARM_INERTIA,

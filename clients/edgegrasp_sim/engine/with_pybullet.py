@@ -30,10 +30,7 @@ class PybulletWorld(World):
 
     name = "pybullet"
     constants: ClassVar = {
-        "time_step": engine.TIME_STEP,
         "solver_iterations": SOLVER_ITERATIONS,
-        "gravity": engine.GRAVITY,
-        "collision_depth": COLLISION_DEPTH,
         "finger_spinning_friction": FINGER_SPINNING_FRICTION,
         "gear_force": GEAR_FORCE,
     }
