@@ -35,7 +35,6 @@ def generate_data(
     """
     from edgegrasp_sim.engine import choose_engine
     from edgegrasp_training.generation import generate, missing_scenes
-    from edgegrasp_training.views import find_views, write_data_card
 
     print(f"engine: {choose_engine(asked.engine)}")
     missing = len(missing_scenes(output, asked))
@@ -44,7 +43,6 @@ def generate_data(
         made = generate(output, asked.objects, asked, asked.workers, asked.ray)
         for _, grasps, successes in track(made, "scenes", total=missing):
             tried, held = tried + grasps, held + successes
-    write_data_card(output, find_views([output]), _command())
     share = f", {100 * held / tried:.1f} % held" if tried else ""
     kept = asked.scenes - missing
     print(f"{missing} scenes made, {kept} kept; {tried} grasps tried{share}.")
@@ -118,7 +116,7 @@ def train(
         trainer.run(on_step, asked.until)
     if trainer.finished:
         provenance = {"data": [folder.name for folder in data], "date": time.strftime("%Y-%m-%d")}
-        evaluation = trainer.finish(provenance, _command())
+        evaluation = trainer.finish(provenance, shlex.join(["edgegrasp", *sys.argv[1:]]))
         print(f"validation loss {evaluation.loss:.4f}, AUROC {evaluation.auroc:.4f}: {asked.run}")
     else:
         print(f"paused at step {trainer.step}; the same command continues")
@@ -182,8 +180,3 @@ def import_checkpoint(
     path = output or Path(f"{metadata.name}.safetensors")
     save_checkpoint(path, network, metadata)
     print(f"{path}: {metadata.network.architecture}, use it with --weights {path}")
-
-
-def _command() -> str:
-    """The command line, for data and model cards."""
-    return shlex.join(["edgegrasp", *sys.argv[1:]])

@@ -1,8 +1,7 @@
-"""Labelled views, which a data generator writes and a trainer reads, and their data card."""
+"""Labelled views, which a data generator writes and a trainer reads."""
 
 import json
 import zlib
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -170,43 +169,7 @@ def split_by_scene(
     )
 
 
-def write_data_card(folder: Path, paths: list[Path], command: str) -> None:
-    """Count views, scenes, labels and objects of each kind of scene in `card.md`."""
-    views = {path: load_view(path) for path in paths}
-    kind = {path: path.stem.split("_")[0] for path in paths}
-    kinds = [*sorted(set(kind.values())), "all"]
-    columns = [_facts({p: v for p, v in views.items() if k in (kind[p], "all")}) for k in kinds]
-    rows = [(fact, *(column[fact] for column in columns)) for fact in columns[0]]
-    objects = Counter(
-        known
-        for view in views.values()
-        for known in set(zip(view.objects, view.object_digests, strict=True))
-    )
-    lines = ["# Labelled views", "", *table(("", *kinds), rows)]
-    lines += ["", "Made by:", "", "```", command, "```", ""]
-    lines += ["Objects, the SHA-256 of their files, and in how many views they are:", ""]
-    lines += [f"- {name} `{digest}`: {count}" for (name, digest), count in sorted(objects.items())]
-    (folder / "card.md").write_text("\n".join(lines) + "\n")
-
-
 def table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> list[str]:
     """The lines of a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return ["|" + "".join(f" {cell} |" if cell != "" else " |" for cell in line) for line in lines]
-
-
-def _facts(views: dict[Path, LabelledView]) -> dict[str, object]:
-    success = np.concatenate([view.success for view in views.values()])
-    firm = [view.firm[view.success == 1] for view in views.values() if view.firm is not None]
-    tried, held = success[success != UNTRIED], np.concatenate([np.empty(0), *firm])
-    shares = (f"{100 * (part == 1).mean():.1f} %" if len(part) else "-" for part in (tried, held))
-    return {
-        "scenes": len({scene_of(path) for path in views}),
-        "views": len(views),
-        "engine": ", ".join(sorted({view.engine for view in views.values()})),
-        "hands": len({view.gripper for view in views.values()}),
-        "grasps tried": len(tried),
-        "held after the lift": next(shares),
-        "of those, held after shaking too": next(shares),
-        "objects": len({name for view in views.values() for name in view.objects}),
-    }
