@@ -6,7 +6,6 @@ scene, and by whether the camera saw the far side.
 """
 
 import argparse
-import csv
 import json
 import sys
 from dataclasses import asdict, dataclass, replace
@@ -32,7 +31,6 @@ from edgegrasp_training.views import find_views, load_view, scene_of, table
 
 TENTHS = tuple(round(0.1 * number, 1) for number in range(11))
 EDGES = (0.0, 0.1, 0.3, 0.5, 0.8, 0.9, 0.95, 1.0)  # edges of the score ranges in a comparison
-CURVE_ROWS = 20  # approximate number of rows of the learning curve in the card
 SCORES = (1e-4, 1.0 - 1e-4)  # scores are taken to lie between
 # Spread of log(scale) and of shift before there is any outcome: few outcomes change little.
 PRIOR_SCALE, PRIOR_SHIFT = 0.5, 1.5
@@ -111,7 +109,7 @@ def calibration_error(score: Floats, held: NDArray[np.generic]) -> float:
 
 
 def write_model_card(
-    path: Path, metadata: CheckpointMetadata, evaluation: Evaluation, log: Path, command: str
+    path: Path, metadata: CheckpointMetadata, evaluation: Evaluation, command: str
 ) -> None:
     """Write a card in Markdown, with the evaluation before calibration."""
     network = {name: value for name, value in asdict(metadata.network).items() if value != ()}
@@ -128,14 +126,10 @@ def write_model_card(
     ]
     ranges = reliability(expit(evaluation.logit / metadata.temperature), evaluation.label)
     bins = [(f"{score:.3f}", f"{held:.3f}", count) for score, held, count in ranges.values()]
-    with log.open(newline="") as file:
-        head, *curve = csv.reader(file)
-    some = curve[:: -max(1, len(curve) // CURVE_ROWS)][::-1]
     lines = [f"# {metadata.name}", "", *table(("", ""), rows)]
     lines += ["", "Trained by:", "", "```", command, "```", ""]
     lines += ["Reliability of the score on the validation views:", ""]
-    lines += [*table(("score", "held", "grasps"), bins), "", "During training:", ""]
-    lines += table([name.replace("_", " ") for name in head], some)
+    lines += table(("score", "held", "grasps"), bins)
     path.write_text("\n".join(lines) + "\n")
 
 

@@ -172,8 +172,7 @@ class Trainer:
             training |= {"kept_of_it": self.options.keep}
         metadata = replace(self.metadata, temperature=evaluation.temperature, training=training)
         self._save_average(metadata)
-        card = self.folder / f"{self.metadata.name}.md"
-        write_model_card(card, metadata, evaluation, self.folder / LOG_FILE, command)
+        write_model_card(path.with_suffix(".md"), metadata, evaluation, command)
         return evaluation
 
     def _train_step(self) -> float:
