@@ -1,6 +1,7 @@
 """The report of a benchmark, one HTML file with tables and pictures; attempts made again for it."""
 
 import base64
+import json
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -102,8 +103,7 @@ def write_report(folder: ResultFolder, summary: dict[str, Any]) -> Path:
         "<h2>Objects</h2>",
         table(_object_rows(summary)),
         "<h2>Conditions</h2><details><summary>every constant, version and digest</summary>",
-        table([("name", "value"), *_flat("", facts)]),
-        "</details>",
+        f"<pre>{escape(json.dumps(facts, indent=1))}</pre></details>",
     ]
     path = folder.path / "report.html"
     path.write_text(page(title, parts))
@@ -173,14 +173,6 @@ def _object_rows(summary: dict[str, Any]) -> Iterator[Row]:
 
 def _share(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.1f}"
-
-
-def _flat(prefix: str, value: Any) -> Iterator[Row]:
-    if isinstance(value, dict):
-        for name, part in value.items():
-            yield from _flat(f"{prefix}.{name}".strip("."), part)
-    else:
-        yield prefix, value
 
 
 def _failure_pictures(replay: Replay, rounds: Sequence[Round]) -> Iterator[str]:
