@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
+from scipy.stats.contingency import crosstab
 
 from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Int64
 from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
@@ -117,10 +118,8 @@ def _matched(
     Also the pixels of each object called (C,), of each labelled (L,) and of each pair (C, L), and
     the F of the matches (M,).
     """
-    names, row = np.unique(np.concatenate([[0], answer]), return_inverse=True)
-    truths, column = np.unique(np.concatenate([[0], labels]), return_inverse=True)
-    pair = row[1:] * len(truths) + column[1:]
-    count = np.bincount(pair, minlength=len(names) * len(truths)).reshape(len(names), -1)
+    # Background is in both, also where an image has none.
+    count = crosstab(np.append(answer, 0), np.append(labels, 0)).count
     called, labelled, common = count[1:].sum(axis=1), count[:, 1:].sum(axis=0), count[1:, 1:]
     f = 2 * common / np.maximum(called[:, None] + labelled, 1)
     rows, columns = linear_sum_assignment(f, maximize=True)
