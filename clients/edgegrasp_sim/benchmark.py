@@ -5,7 +5,7 @@ import platform
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -103,7 +103,8 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
         "seeds": list(config.seeds),
         "objects_folder": str(config.objects) if config.objects is not None else None,
         "split": config.split,
-        "versions": {"python": platform.python_version()} | {n: _version(n) for n in PACKAGES},
+        "versions": {"python": platform.python_version()}
+        | {each.name: each.version for each in distributions() if each.name in PACKAGES},
         "host": {
             "name": platform.node(),
             "platform": platform.platform(),
@@ -167,10 +168,3 @@ class RoundRunner:
         self.simulation.close()
         if close := getattr(self.planner, "close", None):
             close()
-
-
-def _version(distribution: str) -> str | None:
-    try:
-        return version(distribution)
-    except PackageNotFoundError:
-        return None
