@@ -57,7 +57,6 @@ CROSSED = "another cloud's answer"
 EXPECTED = {"good": {ANSWERED}, "malformed": {REFUSED}, "cancelled": {CANCELLED, ANSWERED}}
 FAULTS: tuple[dict[str, Any], ...] = ({"seed": -1}, {"model": "none"}, {"viewpoint": [1e300, 0, 0]})
 SECONDS = 30.0  # until a request counts as lost
-TOGETHER = 8  # requests of one stream
 START_SECONDS = 1.0  # for processes to start
 STOP_SECONDS = 30.0  # for the server to stop
 PROBE_SECONDS = 0.1  # between two questions for health
@@ -172,57 +171,34 @@ class Soak:
             await asyncio.sleep(seconds)
 
     async def _send(self, way: str) -> None:
-        """Send plans one by one, or several at a time in a stream."""
+        """Send plans one by one."""
         address = self._server.http_url if way == "rest" else self._server.grpc_address
         async with AsyncGraspClient(address, timeout=SECONDS, retry=False) as client:
-            while some := list(islice(self._todo, TOGETHER if way == "stream" else 1)):
-                self._given += len(some)
-                if way == "stream":
-                    await self._stream(client, some)
-                    continue
-                (plan,) = some
+            for plan in self._todo:
+                self._given += 1
                 try:
                     async with asyncio.timeout(plan.wait if plan.kind == "cancelled" else None):
-                        answer = await client.detect(plan.points(), **plan.options())
-                        came = outcome(plan, answer)
+                        answer = await ask(client, way, plan)
+                    mine = answer.counts["crc32"] == zlib.crc32(plan.points().tobytes())
+                    came = ANSWERED if mine else CROSSED
                 except TimeoutError:
                     came = CANCELLED
+                except InvalidRequestError:
+                    came = REFUSED
                 except GraspClientError as error:
-                    came = outcome(plan, error)
-                self._note(way, plan, came)
-
-    async def _stream(self, client: AsyncGraspClient, some: list[Plan]) -> None:
-        # The stream is left with the plans that are cancelled, so they come last.
-        some.sort(key=lambda plan: plan.kind == "cancelled")
-        requests = [
-            StreamRequest(plan.points(), request_id=str(plan.number), **plan.options())
-            for plan in some
-        ]
-        answers, failed = client.detect_stream(requests), ""
-        for plan in some:
-            came = failed or CANCELLED
-            if not failed and plan.kind != "cancelled":
-                try:
-                    answer = await anext(answers)
-                    came = outcome(plan, answer.error or answer.result())
-                    came = came if answer.request_id == str(plan.number) else CROSSED
-                except GraspClientError as error:  # of the stream: what follows has no answer
-                    came = failed = type(error).__name__
-            self._note("stream", plan, came)
-        await answers.aclose()
-
-    def _note(self, way: str, plan: Plan, came: str) -> None:
-        self._outcomes[f"{way} {plan.kind}: {came}"] += 1
-        if came not in EXPECTED[plan.kind]:
-            self._wrong.append({**asdict(plan), "transport": way, "outcome": came})
+                    came = type(error).__name__
+                self._outcomes[f"{way} {plan.kind}: {came}"] += 1
+                if came not in EXPECTED[plan.kind]:
+                    self._wrong.append({**asdict(plan), "transport": way, "outcome": came})
 
 
-def outcome(plan: Plan, came: Detection | GraspClientError) -> str:
-    """The outcome of a request, by the digest in its answer or by its error."""
-    if isinstance(came, Detection):
-        mine = came.counts["crc32"] == zlib.crc32(plan.points().tobytes())
-        return ANSWERED if mine else CROSSED
-    return REFUSED if isinstance(came, InvalidRequestError) else type(came).__name__
+async def ask(client: AsyncGraspClient, way: str, plan: Plan) -> Detection:
+    """Send one plan, alone or in a stream of its own; raises the error that it is answered with."""
+    if way != "stream":
+        return await client.detect(plan.points(), **plan.options())
+    stream = client.detect_stream([StreamRequest(plan.points(), **plan.options())])
+    async with contextlib.aclosing(stream) as answers:
+        return (await anext(answers)).result()
 
 
 # The attackers and the probe
