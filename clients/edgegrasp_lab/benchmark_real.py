@@ -28,10 +28,7 @@ Rows = list[tuple[str, ...]]
 DECIDED = ("viewpoint", "debug", "robot", "previous")
 SHARES = ("on_object", "from_below", "through_points")  # counts, which are shares of the best
 OVERLAPS = ("overlap_precision", "overlap_recall", "overlap_f")
-PLANE_SQUARE = 0.12  # metres, edge of the square that shows a plane at an object's foot
-LABELLED, FOUND = "#39d353", "#ff4fd8"  # colours of the planes
 ON_SUPPORT, BACKGROUND, NO_READING = (92, 112, 140), (48, 48, 52), (0, 0, 0)  # colours
-CAPTION = "\nwhite: labelled objects    green: labelled plane    pink: the plane found"
 
 
 @takes_flags(options=option_flags(*DECIDED))
@@ -71,7 +68,7 @@ def benchmark_real(
             figures = judge(scene, grasps, plane, answer, gripper, milliseconds, refused)
             done[scene.name] = figures
             title = f"{scene.name}: {_sentence(figures)}"
-            draw(output / f"{scene.name}.png", scene, grasps[:BEST], plane, title)
+            draw(output / f"{scene.name}.png", scene, grasps[:BEST], title)
             draw_labels(output / f"{scene.name}-labels.png", scene, labels)
     _write(output, model.name, fields, done)
 
@@ -217,21 +214,15 @@ def _sentence(figures: SceneFigures) -> str:
 # Pictures
 
 
-def draw(
-    path: Path, scene: RealScene, grasps: Sequence[Any], plane: tuple[Any, float] | None, title: str
-) -> None:
-    """Write a picture: the camera's image with the grasps, and both support planes.
+def draw(path: Path, scene: RealScene, grasps: Sequence[Any], title: str) -> None:
+    """Write a picture: the camera's image with the labelled objects' outlines and the grasps.
 
-    Grasps are best first; the found plane is given by its normal (3,) and offset; camera frame.
+    Grasps are best first, in the camera's frame.
     """
-    picture = Picture(scene.camera, scene.points, image=scene.rgb, title=title + CAPTION)
+    picture = Picture(scene.camera, scene.points, image=scene.rgb, title=title)
     row = picture.row_of_pixel
     for label in scene.objects:
         picture.outline((row >= 0) & (scene.labels[row] == label))
-    if scene.normal is not None:
-        _draw_plane(picture, scene, scene.normal, scene.offset, LABELLED, width=3.5)
-        if plane is not None:
-            _draw_plane(picture, scene, *plane, FOUND, width=1.4)
     picture.grasps(grasps)
     picture.save(path)
 
@@ -262,17 +253,3 @@ def draw_labels(path: Path, scene: RealScene, labels: Int64) -> None:
         image = 255 * colormaps["gray"](1 - (depth - near) / (far - near))[..., :3]
     parts = [image, painted(truth, scene.labels == 1), painted(found, labels == SUPPORT)]
     imsave(path, np.hstack(parts).astype(np.uint8))
-
-
-def _draw_plane(
-    picture: Picture, scene: RealScene, normal: Any, offset: float, color: str, *, width: float
-) -> None:
-    """A square of a plane at the foot of each object, and the way up from it."""
-    across = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
-    across = across / np.linalg.norm(across)
-    half = PLANE_SQUARE / 2 * np.stack([across, np.cross(normal, across)])
-    for foot in scene.feet:
-        middle = foot - (foot @ normal - offset) * normal
-        around = [(1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1)]
-        for line in (middle + around @ half, [middle, middle + PLANE_SQUARE / 2 * normal]):
-            picture.lines(line, color, width)
