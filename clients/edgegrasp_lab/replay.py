@@ -44,8 +44,7 @@ def attempt(
     first = folder.manifest()["seeds"][0]
     waiting = Console(stderr=True).status("Making the attempt again…")
     with waiting, Replay(folder, objects) as repeated:
-        done = repeated.find(first if seed is None else seed, round, number)
-        now, seen = repeated.repeat(done.seed, round, number)
+        done, now, seen = repeated.repeat(first if seed is None else seed, round, number)
     before, title = done.attempts[number], attempt_title(done, number)
     if picture is not None:
         drawn = Picture(View.of(seen.cloud, seen.camera_position), seen.cloud, title=title)

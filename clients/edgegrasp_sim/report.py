@@ -61,8 +61,11 @@ class Replay(AbstractContextManager["Replay"]):
     def __exit__(self, *_: object) -> None:
         self.simulation.close()
 
-    def find(self, seed: int, index: int, attempt: int = 0) -> Round:
-        """A recorded round that has an attempt of this number; raises ValueError without one."""
+    def repeat(self, seed: int, index: int, attempt: int) -> tuple[Round, Attempt, Observation]:
+        """Repeat a round up to an attempt; ValueError: it is not recorded.
+
+        Returns the recorded round, the attempt now, and the image before it.
+        """
         done = self.rounds.get((seed, index))
         if done is None:
             known = ", ".join(f"{s}/{i}" for s, i in list(self.rounds)[:10])
@@ -72,11 +75,6 @@ class Replay(AbstractContextManager["Replay"]):
                 f"attempt is {attempt}; round {index} of seed {seed} has {len(done.attempts)}, "
                 "counted from 0"
             )
-        return done
-
-    def repeat(self, seed: int, index: int, attempt: int) -> tuple[Attempt, Observation]:
-        """Repeat a round up to an attempt; returns the attempt and the image before it."""
-        done = self.find(seed, index, attempt)
         driver = RoundDriver(self.simulation, self.scene, self.protocol, seed=seed, index=index)
         for recorded in done.attempts[: attempt + 1]:
             seen = driver.look()
@@ -84,7 +82,7 @@ class Replay(AbstractContextManager["Replay"]):
                 seen = driver.look()
             grasp = PlannedGrasp(recorded.T_world_hand, recorded.score, recorded.width)
             repeated = driver.execute(grasp)
-        return repeated, seen
+        return done, repeated, seen
 
 
 def write_report(folder: ResultFolder, summary: dict[str, Any]) -> Path:
@@ -185,7 +183,7 @@ def _failure_pictures(replay: Replay, rounds: Sequence[Round]) -> Iterator[str]:
                 before[str(attempt.cause)] += 1
                 failed.append((before[str(attempt.cause)], done, number))
     for _, done, number in sorted(failed, key=lambda each: each[0])[:PICTURES]:
-        _, seen = replay.repeat(done.seed, done.index, number)
+        _, _, seen = replay.repeat(done.seed, done.index, number)
         title = attempt_title(done, number)
         with tempfile.TemporaryDirectory() as folder:
             file, view = Path(folder) / "failure.jpg", View.of(seen.cloud, seen.camera_position)
