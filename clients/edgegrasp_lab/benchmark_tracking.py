@@ -263,13 +263,10 @@ def summary(done: list[Followed]) -> dict[str, Any]:
     off = np.array([each for one in done for each in one.off]).reshape(-1, 3)
     latency = 1000 * np.array([each for one in done for each in one.latency])
     measured = {"mm": off[:, 1], "degrees": off[:, 2], "ms": latency}
-    minutes = sum(one.off[-1][0] for one in done if one.off) / 60
-    switches = sum(one.switches for one in done)
     return {
         "scenes": len(done),
         "images": len(latency),
-        "switches": switches,
-        "switches_a_minute": switches / minutes if minutes else None,
+        "switches": sum(one.switches for one in done),
         **{
             f"{name}_{share}": float(np.percentile(values, share)) if len(values) else None
             for name, values in measured.items()
