@@ -18,6 +18,7 @@ from torch.nn import functional
 from torch.optim import swa_utils
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
+from edgegrasp_camera.depth import Intrinsics, unproject
 from edgegrasp_model.scene.network import VOTE_UNIT, SceneNet, SceneOutput, scene_features
 from edgegrasp_model.scene.segment import group, look, mean_probability
 from edgegrasp_training.scene_images import DEPTH_UNIT, SceneImage
@@ -63,10 +64,8 @@ def read_images(files: Iterable[Path]) -> list[SceneImage]:
 
 def image_points(image: SceneImage) -> Float32:
     """(H, W, 3) camera frame, metres; NaN without a reading."""
-    fx, fy, cx, cy = image.camera
-    z = np.where(image.depth > 0, image.depth * np.float32(DEPTH_UNIT), np.float32(np.nan))
-    y, x = np.indices(z.shape, dtype=np.float32)
-    return np.stack([(x - cx) / fx * z, (y - cy) / fy * z, z], axis=-1)
+    depth = np.where(image.depth > 0, image.depth * np.float32(DEPTH_UNIT), np.float32(np.nan))
+    return unproject(depth, Intrinsics(*image.camera.tolist()))
 
 
 def make_batch(
