@@ -33,8 +33,8 @@ TOP_DOWN = "examples.your_planner:plan"
 SMOKE_GATE = Path(__file__).parent / "smoke_gate.json"
 
 
-def figures(folder: Path) -> dict:
-    return json.loads((folder / "summary.json").read_text())
+def figures(folder: Path, name: str = "summary.json") -> dict[str, Any]:
+    return json.loads((folder / name).read_text())
 
 
 def attempts(folder: Path) -> list[dict[str, str]]:
@@ -71,14 +71,14 @@ def test_the_shipped_weights_are_not_below_the_gate(tmp_path) -> None:
     committed = json.loads(SMOKE_GATE.read_text()) | {"engine": choose_engine()}
     gate.write_text(json.dumps(committed))
     benchmark(tmp_path, "in-process", *few, "--gate", gate, rounds=4)
-    planner = json.loads((tmp_path / "manifest.json").read_text())["run"]["planner"]
+    planner = figures(tmp_path, "manifest.json")["run"]["planner"]
     assert planner["options"] == {"num_approach_points": 16, "num_candidates": 400}
 
 
 def test_another_hand_is_planned_for_and_simulated(run, refused, tmp_path) -> None:
     few = ("--num-approach-points", 16, "--num-candidates", 400, "--gripper", "robotiq-2f-85")
     assert benchmark(tmp_path, "in-process", *few, rounds=1)["successes"] > 0
-    manifest = json.loads((tmp_path / "manifest.json").read_text())["run"]
+    manifest = figures(tmp_path, "manifest.json")["run"]
     assert manifest["gripper"]["max_opening"] == 0.085
     assert manifest["planner"]["options"]["gripper"] == manifest["gripper"]
     assert "the result is the same" in run("replay", "attempt", tmp_path, "--round", 0)
@@ -124,7 +124,7 @@ def test_wrong_replays_and_comparisons_end_with_a_sentence(in_process, refused, 
     assert "contains no benchmark" in refused("compare", in_process, tmp_path)
     benchmark(tmp_path, TOP_DOWN, "--protocol", "giga", rounds=1)
     assert "differ in protocol" in refused("compare", in_process, tmp_path)
-    facts = json.loads((tmp_path / "manifest.json").read_text())
+    facts = figures(tmp_path, "manifest.json")
     facts["run"]["arm"] = ["joint_1"]
     (tmp_path / "manifest.json").write_text(json.dumps(facts))
     assert "attempts of an arm" in refused("replay", "attempt", tmp_path)
@@ -133,7 +133,7 @@ def test_wrong_replays_and_comparisons_end_with_a_sentence(in_process, refused, 
 def test_two_planners_are_compared_scene_by_scene(in_process, top_down, run, tmp_path) -> None:
     output = run("compare", top_down, in_process, "--output", tmp_path / "compared.json")
     assert "2 scenes" in output
-    compared = json.loads((tmp_path / "compared.json").read_text())
+    compared = figures(tmp_path, "compared.json")
     for name in ("grasp_success_rate", "declutter_rate"):
         ceiling, base = (figures(folder)[name]["value"] for folder in (in_process, top_down))
         assert compared[name]["difference"] == pytest.approx(ceiling - base)
@@ -221,11 +221,12 @@ def test_a_view_in_which_the_arm_touches_the_table_is_told_from_other_errors() -
     *_, fields = benchmark_arm("fr3", load_protocol("edgegrasp").camera)
     choice, asked = PlannerFlags(planner="in-process", robot="fr3"), LITTLE | fields
     fields["robot"]["T_base_cloud"][2][3] += 0.5  # the table, up to the hand
-    with open_planner(choice, PAPER, asked) as made, pytest.raises(StartCollides, match="support"):
-        made.make()(seen_under("edgegrasp"), 3)
-    fields["robot"]["joints"] = [9.0] * 7
-    with open_planner(choice, PAPER, asked) as made, pytest.raises(InvalidRequest, match="joint1"):
-        made.make()(seen_under("edgegrasp"), 3)
+    with open_planner(choice, PAPER, asked) as made:
+        with pytest.raises(StartCollides, match="support"):
+            made.make()(seen_under("edgegrasp"), 3)
+        fields["robot"]["joints"] = [9.0] * 7
+        with pytest.raises(InvalidRequest, match="joint1"):
+            made.make()(seen_under("edgegrasp"), 3)
 
 
 def test_another_package_may_name_its_planner(tmp_path, monkeypatch) -> None:

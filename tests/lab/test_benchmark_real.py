@@ -99,16 +99,15 @@ def test_clouds_show_the_same_scene_as_depth_images(scene: Path, tmp_path: Path)
     arrays = seen_scene()
     image = load_scene(scene)
     turned = image.points * np.float32([1, -1, -1])
+    arrays = {name: arrays[name] for name in ("labels", "support_normal", "support_offset")}
     organised = {"points": turned.reshape(*SHAPE, 3), "support_normal": NORMAL * (1, -1, -1)}
-    rest = {name: arrays[name] for name in ("labels", "support_offset")}
-    np.savez(tmp_path / "organised.npz", **rest, **organised)
+    np.savez(tmp_path / "organised.npz", **arrays | organised)
     camera = load_scene(tmp_path / "organised.npz").camera
     wanted = pytest.approx((-INTRINSICS[0], *INTRINSICS[1:]), abs=0.01)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == wanted
     seen = np.isfinite(image.points).all(axis=1)
     flat = {"points": image.points[seen], "labels": arrays["labels"].ravel()[seen]}
-    beside = {name: arrays[name] for name in ("support_normal", "support_offset")}
-    np.savez(tmp_path / "flat.npz", **flat, **beside)
+    np.savez(tmp_path / "flat.npz", **arrays | flat)
     virtual = load_scene(tmp_path / "flat.npz")
     column, row = virtual.camera.project(virtual.points)[0].T
     assert (column.min() >= 0) & (column.max() < virtual.camera.shape[1])
@@ -144,11 +143,11 @@ def test_of_a_heap_that_hides_its_support_no_plane_and_no_objects_are_judged(sce
 
 
 def test_a_scene_that_is_refused_counts_as_one_without_grasps(scene, run, tmp_path) -> None:
-    arrays, whole = seen_scene(), load_scene(scene)
+    whole = load_scene(scene)
     row = np.flatnonzero(whole.labels == 2)[:10]  # fewer points than grasps are asked around
-    few = {"points": whole.points[row], "labels": whole.labels[row]}
-    beside = {name: arrays[name] for name in ("support_normal", "support_offset")}
-    np.savez(scene.parent / "refused.npz", **few, **beside)
+    plane = {"support_normal": whole.normal, "support_offset": whole.offset}
+    few = {"points": whole.points[row], "labels": whole.labels[row], **plane}
+    np.savez(scene.parent / "refused.npz", **few)
     asked = ("--num-approach-points", 20, "--output", tmp_path / "results")
     run("benchmark-real", "--scenes", scene.parent, *asked)
     results = json.loads((tmp_path / "results" / "results.json").read_text())

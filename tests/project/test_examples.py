@@ -19,12 +19,12 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def test_demo_prints_ranked_grasps_of_both_transports_and_writes_a_picture(tmp_path: Path) -> None:
-    done = run(sys.executable, EXAMPLES / "demo.py", "--output", tmp_path)
-    grpc_table, rest_table = re.split(r"\n\d+ grasps over ", done.stdout)[1:]
+    shown = example("demo.py", "--output", tmp_path)
+    grpc_table, rest_table = re.split(r"\n\d+ grasps over ", shown)[1:]
     ranked = re.compile(r"^ +(\d+)  (0\.\d+)  ", re.MULTILINE)
     assert len(ranked.findall(grpc_table)) >= 10
     assert ranked.findall(grpc_table) == ranked.findall(rest_table)
-    assert "the same grasps" in done.stdout
+    assert "the same grasps" in shown
     assert re.search(
         r"Executed the best one in the simulator: it (held|did not hold)\.", rest_table
     )
@@ -38,11 +38,10 @@ def example(name: str, *words: object) -> str:
 
 
 def test_cpp_example_is_built_and_prints_five_grasps(dummy_server, tmp_path: Path) -> None:
-    for program in ("cmake", "c++", "protoc", "grpc_cpp_plugin", "pkg-config"):
-        if shutil.which(program) is None:
-            pytest.skip(f"{program} is not installed, see examples/cpp/CMakeLists.txt")
-    if subprocess.run(["pkg-config", "--exists", "grpc++"]).returncode:
-        pytest.skip("gRPC for C++ is not installed, see examples/cpp/CMakeLists.txt")
+    needed = ("cmake", "c++", "protoc", "grpc_cpp_plugin", "pkg-config")
+    there = all(map(shutil.which, needed))
+    if not there or subprocess.run(["pkg-config", "--exists", "grpc++"]).returncode:
+        pytest.skip(f"{needed} or grpc++ is not installed, see examples/cpp/CMakeLists.txt")
     build = tmp_path / "build"
     run("cmake", "-S", EXAMPLES / "cpp", "-B", build)
     run("cmake", "--build", build, "--parallel", 2)

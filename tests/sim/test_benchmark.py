@@ -48,10 +48,7 @@ def paper_with(number: int) -> Protocol:
 
 
 TWO_OBJECTS = paper_with(2)
-
-# Called, it gives the planner; spawned workers can import it.
-make_planner = partial(partial, plan)
-
+make_planner = partial(partial, plan)  # called, it gives the planner; workers can import it
 
 DIES_ONCE = """
 import os, signal
@@ -110,19 +107,20 @@ def test_the_manifest_holds_what_decides_the_figures(engine: str) -> None:
 
 
 def test_wrong_settings_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="rounds is 0"):
-        BenchmarkConfig(SceneKind.PILE, rounds=0)
-    with pytest.raises(ValueError, match=r"seeds is \(-1,\)"):
-        BenchmarkConfig(SceneKind.PILE, rounds=1, seeds=(-1,))
-    with pytest.raises(ValueError, match="each seed once"):
-        BenchmarkConfig(SceneKind.PILE, rounds=1, seeds=(1, 1))
-    config = BenchmarkConfig(SceneKind.PILE, rounds=1, objects=tmp_path)
+    for message, rounds, seeds in (
+        ("rounds is 0", 0, (0,)),
+        (r"seeds is \(-1,\)", 1, (-1,)),
+        ("each seed once", 1, (1, 1)),
+    ):
+        with pytest.raises(ValueError, match=message):
+            BenchmarkConfig(SceneKind.PILE, rounds, seeds)
+    config = BenchmarkConfig(SceneKind.PILE, rounds=1)
     with pytest.raises(FileNotFoundError, match=r"no \*\.urdf, \*\.obj"):
-        run_benchmark(config, make_planner, workers=2)
+        run_benchmark(replace(config, objects=tmp_path), make_planner, workers=2)
     with pytest.raises(ValueError, match="workers is 0"):
-        run_benchmark(replace(config, objects=None), make_planner, workers=0)
+        run_benchmark(config, make_planner, workers=0)
     with pytest.raises(ValueError, match="returned <class 'int'>; return a PlannedGrasp or None"):
-        run_benchmark(replace(config, objects=None), lambda: lambda *_: 7)
+        run_benchmark(config, lambda: lambda *_: 7)
 
 
 def test_a_killed_run_goes_on_and_changes_nothing(alone, tmp_path) -> None:
@@ -155,13 +153,8 @@ def test_a_missing_ray_or_cluster_is_named(alone, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ModuleNotFoundError, match=r"ray is not .*edgegrasp\[ray\]"):
         run_benchmark(config, make_planner, ray="local")
-
-    class Ray:
-        @staticmethod
-        def init(**_: object) -> None:
-            raise ConnectionError("nobody answers")
-
-    monkeypatch.setitem(sys.modules, "ray", Ray)
+    deaf = Mock(init=Mock(side_effect=ConnectionError("nobody answers")))
+    monkeypatch.setitem(sys.modules, "ray", deaf)
     with pytest.raises(RuntimeError, match=r"no Ray cluster at '127\.0\.0\.1:1': nobody"):
         run_benchmark(config, make_planner, ray="127.0.0.1:1")
 
@@ -211,12 +204,9 @@ IN_THE_AIR = np.diag([1.0, -1.0, -1.0, 1.0])
 IN_THE_AIR[:3, 3] = (0.15, 0.15, 0.5)
 
 
-def run(
-    simulation: ClutterSimulation, planner: Planner, scene: SceneKind, number: int, **given: int
-) -> Round:
+def run(simulation, planner: Planner, scene: SceneKind, number: int, seed=0, index=0) -> Round:
     """A round with so many objects."""
-    of = {"seed": 0, "index": 0} | given
-    return RoundDriver(simulation, scene, paper_with(number), **of).run(planner)
+    return RoundDriver(simulation, scene, paper_with(number), seed=seed, index=index).run(planner)
 
 
 def test_two_failures_in_a_row_or_no_grasp_three_times_end_a_round(simulation) -> None:
@@ -258,26 +248,20 @@ def test_an_arm_that_cannot_start_in_a_view_takes_another_one(simulation) -> Non
 
 
 def test_scenes_and_views_do_not_depend_on_the_planner(engine, simulation) -> None:
-    first_clouds = []
-
-    def keep_first(seen: Observation, seed: int) -> PlannedGrasp:
-        first_clouds.append(seen.cloud)
-        return PlannedGrasp(IN_THE_AIR, 1.0, 0.04)
-
+    keep_first = Mock(return_value=PlannedGrasp(IN_THE_AIR, 1.0, 0.04))
     run(simulation, plan, PILE, 2, seed=4, index=0)
     run(simulation, keep_first, PILE, 2, seed=4, index=1)
     with ClutterSimulation(engine=engine) as other:
-        RoundDriver(other, PILE, paper_with(2), seed=4, index=1).run(keep_first)
+        run(other, keep_first, PILE, 2, seed=4, index=1)
+    first_clouds = [call.args[0].cloud for call in keep_first.call_args_list]
     assert np.array_equal(first_clouds[0], first_clouds[2])
 
 
 # Figures, folders of results and gates.
 
 
-HELD = Attempt(
-    None, "mug", "mug", False, 0.5, 0.04, 0.03, False, 0, 1000, 0.25,
-    [[0.0] * 4] * 4,
-)  # fmt: skip
+OF_A_MUG = "mug", "mug", False, 0.5, 0.04, 0.03, False, 0, 1000, 0.25
+HELD = Attempt(None, *OF_A_MUG, [[0.0] * 4] * 4)
 MISSED = replace(HELD, cause=FailureCause.MISSED, object=None, planning_seconds=0.35)
 WRONG = replace(HELD, object="cube", wrong_object=True, start_contact=True)
 ROUNDS = [
@@ -375,14 +359,8 @@ def gate_file(path: Path) -> Path:
 
 
 def summary_with(rate: dict[str, object]) -> dict[str, object]:
-    return {
-        "scene": "pile",
-        "engine": "pybullet",
-        "protocol": "edgegrasp",
-        "protocol_version": 1,
-        "grasp_success_rate": rate,
-        "declutter_rate": rate,
-    }
+    of = {"scene": "pile", "engine": "pybullet", "protocol": "edgegrasp", "protocol_version": 1}
+    return of | {"grasp_success_rate": rate, "declutter_rate": rate}
 
 
 def test_the_gate_lets_chance_pass_and_stops_a_fall(tmp_path: Path) -> None:

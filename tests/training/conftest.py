@@ -34,15 +34,8 @@ def made_up_view(seed: int) -> LabelledView:
     made = edge_grasps(cloud, approach, contact, load_gripper())
     label = np.full(len(approach), -1, np.int8)
     label[made.pair] = made.approach[:, 2] > 0.4
-    return LabelledView(
-        cloud.points,
-        cloud.normals,
-        np.array([0.15, 0.15, 0.8], np.float32),
-        approach,
-        contact,
-        None,
-        label,
-    )
+    camera = np.array([0.15, 0.15, 0.8], np.float32)
+    return LabelledView(cloud.points, cloud.normals, camera, approach, contact, None, label)
 
 
 @pytest.fixture(scope="session")

@@ -16,13 +16,11 @@ from edgegrasp_training.options import GenerationOptions
 from edgegrasp_training.shapes import NUM_DRAWN, drawn_shape, household_objects
 from edgegrasp_training.views import find_views, load_view
 
+SMALL = GenerationOptions(scenes=4, views_per_scene=1, grasps_per_view=8, seed=5)
+
 
 def small(**other: object) -> GenerationOptions:
-    few = {"scenes": 4, "views_per_scene": 1, "grasps_per_view": 8, "seed": 5}
-    return GenerationOptions(**few | other)
-
-
-SMALL = small()
+    return SMALL.model_copy(update=other)
 
 
 @pytest.fixture(scope="module")

@@ -50,11 +50,10 @@ def test_the_same_scene_is_made_again_from_its_seed(pool: list[PoolMesh]) -> Non
 
 
 def test_a_file_is_made_and_learned_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_images, "SCENES_PER_FILE", 2)
-    monkeypatch.setattr(scene_images, "NUM_POOL", 12)
-    monkeypatch.setattr(scene_images, "ARMS", ())
-    monkeypatch.setattr(scene_training, "HELD_OUT", 1)
-    monkeypatch.setattr(scene_training, "BATCH", 2)
+    for name, value in {"SCENES_PER_FILE": 2, "NUM_POOL": 12, "ARMS": ()}.items():
+        monkeypatch.setattr(scene_images, name, value)
+    for name, value in {"HELD_OUT": 1, "BATCH": 2}.items():
+        monkeypatch.setattr(scene_training, name, value)
     mesh = tmp_path / "block.obj"
     mesh.write_text(block_obj(0.05, 0.04, 0.06))
     generate(tmp_path / "data", [mesh], files=2, seed=1, part=0, parts=1)

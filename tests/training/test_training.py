@@ -14,10 +14,7 @@ from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, 
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_training.evaluation import fit, read_outcomes, recalibrate
-from edgegrasp_training.examples import (
-    GRASPS_PER_BALL,
-    Teacher,
-)
+from edgegrasp_training.examples import GRASPS_PER_BALL, Teacher
 from edgegrasp_training.options import TrainingOptions
 from edgegrasp_training.recipes import RECIPES
 from edgegrasp_training.training import Trainer
@@ -25,13 +22,7 @@ from edgegrasp_training.views import find_views, split_by_scene
 
 from .conftest import NETWORKS, SAMPLE, made_up_view
 
-FAST = {
-    "steps": 40,
-    "views_per_step": 2,
-    "balls_per_view": 3,
-    "learning_rate": 3e-3,
-    "evaluate_every": 10,
-}
+FAST = {"steps": 40, "views_per_step": 2, "balls_per_view": 3, "evaluate_every": 10}
 
 
 @pytest.fixture(scope="session")
@@ -50,7 +41,7 @@ def make_trainer(views: list[Path]) -> Callable[..., Trainer]:
     ) -> Trainer:
         metadata = CheckpointMetadata(name, NETWORKS[network], voxel_size=0.0045, gripper="panda")
         train, validation = split_by_scene(views, 0.25, seed=0)
-        chosen = TrainingOptions(**FAST | options)
+        chosen = TrainingOptions(learning_rate=3e-3, **FAST | options)
         return Trainer(metadata, train, validation, folder, chosen, teacher=teacher, start=start)
 
     return make
@@ -177,12 +168,8 @@ def test_a_teacher_alone_labels_views_in_which_no_grasp_was_tried(
     make_trainer, teacher: Teacher, tmp_path: Path
 ) -> None:
     for number in range(8):
-        view = made_up_view(number)
-        nothing = np.empty(0, dtype=np.int64)
-        untried = replace(
-            view, approach_index=nothing, contact_index=nothing, success=nothing.astype(np.int8)
-        )
-        untried.save(tmp_path / f"packed_{number}_0.npz")
+        none = dict.fromkeys(("approach_index", "contact_index", "success"), np.empty(0, np.int8))
+        replace(made_up_view(number), **none).save(tmp_path / f"packed_{number}_0.npz")
     run = make_trainer(tmp_path / "run", "balls", teacher=teacher, views=find_views([tmp_path]))
     before = run.evaluate()
     run.run(ignore)
@@ -202,6 +189,15 @@ def test_hands_go_on_with_hands_alone_and_teach_balls_alone(make_trainer, teache
         make_trainer(tmp_path / "run", "hands", teacher=teacher)
 
 
+def write_outcomes(folder: Path, digest: str, held: list[bool]) -> Path:
+    """Add outcomes of grasps, scored 0.9 by the weights of a digest, to a file."""
+    file = folder / "outcomes.jsonl"
+    with file.open("a") as lines:
+        for one in held:
+            lines.write(json.dumps({"digest": digest, "score": 0.9, "held": one}) + "\n")
+    return file
+
+
 @pytest.mark.parametrize("name", ["balls", "vn", "hands"])
 def test_the_new_weights_answer_the_fitted_probability(name, tmp_path):
     config, old = NETWORKS[name], tmp_path / "old.safetensors"
@@ -209,12 +205,8 @@ def test_the_new_weights_answer_the_fitted_probability(name, tmp_path):
     network = build_network(config, torch.Generator().manual_seed(0))
     save_checkpoint(old, network, metadata)
     network, metadata = load_checkpoint(old)
-    lines = [
-        {"digest": metadata.digest, "score": 0.9, "held": number % 3 == 0} for number in range(60)
-    ]
-    lines.append({"digest": "of other weights", "score": 0.9, "held": True})
-    file = tmp_path / "outcomes.jsonl"
-    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    file = write_outcomes(tmp_path, metadata.digest, [number % 3 == 0 for number in range(60)])
+    write_outcomes(tmp_path, "of other weights", [True])
     assert recalibrate(old, file, tmp_path).startswith("60 outcomes, 0.33 held")
     new = tmp_path / "old-robot.safetensors"
     assert load_checkpoint(new)[1].training["recalibrated_from_digest"] == metadata.digest
@@ -233,11 +225,9 @@ def test_the_new_weights_answer_the_fitted_probability(name, tmp_path):
 
 
 def test_the_order_of_grasps_stays_and_few_outcomes_warn(tmp_path: Path) -> None:
-    (old,) = (one for one in WEIGHTS_FOLDER.glob("edgegrasp-plus.safetensors"))
+    old = WEIGHTS_FOLDER / "edgegrasp-plus.safetensors"
     before = GraspDetector.load(old)
-    lines = [{"digest": before.metadata.digest, "score": 0.9, "held": row == 0} for row in range(9)]
-    file = tmp_path / "outcomes.jsonl"
-    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    file = write_outcomes(tmp_path, before.metadata.digest, [row == 0 for row in range(9)])
     assert "Warning: fewer than 25 outcomes" in recalibrate(old, file, tmp_path)
     after = GraspDetector.load(tmp_path / "edgegrasp-plus-robot.safetensors")
     box = np.random.default_rng(0).uniform(-1, 1, (4000, 3)) * (0.02, 0.03, 0.05)

@@ -155,15 +155,14 @@ def test_views_are_scored_by_hand_networks_alone(tmp_path: Path) -> None:
     made_up_view(1).save(tmp_path / "pile_0-000000_0.npz")
     made_up_view(2).save(tmp_path / "table_0-000001_0.npz")
     paths = sorted(tmp_path.glob("*.npz"))
-    files = {}
-    for name in ("hands", "balls"):
-        files[name] = tmp_path / f"{name}.safetensors"
-        metadata = CheckpointMetadata(name, NETWORKS[name], 0.0045, "panda")
-        save_checkpoint(files[name], build_network(NETWORKS[name]), metadata)
-    scored = score_views(paths, [files["hands"], files["hands"]])
+    hands, balls = (tmp_path / f"{name}.safetensors" for name in ("hands", "balls"))
+    for file in (hands, balls):
+        metadata = CheckpointMetadata(file.stem, NETWORKS[file.stem], 0.0045, "panda")
+        save_checkpoint(file, build_network(metadata.network), metadata)
+    scored = score_views(paths, [hands, hands])
     assert set(scored.kind.tolist()) == {"pile", "table"}
     assert scored.logit.shape == (2, len(scored.held))
     np.testing.assert_array_equal(*scored.logit)
     assert 0 < scored.held.mean() < 1
     with pytest.raises(ValueError, match="hand networks"):
-        score_views(paths, [files["balls"]])
+        score_views(paths, [balls])
