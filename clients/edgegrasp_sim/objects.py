@@ -5,7 +5,6 @@ A mesh is scaled to the hand, decomposed into convex parts and cached on disk.
 
 import contextlib
 import hashlib
-import json
 import logging
 import os
 import shutil
@@ -324,20 +323,9 @@ def _kept_in(name: str, write: Callable[[Path], None]) -> Path:
 
 def _digest(mesh: Path) -> str:
     """SHA-256 of a mesh and of everything that decides how it is prepared."""
-    recipe = {
-        "layout": LAYOUT,
-        "shortest_side": SHORTEST_SIDE,
-        "longest_side": LONGEST_SIDE,
-        "concavity": CONCAVITY,
-        "search": SEARCH,
-        "mass": OBJECT_MASS,
-        "friction": OBJECT_FRICTION,
-        "coacd": version("coacd"),
-        "suffix": mesh.suffix.lower(),
-    }
-    digest = hashlib.sha256(json.dumps(recipe, sort_keys=True).encode())
-    digest.update(mesh.read_bytes())
-    return digest.hexdigest()
+    sizes = SHORTEST_SIDE, LONGEST_SIDE, CONCAVITY, OBJECT_MASS, OBJECT_FRICTION
+    recipe = LAYOUT, sizes, SEARCH, version("coacd"), mesh.suffix.lower()
+    return hashlib.sha256(repr(recipe).encode() + mesh.read_bytes()).hexdigest()
 
 
 def _read(mesh: Path) -> Any:
