@@ -202,12 +202,9 @@ def request(observation: Observation, num_candidates: int = 2000) -> DetectOptio
 
 
 def write_table(page: Path, written: str) -> None:
-    """Put a table between a page's markers; raises ValueError where it does not hold both."""
-    place = re.compile(f"{BEGIN}.*{END}", re.DOTALL)
-    text, count = place.subn(lambda _: f"{BEGIN}\n{written}\n{END}", page.read_text())
-    if not count:
-        raise ValueError(f"{page} holds no {BEGIN} … {END}")
-    page.write_text(text)
+    """Put a table between a page's markers."""
+    place = re.compile(f"(?<={BEGIN}\n).*(?=\n{END})", re.DOTALL)
+    page.write_text(place.sub(lambda _: written, page.read_text()))
 
 
 def camera_table(results: dict[str, Any]) -> str:
