@@ -20,15 +20,10 @@ from edgegrasp_sim.trial import Attempt, PlannedGrasp, Round, RoundDriver
 
 PICTURES = 6
 STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1c2430; max-width: 1120px;
-       margin: 2em auto; padding: 0 1.2em; }
-h1 { font-size: 1.7em; margin-bottom: .1em; } h2 { font-size: 1.2em; margin-top: 2em;
-     border-bottom: 1px solid #d5dae0; padding-bottom: .2em; }
-table { border-collapse: collapse; margin: .8em 0; }
-th, td { padding: .28em .9em .28em 0; text-align: left; border-bottom: 1px solid #e6e9ed;
-         vertical-align: top; overflow-wrap: anywhere; font-variant-numeric: tabular-nums; }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1120px; margin: 2em auto; padding: 0 1em; }
+table { border-collapse: collapse; display: block; overflow-x: auto; }
+th, td { padding: .3em .9em .3em 0; text-align: left; border-bottom: 1px solid #e6e9ed; }
 img { max-width: 100%; margin: 1.2em 0; }
-@media (max-width: 700px) { body { margin-top: 1em; } table { display: block; overflow-x: auto; } }
 """
 Row = Sequence[object]
 
