@@ -1,10 +1,11 @@
 """The depth camera: viewpoints, points from depth images, and what a planner receives."""
 
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator
 
 from edgegrasp_sim.engine import Intrinsics
 from edgegrasp_sim.poses import Matrix
@@ -42,13 +43,22 @@ class Observation:
         return np.asarray(self.camera_positions[0])
 
 
+def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError(f"got {ends}; give the lower end first")
+    return ends
+
+
+Range = Annotated[tuple[float, float], AfterValidator(_ascending)]  # checked in a protocol's file
+
+
 @dataclass(frozen=True, slots=True)
 class ViewRange:
     """Where a camera may stand: ranges of spherical coordinates around `target`."""
 
-    radius: tuple[float, float]  # metres
-    polar_degrees: tuple[float, float]  # from world z
-    azimuth_degrees: tuple[float, float]  # from world x
+    radius: Range  # metres
+    polar_degrees: Range  # from world z
+    azimuth_degrees: Range  # from world x
     target: tuple[float, float, float]  # the point looked at, world frame, metres
 
     def sample(self, rng: np.random.Generator, views: int = 1) -> list[Matrix]:

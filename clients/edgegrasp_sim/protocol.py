@@ -9,25 +9,16 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, ConfigDict, Field, PositiveInt, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, PositiveInt, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from edgegrasp_sim.camera import TableView, ViewRange
+from edgegrasp_sim.camera import Range, TableView, ViewRange
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.sensor import SENSORS, DepthNoise, DepthSensor, random_sensor
 from edgegrasp_sim.surroundings import OPEN_THICKNESS
 
 FOLDER = Path(__file__).parent / "protocols"
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-
-def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
-    if ends[0] > ends[1]:
-        raise ValueError(f"got {ends}; give the lower end first")
-    return ends
-
-
-Range = Annotated[tuple[float, float], AfterValidator(_ascending)]
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -54,9 +45,6 @@ class RoundRules:
 class CameraRules(ViewRange):
     """Where the camera stands; ranges are drawn from uniformly before every grasp."""
 
-    radius: Range
-    polar_degrees: Range
-    azimuth_degrees: Range
     views: PositiveInt  # images before every grasp, spread evenly over a full turn from the first
 
 
