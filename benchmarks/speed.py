@@ -5,6 +5,7 @@ machine too.
 """
 
 import argparse
+import itertools
 import math
 import re
 import statistics
@@ -20,7 +21,6 @@ from benchmarks.measuring import RESULTS, RUNS, interleaved, machine, memory, se
 from examples.your_planner import plan
 
 from edgegrasp_lab.real_scenes import load_scenes
-from edgegrasp_model.candidates.sample import Sampler
 from edgegrasp_model.detector import ModelCatalogue
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_sim.camera import EVALUATION_VIEWS, Observation, TableView
@@ -30,9 +30,11 @@ from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trial import RoundDriver
 from edgegrasp_training import views
+from edgegrasp_training.generation import label
+from edgegrasp_training.options import GenerationOptions
 
 WEIGHTS = ("edgegrasp-plus", "edgegrasp-small", "edgegrasp", "vn-edgegrasp")
-LABELLED_GRASPS = 240  # candidates in each scene; some hundred differ and are tried
+LABELS = 240  # grasps tried in each scene
 SIMULATED = 4  # scenes and rounds
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared" / "real_scenes"
@@ -140,45 +142,30 @@ def simulators() -> dict[str, Any]:
 
 
 def simulator(kind: SceneKind) -> dict[str, dict[str, float]]:
-    """Labels a second and rounds a minute of each engine, scenes and images included."""
-    simulations = {
-        engine: ClutterSimulation(engine=engine) for engine in ENGINES if installed(engine)
-    }
-    protocol = load_protocol("edgegrasp")
-    seconds: dict[str, list[tuple[float, float]]] = {engine: [] for engine in simulations}
-    labels = dict.fromkeys(simulations, 0)
-    for simulation in simulations.values():  # a process draws its first image once
-        simulation.observe_from([np.eye(4)], np.random.default_rng(0))
-    for seed in range(SIMULATED):
-        for engine, simulation in simulations.items():
+    """Labels a second and rounds a minute of each engine, all but the start included."""
+    protocol, options = load_protocol("edgegrasp"), GenerationOptions(grasps_per_view=LABELS)
+    # Labels, seconds that they took, and seconds of a round.
+    rows: dict[str, list[tuple[float, ...]]] = {name: [] for name in ENGINES if installed(name)}
+    for seed, engine in itertools.product(range(SIMULATED + 1), rows):
+        with ClutterSimulation(engine=engine) as simulation:
             start = time.process_time()
             simulation.reset(kind, np.random.default_rng(seed))
-            camera, noise = map(np.random.default_rng, ([seed, 1], [seed, 2]))
+            camera, noise, choice = (np.random.default_rng([seed, k]) for k in range(3))
             observation = simulation.observe_from(EVALUATION_VIEWS.sample(camera), noise)
-            seen = time.process_time()
-            options = request(observation, num_candidates=LABELLED_GRASPS)
-            ours = ModelCatalogue.load().get("edgegrasp-small")
-            prepared = ours.prepare(observation.cloud, options)
-            assert prepared.scene is not None
-            hands = prepared.gripper, prepared.crop_radius, prepared.counts, ours.sees_hands
-            sample = Sampler(prepared.scene, options, *hands).all()
-            poses = prepared.scene.frame.poses_in_cloud(sample.candidates.T_cloud_hand)
-            begin = time.process_time()
-            for pose in poses:
-                simulation.try_grasp(pose, shake=True)
+            query = observation, request(observation)
+            view, _ = label(simulation, query, options, choice, None)
             labelled = time.process_time()
             RoundDriver(simulation, kind, protocol, seed=seed, index=0).run(plan)
             end = time.process_time()
-            seconds[engine].append((seen - start + labelled - begin, end - labelled))
-            labels[engine] += len(poses)
+        if seed:  # with the first a process loads and compiles
+            rows[engine].append((len(view.success), labelled - start, end - labelled))
     results = {}
-    for engine, simulation in simulations.items():
-        simulation.close()
-        labelling, rounds = np.sum(seconds[engine], axis=0).tolist()
+    for engine, each in rows.items():
+        labels, labelling, rounds = np.sum(each, axis=0).tolist()
         results[engine] = {
-            "labels_per_second": labels[engine] / labelling,
-            "rounds_per_minute": 60 * SIMULATED / rounds,
-            "labels": labels[engine],
+            "labels_per_second": labels / labelling,
+            "rounds_per_minute": 60 * len(each) / rounds,
+            "labels": labels,
         }
     return results
 
@@ -191,11 +178,11 @@ def observe(kind: SceneKind = SceneKind.PILE, table: TableView = "known") -> Obs
         return simulation.observe_from(views, np.random.default_rng(2), table=table)
 
 
-def request(observation: Observation, num_candidates: int = 2000) -> DetectOptions:
+def request(observation: Observation) -> DetectOptions:
     """The options of a request with a known table."""
     return DetectOptions(
         num_approach_points=32,
-        num_candidates=num_candidates,
+        num_candidates=2000,
         viewpoint=tuple(observation.camera_position.tolist()),
         support={"normal": (0.0, 0.0, 1.0), "offset": observation.table_height},
     )
@@ -242,7 +229,7 @@ def table(results: dict[str, Any]) -> str:
         f"candidates, one view. "
         f"The server is ready after {server['ready_seconds']:.1f} s and takes "
         f"{server['rest_mb']:.0f} MB at rest, {server['used_mb']:.0f} MB after ten "
-        f"requests. The time of a label or a round includes its scene and images."
+        f"requests. The time of a label or a round includes its scene, images and choice of grasps."
     )
     return "\n".join([*lines, "", *views.table(head, rows), "", text])
 
