@@ -215,22 +215,17 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         """The scene in colour from a pose (4, 4): (H, W, 3), each object in a different colour."""
         depth = self.world.render_depth(T_world_camera, CAMERA)
         seen = depth < FARTHEST * CAMERA.far
-        points = points_of(depth, T_world_camera, CAMERA)
+        points, eye = points_of(depth, T_world_camera, CAMERA), T_world_camera[:3, 3]
         numbers = {item.body.uid: number for number, item in enumerate(self._objects)}
         around = [(low - 0.003, high + 0.003) for low, high in self.object_bounds]
         inside = [((points > low) & (points < high)).all(axis=1) for low, high in around]
         row = np.flatnonzero(np.any(inside, axis=0))
-        # From a little before what is seen to a little behind: shapes may be filled hollows.
-        sight = points[row] - T_world_camera[:3, 3]
-        sight *= 0.003 / np.linalg.norm(sight, axis=1, keepdims=True)
         painted = np.full((len(points), 3), WOOD)
         for part in np.array_split(row, len(row) // 10_000 + 1):
-            ahead = sight[np.searchsorted(row, part)]
-            for reach in (2.0, 30.0):  # then everything behind the surface
-                hits = self.world.first_hits(points[part] - reach * ahead, points[part] + ahead)
-                found = np.array([numbers.get(uid, -1) for uid in hits], dtype=np.int64)
-                painted[part[found >= 0]] = PAINTS[found[found >= 0] % len(PAINTS)]
-                part, ahead = part[found < 0], ahead[found < 0]
+            starts = np.tile(eye, (len(part), 1))  # rays end a little behind what is seen
+            hits = self.world.first_hits(starts, starts + 1.01 * (points[part] - eye))
+            found = np.array([numbers.get(uid, -1) for uid in hits], dtype=np.int64)
+            painted[part[found >= 0]] = PAINTS[found[found >= 0] % len(PAINTS)]
         light = lit(np.where(seen, depth, np.nan), CAMERA.focal_length, CAMERA.focal_length)
         image = np.full((*depth.shape, 3), 255.0)
         image[seen] = painted * (0.45 + 0.55 * light[seen][:, None])
