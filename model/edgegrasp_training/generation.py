@@ -1,7 +1,6 @@
 """Generate labelled views: observe random clutter, try edge grasps in it, keep the outcomes."""
 
 import json
-from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -15,8 +14,8 @@ from scipy.spatial import cKDTree
 from edgegrasp_camera.arrays import Float32, Floats, Int64
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import Sample, Sampler
-from edgegrasp_model.detector import GraspDetector
-from edgegrasp_model.gripper import choose_gripper, gripper_fields, load_gripper
+from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector, Prepared
+from edgegrasp_model.gripper import gripper_fields
 from edgegrasp_model.options import (
     AutoPlane,
     Box,
@@ -29,8 +28,7 @@ from edgegrasp_model.options import (
     Workspace,
 )
 from edgegrasp_model.ranking import judged_together
-from edgegrasp_model.scene.cloud import check_cloud
-from edgegrasp_model.scene.scene import Scene, SelectedPoints, build_scene, select_points
+from edgegrasp_model.scene.scene import Scene
 from edgegrasp_sim.camera import Observation, TableView, ViewRange
 from edgegrasp_sim.engine import choose_engine
 from edgegrasp_sim.hand import FINGERTIP
@@ -42,7 +40,6 @@ from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
 from edgegrasp_sim.workers import run_tasks
 from edgegrasp_training.options import GenerationOptions
-from edgegrasp_training.recipes import CROP_RADIUS, VOXEL_SIZE
 from edgegrasp_training.shapes import household_objects, varied_objects
 from edgegrasp_training.views import TABLE as TABLE_PLANE
 from edgegrasp_training.views import LabelledView, different
@@ -106,7 +103,9 @@ REACH = 0.6, 1.0  # outward part of that link in the open hand, in halves of the
 STEEPEST = 0.75  # most of it, in radii
 
 Query = tuple[Observation, DetectOptions]  # a view of a scene, and a request for grasps in it
-detector = lru_cache(maxsize=1)(GraspDetector.load)  # loads weights once in a process
+# What prepares a view without a guide; its network is not asked.
+DEFAULT_WEIGHTS = WEIGHTS_FOLDER / "edgegrasp-plus.safetensors"
+detector = lru_cache(maxsize=2)(GraspDetector.load)  # loads weights once in a process
 
 
 def generate(
@@ -327,21 +326,22 @@ def label(
     guide: GraspDetector | None,  # guides the choice
 ) -> tuple[LabelledView, Float32 | None]:
     """Sample candidates as the detector does and try some; also the guide's best hand (4, 4)."""
-    observation, request = query
+    observation, _ = query
     found = choose_grasps(query, options, rng, guide)
     if found is None:
         nothing, rows = np.empty((0, 3), dtype=np.float32), np.empty(0, dtype=np.int64)
         camera, success = observation.camera_position, rows.astype(np.int8)
         return LabelledView(nothing, nothing, camera, rows, rows, None, success), None
-    selected, scene, candidates, best = found
+    prepared, scene, candidates, best = found
     T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
     # Points far from every grasp carry no information.
-    behind = choose_gripper(request, load_gripper(), {}).tip_z - FINGERTIP
+    behind = prepared.gripper.tip_z - FINGERTIP
     places = T_world_hand[:, :3, 3] + np.float32(behind) * T_world_hand[:, :3, 2]
     if len(places) == 0:  # a teacher's grasps are on the objects
         places = scene.points_in_cloud[scene.approach_allowed]
-    plane = None if selected.support is None else selected.support.plane
+    support = prepared.selected.support
+    plane = None if support is None else support.plane
     kept = np.flatnonzero(cKDTree(places).query(scene.points_in_cloud)[0] <= KEPT_DISTANCE)
     view = LabelledView(
         points=scene.points_in_cloud[kept],
@@ -361,36 +361,34 @@ def label(
 
 def choose_grasps(
     query: Query, options: GenerationOptions, rng: np.random.Generator, guide: GraspDetector | None
-) -> tuple[SelectedPoints, Scene, Candidates, int | None] | None:
+) -> tuple[Prepared, Scene, Candidates, int | None] | None:
     """Sample candidates of a view as the detector does and choose some; None without any.
 
     The last is the row of the guide's best among them.
     """
     observation, request = query
-    if len(observation.cloud) == 0:
+    if len(observation.cloud) < (request.num_approach_points or 1):
+        return None
+    prepared = (guide or detector(DEFAULT_WEIGHTS)).prepare(observation.cloud, request)
+    scene = prepared.scene
+    if scene is None or not scene.approach_allowed.any():
         return None
     if guide is None:
-        selected = select_points(check_cloud(observation.cloud), request, {}, [])
-        scene = build_scene(selected, request, VOXEL_SIZE, {})
-        if scene is None or not scene.approach_allowed.any():
-            return None
-        gripper = choose_gripper(request, load_gripper(), {})
-        radius = max(CROP_RADIUS, gripper.max_opening / 2)
-        sample = Sampler(scene, request, gripper, radius, defaultdict(int), sees_hands=True).all()
+        given = request, prepared.gripper, prepared.crop_radius, prepared.counts
+        sample = Sampler(scene, *given, sees_hands=True).all()
         if len(sample.candidates) == 0:
             return None
         rows, best = _any(sample, options.grasps_per_view, rng), None
     else:
-        prepared = guide.prepare(observation.cloud, request)
-        selected, scene, scored = prepared.selected, prepared.scene, guide.evaluate(prepared)
-        if scene is None or scored is None or len(scored.logits) == 0:
+        scored = guide.evaluate(prepared)
+        if scored is None or len(scored.logits) == 0:
             return None
         sample = scored.sample
         rating = judged_together(scored.logits, sample, scene, prepared.gripper)
         number = scene.object_of_point[sample.candidates.contact_index]
         rows = _likely(number, scored.logits, rating, options.grasps_per_view, rng)
         best = int(np.searchsorted(rows, rating.argmax()))
-    return selected, scene, sample.candidates.take(rows), best
+    return prepared, scene, sample.candidates.take(rows), best
 
 
 def _any(sample: Sample, total: int, rng: np.random.Generator) -> Int64:
