@@ -289,21 +289,11 @@ def simulated(objects: Path | None, motion: Motion, rounds: int) -> Iterator[Sim
 
 
 def _print(rows: dict[str, dict[str, Any]]) -> None:
-    """A row for each motion or recorded scene; medians and 95 % in one column."""
-    held = [name for name in next(iter(rows.values()), {}) if name in SUCCESSES]
-    counts, measured = ("scenes", "images", "switches"), ("mm", "degrees", "ms")
-    table = Table("", *counts, *measured, *held, "alike", box=None)
+    """A row of figures for each motion or recorded scene."""
+    table = Table("", *next(iter(rows.values()), {}), box=None)
     for label, row in rows.items():
-        pairs = ((row[f"{name}_50"], row[f"{name}_95"]) for name in measured)
-        texts = ("-" if low is None else f"{low:.1f}, {high:.1f}" for low, high in pairs)
-        table.add_row(
-            label,
-            *(str(row[name]) for name in counts),
-            *texts,
-            *(str(row[name]) for name in held),
-            "-" if row["alike"] is None else f"{row['alike']:.0%}",
-        )
-    Console(width=110, markup=False, emoji=False).print(table)
+        table.add_row(label, *("-" if value is None else f"{value:.4g}" for value in row.values()))
+    Console(width=130, markup=False, emoji=False).print(table)
 
 
 def _plot(path: Path, done: dict[str, list[Followed]]) -> None:
