@@ -67,7 +67,8 @@ def benchmark_real(
             answer = np.maximum(labels + 1, 0)
             figures = judge(scene, grasps, plane, answer, gripper, milliseconds, refused)
             done[scene.name] = figures
-            title = f"{scene.name}: {_sentence(figures)}"
+            said = f"of the {figures.best} best {figures.on_object} on an object, plane: "
+            title = f"{scene.name}: {refused or said + _plane_text(figures)}"
             draw(output / f"{scene.name}.png", scene, grasps[:BEST], title)
             draw_labels(output / f"{scene.name}-labels.png", scene, labels)
     _write(output, model.name, fields, done)
@@ -200,15 +201,6 @@ def _plane_text(figures: SceneFigures) -> str:
         return "none found"
     verdict = "right" if plane.right else "wrong"
     return f"{verdict}: {plane.angle:.1f}°, {1000 * plane.offset:.0f} mm"
-
-
-def _sentence(figures: SceneFigures) -> str:
-    if figures.refused:
-        return f"refused: {figures.refused}"
-    return (
-        f"of the {figures.best} best {figures.on_object} on an object, {figures.from_below} from "
-        f"below, {figures.through_points} through points; plane {_plane_text(figures)}"
-    )
 
 
 # Pictures
