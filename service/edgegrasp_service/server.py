@@ -88,11 +88,10 @@ class Server:
             scheme = "http" if self.service.tls is None else "https"
             self.http_url = _url(scheme, http_socket)
             self.grpc_address = grpc_server.address
-            await grpc_server.set_serving(False)
             await grpc_server.server.start()
             trimming = asyncio.create_task(grpc_server.trim(http_connections.taken))
             http_task = asyncio.create_task(http_server.serve(sockets=[http_socket]))
-            load_task = asyncio.create_task(self._load(grpc_server, ready))
+            load_task = asyncio.create_task(self._load(ready))
             opened()
             stopped = asyncio.create_task(stop.wait())
             try:
@@ -103,7 +102,6 @@ class Server:
             finally:
                 load_task.cancel()
                 self.service.stopping.set()  # new requests are refused, accepted ones answered
-                await grpc_server.set_serving(False)
                 notice = min(NOTICE_SECONDS, self._settings.grace_seconds)
                 await asyncio.sleep(notice)
                 await self.service.drain(self._settings.grace_seconds - notice)
@@ -115,11 +113,10 @@ class Server:
                 if self.service.recorder is not None:
                     self.service.recorder.close()
 
-    async def _load(self, grpc_server: GrpcServer, ready: Callable[[], None]) -> None:
+    async def _load(self, ready: Callable[[], None]) -> None:
         await self.pool.start()
         gc.freeze()  # a collection that visits every module stops the event loop for 100 ms
         if not self.service.stopping.is_set():
-            await grpc_server.set_serving(True)
             ready()
 
     def _http_server(self, places: Places) -> "_HttpServer":

@@ -338,9 +338,8 @@ async def test_pages_that_nobody_reads_keep_no_place_from_another_client(running
             assert (await running.http().get(path)).status_code == 200
 
 
-async def test_silent_health_checks_and_watchers_hold_up_nobody(running, monkeypatch) -> None:
+async def test_silent_health_checks_and_watchers_hold_up_nobody(running) -> None:
     """Hundreds of streams of one connection that ask nothing, or ask for ever."""
-    monkeypatch.setattr("edgegrasp_service.front.grpc.SMALL_READ_SECONDS", PATIENCE)
     check = running.channel().stream_unary("/grpc.health.v1.Health/Check")
     silent = [check() for _ in range(400)]
     stub = health_pb2_grpc.HealthStub(running.channel(*OWN_CONNECTION))

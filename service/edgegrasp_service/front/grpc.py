@@ -12,7 +12,7 @@ import os
 import socket
 import struct
 import urllib.parse
-from collections import Counter, defaultdict, deque
+from collections import defaultdict, deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Sized
 from functools import partial
 from pathlib import Path
@@ -60,14 +60,13 @@ CHECK = f"/{HEALTH}/Check"
 STATES = health_pb2.HealthCheckResponse.ServingStatus
 REFLECTION = tuple(f"grpc.reflection.{version}.ServerReflection" for version in ("v1", "v1alpha"))
 
-SMALL_READS = 8  # messages of health checks and reflection read at a time
-SMALL_READ_SECONDS = 2.0
-WATCHERS = 64  # of health
+WATCHERS = 64  # of health, and readers of the interface by reflection
+WATCH_SECONDS = 1.0  # seconds between two looks at the health
 STREAM_IDLE_SECONDS = 300.0  # for which a stream may stay open without a message
 STREAM_GRACE_SECONDS = 10.0  # seconds after which an idle stream yields its place to another one
 MOST_STREAM_FIELDS = 16  # in a message of a stream, which has three
-# Number and wire type, 2 of bytes and 1 of a double, of those of a DetectGraspsStreamRequest.
-STREAM_FIELDS = {(1, 2): "request_id", (2, 2): "request", (3, 1): "timeout"}
+# By tag, those of a DetectGraspsStreamRequest.
+STREAM_FIELDS = {0x0A: "request_id", 0x12: "request", 0x19: "timeout"}
 
 # Connections
 CALLS = 100  # calls of one connection at a time; further ones wait in the client
@@ -96,11 +95,8 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
 
     def __init__(self, service: GraspService) -> None:
         self._service = service
-        self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
         names = (SERVICE.full_name, HEALTH, *REFLECTION)
         self._reflection = reflection.aio.ReflectionServicer(names)  # type: ignore[attr-defined]
-        self._small_reads = Places(SMALL_READS)
-        self._checking: Counter[str] = Counter()  # by connection
         self._watchers = Places(WATCHERS)
         self._streams = Places(service.settings.max_streams, STREAM_GRACE_SECONDS)
         ours: dict[str, Behaviour] = {
@@ -122,11 +118,8 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         self.server = aio.server(options=_bounds(service.settings))
         self.server.add_generic_rpc_handlers((self,))
         # It has a queue of its own: no other calls come before it.
-        checking = grpc.stream_stream_rpc_method_handler(
-            self._check, response_serializer=_serialized
-        )
         self.server.add_registered_method_handlers(  # type: ignore[attr-defined]
-            HEALTH, {"Check": checking}
+            HEALTH, {"Check": self._handler(CHECK)}
         )
         self.address, self._port = self._listen()
 
@@ -145,12 +138,6 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
             raise AddressInUse("gRPC", place, str(error)) from None
         return (place, 0) if sockets else (f"{host}:{port}", port)
 
-    async def set_serving(self, serving: bool) -> None:
-        """Set the status that health checks report."""
-        status = STATES.SERVING if serving else STATES.NOT_SERVING
-        for name in ("", SERVICE.full_name):
-            await self._health.set(name, status)
-
     async def trim(self, others: Sized) -> None:
         """Keep closing surplus connections, which gRPC cannot limit by client.
 
@@ -165,24 +152,13 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
 
     def service(self, handler_call_details: grpc.HandlerCallDetails) -> Any:
         """The handler of a path, known or not."""
-        path: str = handler_call_details.method
+        return self._handler(handler_call_details.method)
 
+    def _handler(self, path: str) -> Any:
         async def handle(messages: Any, context: Any) -> None:
             await self._handle(path, context)
 
         return grpc.stream_stream_rpc_method_handler(handle, response_serializer=_serialized)
-
-    async def _check(self, messages: Any, context: Any) -> None:
-        """Answer a health check, or refuse one of many silent ones at little cost."""
-        peer = context.peer()
-        if self._checking[peer] and len(self._small_reads.taken) >= SMALL_READS:
-            why = "This connection has a health check without a message."
-            await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, why)
-        self._checking[peer] += 1
-        try:
-            await self._handle(CHECK, context)
-        finally:
-            self._checking -= Counter((peer,))  # forgets those without any
 
     async def _handle(self, path: str, context: Any) -> None:
         metadata = context.invocation_metadata() or ()
@@ -279,54 +255,44 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         await context.write(response(**{name: getattr(self._service.loaded(), name)}))
 
     async def _reload_models(self, call: Call, context: Any) -> None:
-        models = [grasp_pb2.Model(**facts) for facts in await self._service.reload(call)]
+        models: Any = await self._service.reload(call)
         await context.write(grasp_pb2.ReloadModelsResponse(models=models))
 
     async def _check_health(self, call: Call, context: Any) -> None:
-        request = await self._read_health(context)
-        if request.service not in ("", SERVICE.full_name):
-            await _abort(call, context, _not_found(grpc.StatusCode.NOT_FOUND, request.service))
+        """Answer unread: whatever service it asks about, there is one."""
         status = STATES.SERVING if self._service.ready else STATES.NOT_SERVING
         await context.write(health_pb2.HealthCheckResponse(status=status))
 
     async def _watch_health(self, call: Call, context: Any) -> None:
-        request = await self._read_health(context)
+        """Tell the health and each change; raises NotReady once the server is stopping."""
+        told: bool | None = None
         async with self._watchers.hold(call.client):
-            await self._health.Watch(request, context)
-
-    async def _read_health(self, context: Any) -> Any:
-        kind = health_pb2.HealthCheckRequest
-        return await self._read_small(kind, context) or kind()
+            while told is not False or not self._service.stopping.is_set():
+                if told != self._service.ready:
+                    told = self._service.ready
+                    await self._check_health(call, context)
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(WATCH_SECONDS):
+                        await self._service.stopping.wait()
+        raise NotReady(STOPPING)
 
     async def _reflect(self, call: Call, context: Any) -> None:
         async def requests() -> AsyncIterator[Any]:
-            kind = reflection_pb2.ServerReflectionRequest
-            while (message := await self._read_small(kind, context)) is not None:
-                yield message
+            while (data := await self._service.receive(context.read())) is not EOF:
+                try:
+                    request = reflection_pb2.ServerReflectionRequest.FromString(data)
+                except DecodeError:
+                    raise no_message(data) from None
+                yield request
 
-        async for answer in self._reflection.ServerReflectionInfo(requests(), context):
-            await context.write(answer)
-
-    async def _read_small(self, kind: Any, context: Any) -> Any:
-        """The next message of a method with small messages; None at the end."""
-        try:
-            async with self._small_reads.hold(context.peer()):
-                async with asyncio.timeout(SMALL_READ_SECONDS):
-                    data = await context.read()
-            return None if data is EOF else kind.FromString(data)
-        except TimeoutError:
-            value = f"nothing whole in {SMALL_READ_SECONDS:g} s"
-            raise RequestTimeout("request", value, "Send it without delay.") from None
-        except DecodeError:
-            raise no_message(data) from None
+        async with self._watchers.hold(call.client):
+            async for answer in self._reflection.ServerReflectionInfo(requests(), context):
+                await context.write(answer)
 
 
 async def _unimplemented(call: Call, context: Any) -> None:
-    await _abort(call, context, _not_found(grpc.StatusCode.UNIMPLEMENTED, "Method not found!"))
-
-
-def _not_found(code: grpc.StatusCode, detail: str) -> Problem:
-    return Problem("grpc", detail, "", "", "", code.name, 404)
+    problem = Problem("grpc", "Method not found!", "", "", "", "UNIMPLEMENTED", 404)
+    await _abort(call, context, problem)
 
 
 def _serialized(message: Any) -> bytes:
@@ -372,7 +338,7 @@ def error_detail(problem: Problem) -> grasp_pb2.ErrorDetail:
 async def _next_request(context: Any) -> dict[str, Any] | None:
     """The fields of the next DetectGraspsStreamRequest; None at the end.
 
-    Not parsed by protobuf, which takes seconds for millions of fields.
+    Not parsed by protobuf, which takes seconds for millions of fields. Raises InvalidRequest.
     """
     data = await context.read()
     if data is EOF:
@@ -383,14 +349,15 @@ async def _next_request(context: Any) -> dict[str, Any] | None:
         for _ in range(MOST_STREAM_FIELDS):
             if place == len(data):
                 return fields | {"request_id": fields["request_id"].decode()}
-            tag, place = _varint(data, place)
-            size, place = _varint(data, place) if tag & 7 == 2 else (8, place)
-            if tag & 7 not in (1, 2) or place + size > len(data):
+            name, place = STREAM_FIELDS[data[place]], place + 1
+            size = 8
+            if name != "timeout":
+                size, place = _varint(data, place)
+            if place + size > len(data):
                 break
-            name = STREAM_FIELDS.get((tag >> 3, tag & 7), "unknown")
             fields[name] = data[place : place + size]
             place += size
-    except (IndexError, UnicodeDecodeError):
+    except (LookupError, UnicodeDecodeError):
         pass
     raise no_message(data)
 
@@ -428,10 +395,7 @@ async def _answer(service: GraspService, stream: Call, request: dict[str, Any]) 
 
 
 def _timeout(request: dict[str, Any]) -> float:
-    """The timeout in seconds; raises InvalidRequest for a wrong or unknown field."""
-    if "unknown" in request:
-        fix = "Send the fields of this server's .proto file only."
-        raise InvalidRequest("request", "a field that this server does not know", fix)
+    """The timeout in seconds; raises InvalidRequest for one that is not positive."""
     if request["timeout"] is None:
         return math.inf
     (timeout,) = struct.unpack("<d", request["timeout"])
