@@ -53,15 +53,15 @@ class Server:
         self.service = GraspService(settings, self.pool, self.metrics)
         if settings.outcomes_file is not None:
             check_outcomes(settings.outcomes_file)
-        service, admission, pool = self.service, self.service.admission, self.pool
+        service, admission = self.service, self.service.admission
         watch = self.metrics.watch
         watch("ready", "1: requests are answered", lambda: service.ready)
         watch("requests_in_flight", "requests not yet answered", lambda: service.in_flight)
-        watch("requests_active", "requests that workers have", lambda: pool.busy)
+        watch("requests_active", "requests that workers have", lambda: admission.at_work)
         waiting = "requests let in that no worker has"
-        watch("queue_depth", waiting, lambda: max(0, len(admission.calls) - pool.busy))
+        watch("queue_depth", waiting, lambda: len(admission.calls) - admission.at_work)
         watch("held_bytes", "bytes of bodies in the server", lambda: admission.held_bytes)
-        watch("workers", "worker processes", lambda: len(pool.pids))
+        watch("workers", "worker processes", lambda: len(self.pool.pids))
         self.http_url = self.grpc_address = ""  # once ports are open: http://host:port, host:port
 
     async def serve(

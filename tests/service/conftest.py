@@ -179,7 +179,8 @@ class Running:
     @property
     def waiting(self) -> int:
         """Requests let in that no worker has."""
-        return len(self.server.service.admission.calls) - self.server.pool.busy
+        admission = self.server.service.admission
+        return len(admission.calls) - admission.at_work
 
     async def until(self, condition: Callable[[], bool]) -> None:
         """Return once something is so."""
@@ -190,7 +191,7 @@ class Running:
     async def until_idle(self) -> None:
         """Return once no request is in the server, and no worker has a job."""
         admission, pool = self.server.service.admission, self.server.pool
-        await self.until(lambda: not admission.calls and not pool.busy)
+        await self.until(lambda: not admission.calls and not any(w.answer for w in pool._workers))
 
     def connect(self, transport: str) -> "Grpc | Rest":
         """A client, until the test ends."""

@@ -31,9 +31,11 @@ async def test_recorded_requests_are_replayed(serve, transport, cloud, tmp_path,
     client = running.connect(transport)
     assert (await client.detect(cloud, seed=3)).fine
     assert not (await client.detect(cloud[:0])).fine
+    running.stages.fail("evaluate", "crash")
+    await client.detect(cloud)
     running.stop.set()
     await running.serving
-    fine, bad = sorted((tmp_path / "recorded").glob("*.job"))
+    fine, bad, harmful = sorted((tmp_path / "recorded").glob("*.job"))
     settings = Settings()
     monkeypatch.setattr(answer, "load_catalogue", lambda settings: DummyCatalogue())
     _, recorded, again = answer_again(fine, settings)
@@ -44,6 +46,7 @@ async def test_recorded_requests_are_replayed(serve, transport, cloud, tmp_path,
         cut = recorded.body.index(b'"seconds"')
         assert again.body[:cut] == recorded.body[:cut]
     assert answer_again(bad, settings)[-1].error.kind == "invalid-request"
+    assert answer_again(harmful, settings)[1].error.kind == "harmful-request"
     tried = Job("RecordOutcome", "http", b""), Answer(b"{}", Facts())  # it would be kept twice
     outcome = b"".join(part for message in tried for part in pack(message))
     for other in (b"", b"\xff" * 64, fine.read_bytes()[:-9000], bad.read_bytes()[12:], outcome):

@@ -29,20 +29,17 @@ from edgegrasp_service.errors import (
     PermissionDenied,
     ReloadFailed,
     RequestTimeout,
-    WorkerLost,
     report,
 )
 from edgegrasp_service.observability import CALL, Call, Metrics, log_call
 from edgegrasp_service.recording import Recorder
 from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.process import WORKER_LOST, Answer, Job, WorkerPool
+from edgegrasp_service.worker.process import MOST_DEATHS, Answer, Job, WorkerPool
 
 logger = logging.getLogger(__name__)
 
-MOST_DEATHS = 3  # dead workers after which a request is refused; a crash counts as 3
-HARMFUL_SECONDS = 600.0  # seconds for which it is refused
-MOST_HARMFUL = 1000  # requests remembered
+HARMFUL_SECONDS = 600.0  # seconds for which a request that killed workers is refused
 LATEST = 15  # latest service times, whose median is the pace; one slow request does not change it
 MARGIN = 1.5  # the wait is estimated from a median, and half of the requests take longer
 
@@ -136,7 +133,6 @@ class GraspService:
         Raises:
             PayloadTooLarge: The body is over the limit.
             HarmfulRequest: This request killed workers.
-            WorkerLost: The worker died for another reason.
         """
         call.end_stage("read")
         call.bytes_in = len(job.body)
@@ -155,16 +151,10 @@ class GraspService:
         call.at_work, began = True, time.monotonic()
         try:
             answer = await worker.run(job, call.deadline)
-        except (HarmfulRequest, WorkerLost) as error:
-            await self._note_deaths(job, 1 if isinstance(error, WorkerLost) else MOST_DEATHS)
-            raise
         finally:
             self.admission.service_seconds.append(time.monotonic() - began)
             call.at_work = False
-        if answer.error is not None and answer.error.kind == WORKER_LOST:
-            await self._note_deaths(job, 1)
-        elif answer.error is None and self._deaths:  # its worker had died for another reason
-            self._deaths.pop(await asyncio.to_thread(_digest, job), None)
+        await self._note_deaths(job, answer)
         call.facts, call.problem = answer.facts, answer.error
         call.stages |= answer.facts.seconds
         call.bytes_out = len(answer.body)
@@ -200,13 +190,14 @@ class GraspService:
         except TimeoutError:
             raise Cancelled(f"The client did not take {size} bytes.") from None
 
-    async def _note_deaths(self, job: Job, deaths: int) -> None:
-        """Count workers killed by a request; a crash counts more than a kill."""
-        digest, now = await asyncio.to_thread(_digest, job), time.monotonic()
-        until, before = self._deaths.pop(digest, (0.0, 0))
-        self._deaths[digest] = now + HARMFUL_SECONDS, deaths + (before if now < until else 0)
-        if len(self._deaths) > MOST_HARMFUL:
-            del self._deaths[next(iter(self._deaths))]
+    async def _note_deaths(self, job: Job, answer: Answer) -> None:
+        """Count the workers that a request has killed; forget them once it is answered."""
+        deaths = answer.facts.deaths
+        if deaths or (answer.error is None and self._deaths):
+            digest = await asyncio.to_thread(_digest, job)
+            _, before = self._deaths.pop(digest, (0.0, 0))
+            if deaths:
+                self._deaths[digest] = time.monotonic() + HARMFUL_SECONDS, deaths + before
 
     async def drain(self, grace: float) -> None:
         """Refuse new requests and wait for accepted ones; abandon them after `grace` seconds."""
@@ -344,6 +335,11 @@ class Admission:
             raise call.refusal or DeadlineExceeded() from None
         finally:
             self._release(call)
+
+    @property
+    def at_work(self) -> int:
+        """Number of requests that workers have."""
+        return sum(call.at_work for call in self.calls)
 
     def _refuse_latest(self, holder: str) -> bool:
         """Refuse the latest request of a client that is not being worked on; false without one."""

@@ -36,7 +36,6 @@ from edgegrasp_service.errors import (
     InvalidSettings,
     Problem,
     WorkerLost,
-    kind_of,
     report,
 )
 from edgegrasp_service.settings import Settings
@@ -47,13 +46,12 @@ ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUM
 # Freed memory is kept for the next request: the system hands out new pages slowly.
 KEPT_MEMORY = {"MALLOC_TRIM_THRESHOLD_": str(2**26), "MALLOC_MMAP_THRESHOLD_": str(2**24)}
 
-WORKER_LOST = kind_of(WorkerLost)
+MOST_DEATHS = 3  # dead workers after which a request is refused; a crash counts as so many
 CRASHES = {signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL}
 STATUS_SECONDS = 1.0  # seconds to learn how a worker ended
 START_SECONDS = 20.0  # seconds for a worker to fork, if it need not load
 BEAT_SECONDS = 3.0  # seconds between two checks that a worker is alive
 PULSE_SECONDS = 10.0  # seconds for it to answer
-ALIVE_SECONDS = 15.0  # seconds since the latest answer of any worker
 KILL_SECONDS = 0.5  # seconds that a worker may use to finish an abandoned job
 RETRY_SECONDS = 1.0  # seconds after a worker or the nursery failed to start
 
@@ -91,6 +89,7 @@ class Facts:
     grasps: int = 0  # returned, or evaluated if given by the caller
     seconds: dict[str, float] = field(default_factory=dict)  # of each stage, in order
     counts: dict[str, int] = field(default_factory=dict)  # what passed each stage
+    deaths: int = 0  # of workers, which the request caused
     options: str = ""  # options that differ from the defaults, as shortened JSON
     traceback: str = ""  # of an internal error
 
@@ -180,23 +179,16 @@ class WorkerPool:
         # Last in, first out: its caches are warm.
         self._idle: asyncio.LifoQueue[_Worker] = asyncio.LifoQueue()
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._answered = 0.0  # when a worker last answered
 
     @property
     def alive(self) -> bool:
-        """Whether a worker answered recently, or is busy, which a deadline limits."""
-        recent = time.monotonic() - self._answered < ALIVE_SECONDS
-        return bool(self._workers) and (self.busy > 0 or recent)
+        """Whether there is a worker; one that does not answer in time is killed."""
+        return any(not worker.killed for worker in self._workers)
 
     @property
     def pids(self) -> list[int]:
         """Process ids of the workers."""
         return [worker.pid for worker in self._workers]
-
-    @property
-    def busy(self) -> int:
-        """Number of workers that have a request."""
-        return sum(worker.at_work for worker in self._workers)
 
     async def start(self) -> None:
         """Load weights and start workers; workers of an earlier start finish their request and end.
@@ -224,7 +216,6 @@ class WorkerPool:
         nursery.watch(lambda: self._nursery_lost(nursery))
         for worker in workers:
             self.spawn(self._tend(worker))
-        self._answered = time.monotonic()
         if old_nursery is None:
             self.spawn(self._beat())
         else:
@@ -260,14 +251,14 @@ class WorkerPool:
         """Check regularly that an idle worker answers; one that does not is killed."""
         while True:
             await asyncio.sleep(BEAT_SECONDS)
-            with contextlib.suppress(TimeoutError, EdgeGraspError):
+            with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(PULSE_SECONDS):
                     worker, beat = await self.take(), Job("Beat", "http", b"", 0.0)
                     await worker.run(beat, time.monotonic() + PULSE_SECONDS)
 
     async def _tend(self, worker: "_Worker") -> None:
         """Offer a worker for jobs until it dies, then replace it."""
-        lost = False
+        deaths = 1
         try:
             while True:
                 if worker not in self._workers:
@@ -276,19 +267,18 @@ class WorkerPool:
                     self._idle.put_nowait(worker)
                 answer = await worker.receive()
                 if answer is None:
-                    lost = worker in self._workers
-                    self._workers.discard(worker)  # `take` skips it
-                    if await worker.nursery.crashed(worker.pid):
-                        worker.finish(HarmfulRequest())
                     break
-                self._answered = time.monotonic()
                 worker.finish(answer)
-                if answer.error is not None and answer.error.kind == WORKER_LOST:
+                if answer.facts.deaths:
                     worker.kill()  # it ran out of memory: its state cannot be trusted
+            self._workers.discard(worker)  # `take` skips it
+            if await worker.nursery.crashed(worker.pid):
+                deaths = MOST_DEATHS
         finally:
-            worker.finish(WorkerLost(LOST))
+            error = WorkerLost(LOST) if deaths < MOST_DEATHS else HarmfulRequest()
+            worker.finish(Answer(b"", Facts(deaths=deaths), report(error)))
             worker.close()
-        if lost:
+        if worker.nursery is self._nursery:
             logger.warning("worker %d died and is replaced", worker.pid)
             self._replaced()
             await self._until_done(worker.nursery, lambda: self._replace(worker.nursery))
@@ -402,8 +392,6 @@ class _Worker:
         self.ready: Any = None  # the message that it sent when it had loaded
         self.answer: asyncio.Future[Answer] | None = None  # of the job that it works on
         self._writer: asyncio.StreamWriter | None = None
-        self._killing: asyncio.TimerHandle | None = None
-        self.at_work = False  # on a request
         self.killed = False
 
     async def start(self) -> None:
@@ -427,14 +415,11 @@ class _Worker:
     async def run(self, job: Job, deadline: float) -> Answer:
         """Run a job until a deadline of the event loop's clock; if cancelled, soon kill it.
 
-        Raises:
-            HarmfulRequest: The job killed the process.
-            WorkerLost: It died for another reason.
+        The error of the answer is HarmfulRequest if the job killed the process, WorkerLost if it
+        died for another reason.
         """
         loop = asyncio.get_running_loop()
         answer = self.answer = loop.create_future()
-        answer.add_done_callback(lambda answer: answer.exception())  # nobody may be waiting
-        self.at_work = job.method != "Beat"
         assert self._writer is not None
         try:
             with contextlib.suppress(OSError):  # if it has died, that becomes the answer
@@ -444,22 +429,14 @@ class _Worker:
                         await self._writer.drain()
             return await asyncio.shield(answer)
         except asyncio.CancelledError:
-            if self.answer is answer:  # otherwise it has finished and may have another job
-                self._killing = loop.call_later(KILL_SECONDS, self.kill)
+            killing = loop.call_later(KILL_SECONDS, self.kill)
+            answer.add_done_callback(lambda _: killing.cancel())
             raise
 
-    def finish(self, answer: Answer | EdgeGraspError) -> None:
-        """Complete the worker's job, if any, with the answer or an error."""
-        self.at_work = False
-        if self._killing is not None:
-            self._killing.cancel()
-            self._killing = None
+    def finish(self, answer: Answer) -> None:
+        """Complete the worker's job, if any."""
         waiting, self.answer = self.answer, None
-        if waiting is None:
-            return
-        if isinstance(answer, EdgeGraspError):
-            waiting.set_exception(answer)
-        else:
+        if waiting is not None:
             waiting.set_result(answer)
 
     def kill(self) -> None:
@@ -542,7 +519,7 @@ def _work(
             try:
                 found = answer(job, catalogue, settings)
             except BaseException:  # out of memory
-                facts = Facts(traceback=traceback.format_exc())
+                facts = Facts(traceback=traceback.format_exc(), deaths=1)
                 _send(pool, Answer(b"", facts, report(WorkerLost(LOST))))
                 return
             signal.setitimer(signal.ITIMER_REAL, 0.0)
