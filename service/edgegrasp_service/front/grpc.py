@@ -200,7 +200,8 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
             answer = await service.answer(call, Job(method, "grpc", body))
             if answer.error is not None:
                 await _abort(call, context, answer.error)
-            await service.send(context.write(answer.body), call.bytes_out)
+            async with service.sending(call.bytes_out):
+                await context.write(answer.body)
 
     async def _stream(self, call: Call, context: Any) -> None:
         """Answer the requests of one stream in their order; several are processed in parallel.
@@ -234,7 +235,8 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                         raise RequestTimeout("request", value, "Open another stream.")
                     if ahead and ahead[0].done():
                         response = ahead.popleft().result()
-                        await service.send(context.write(response), len(response))
+                        async with service.sending(len(response)):
+                            await context.write(response)
                     elif reading and reading.done():
                         if (request := reading.result()) is not None:
                             ahead.append(asyncio.create_task(_answer(service, call, request)))

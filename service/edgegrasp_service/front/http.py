@@ -5,23 +5,21 @@ import ipaddress
 import json
 import logging
 import math
-import mimetypes
 import re
 import sys
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, nullcontext, suppress
+from collections.abc import Callable
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-import fastapi_offline
 from fastapi.encoders import jsonable_encoder
 from fastapi.openapi.docs import get_swagger_ui_html
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import JSONResponse, RedirectResponse, Response
+from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Mount, Route, Router
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -54,10 +52,9 @@ MANY_PIECES, SMALL_PIECE = 1024, 16  # more chunks than this, smaller than this,
 
 # Pages
 PAGES = 16  # sent at a time
-PAGE_PAUSE_SECONDS = 0.001  # seconds between the beginnings of two pages
 PAGE_GRACE_SECONDS = 10.0  # seconds after which a page yields its place to another one
 
-ASSETS = "/docs/assets"
+ASSETS = "/docs/assets"  # of fastapi_offline
 PLAYGROUND = "/playground/"
 PLAYGROUND_FILES = Path(__file__).parents[1] / "playground"
 CONTENT_POLICY = (  # what a page may load, and who may show it
@@ -102,7 +99,7 @@ class HttpMiddleware:
     def __init__(self, app: ASGIApp, service: GraspService) -> None:
         self._app = app
         self._service = service
-        self._pages, self._page_begins = Places(PAGES, PAGE_GRACE_SECONDS), asyncio.Lock()
+        self._pages = Places(PAGES, PAGE_GRACE_SECONDS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request, or refuse it."""
@@ -115,6 +112,7 @@ class HttpMiddleware:
         with self._service.observe(call):
 
             async def send_with_headers(message: Message) -> None:
+                body = message.get("body", b"")
                 if message["type"] == "http.response.start":
                     call.code = str(message["status"])
                     extra = [
@@ -127,18 +125,18 @@ class HttpMiddleware:
                     if arriving or self._service.stopping.is_set():
                         extra.append((b"connection", b"close"))
                     message = {**message, "headers": [*message.get("headers", []), *extra]}
-                else:  # in pieces: it returns once the client has taken most of it
-                    body, message = message["body"], {**message, "body": b""}
+                async with self._service.sending(len(body)):
+                    # In pieces: each is sent once the client has taken most of those before.
                     for place in range(0, len(body), PIECE):
                         piece = body[place : place + PIECE]
                         await send({**message, "body": piece, "more_body": True})
-                await send(message)
+                    await send({**message, "body": b""} if body else message)
 
             # With an app in the scope, the router raises HTTPException for an unknown path.
             scope = {**scope, "app": self, "call": call}
             try:
                 self._check(scope, call, headers)
-                async with self._page(call.client) if method == "Docs" else nullcontext():
+                async with self._pages.hold(call.client) if method == "Docs" else nullcontext():
                     await self._app(scope, receive, send_with_headers)
             except Exception as error:
                 if not isinstance(error, EdgeGraspError | HTTPException):
@@ -146,17 +144,9 @@ class HttpMiddleware:
                 if call.code:  # half an answer is sent: the client must see that it is incomplete
                     call.problem, call.code = report(error), ""
                     scope["state"]["abort"]()
-                    await _disconnected(receive)
+                    await _disconnected(receive, call)
                 else:
                     await _error_response(call, scope, error)(scope, receive, send_with_headers)
-
-    @asynccontextmanager
-    async def _page(self, client: str) -> AsyncIterator[None]:
-        """Hold a slot for a page after a short pause, so that many pages do not delay requests."""
-        async with self._page_begins:
-            await asyncio.sleep(PAGE_PAUSE_SECONDS)
-        async with self._pages.hold(client):
-            yield
 
     def _check(self, scope: Scope, call: Call, headers: Headers) -> None:
         """Refuse headers that are too large, a foreign host, a wrong token, a compressed body."""
@@ -230,7 +220,7 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
         Route("/openapi.json", JSONResponse(DOCUMENT), methods=["GET"]),
         Route("/docs", page, methods=["GET"]),
         Route("/", index, methods=["GET"]),
-        *_files(f"{ASSETS}/", Path(fastapi_offline.__file__).with_name("static")),
+        Mount(ASSETS, StaticFiles(packages=[("fastapi_offline", "static")])),
     ]
     if settings.playground:
         found = {name: load_gripper(name) for name in gripper_names()}
@@ -242,20 +232,9 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
                 raise InvalidSettings(f"samples: got {str(folder)!r}, which is not a folder.")
             routes.append(Mount(f"{PLAYGROUND}samples", StaticFiles(directory=folder)))
         routes.append(Route(PLAYGROUND.rstrip("/"), index, methods=["GET"]))
-        routes.append(_file(PLAYGROUND, PLAYGROUND_FILES / "index.html"))
-        routes += _files(PLAYGROUND, PLAYGROUND_FILES)
+        routes.append(Route(PLAYGROUND, FileResponse(PLAYGROUND_FILES / "index.html")))
+        routes.append(Mount(PLAYGROUND, StaticFiles(directory=PLAYGROUND_FILES)))
     return Router(routes, redirect_slashes=False)
-
-
-def _file(path: str, file: Path) -> Route:
-    """A route to a file, read once at the start: reading in threads would delay other requests."""
-    kind, _ = mimetypes.guess_type(file.name)
-    return Route(path, Response(file.read_bytes(), media_type=kind), methods=["GET"])
-
-
-def _files(path: str, folder: Path) -> list[Route]:
-    files = (one for one in folder.rglob("*") if one.is_file())
-    return [_file(f"{path}{one.relative_to(folder).as_posix()}", one) for one in files]
 
 
 @dataclass
@@ -283,26 +262,22 @@ class _Work:
             content_type = headers.get("content-type", "")
             query = scope["query_string"].decode("latin-1")
             job = Job(self.method, "http", cast(bytes, body), 0.0, content_type, query)  # no copy
-            answering = asyncio.create_task(service.answer(call, job))
-            leaving = asyncio.create_task(_disconnected(receive))
+            leaving = asyncio.create_task(_disconnected(receive, call))
             try:
-                await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
-                if not answering.done():
-                    raise Cancelled("The client left.")
-                answer = answering.result()
+                answer = await service.answer(call, job)
             finally:
                 leaving.cancel()
-                answering.cancel()
             response = Response(answer.body, media_type="application/json")
             if answer.error is not None:
                 response = _problem_response(call, answer.error)
-            await service.send(response(scope, receive, send), call.bytes_out)
+            await response(scope, receive, send)
 
 
-async def _disconnected(receive: Receive) -> None:
-    """Wait until the client has disconnected."""
+async def _disconnected(receive: Receive, call: Call) -> None:
+    """Wait until the client has disconnected, then end its request."""
     while (await receive())["type"] != "http.disconnect":
         pass
+    call.refuse(Cancelled("The client left."))
 
 
 def requested_timeout(headers: Headers) -> float:
@@ -342,13 +317,12 @@ def _error_response(call: Call, scope: Scope, error: Exception) -> Response:
 
 
 class HttpProtocol(HttpToolsProtocol):
-    """Closes connections whose headers or readers are too slow; refused clients can read why."""
+    """Closes connections whose headers are too slow; refused clients can read why."""
 
     def __init__(self, settings: Settings, places: Places, **arguments: Any) -> None:
         super().__init__(**arguments)
         self._settings = settings
         self._places = places
-        self._write_timer: asyncio.TimerHandle | None = None
         self._header_timer: asyncio.TimerHandle | None = None
         self._header_bytes = 0
         self._place = Place("", lambda: None)
@@ -410,24 +384,10 @@ class HttpProtocol(HttpToolsProtocol):
         self._places.use(self._place)
         super().on_response_complete()
 
-    def pause_writing(self) -> None:
-        """Close the connection unless the client reads its answer in time."""
-        super().pause_writing()
-        seconds = self._settings.write_seconds
-        seconds += self.transport.get_write_buffer_size() / self._settings.min_bytes_per_second
-        self._write_timer = self.loop.call_later(seconds, self.transport.abort)
-
-    def resume_writing(self) -> None:
-        """Cancel the timer of `pause_writing`."""
-        if self._write_timer is not None:
-            self._write_timer.cancel()
-        super().resume_writing()
-
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop timers and return the place."""
+        """Stop the timer and return the place."""
         if self._header_timer is not None:
             self._header_timer.cancel()
-        self.resume_writing()
         self._places.release(self._place)
         super().connection_lost(exc)
 
@@ -486,11 +446,6 @@ class _LingeringTransport:
     def is_closing(self) -> bool:
         """Whether it is closed or closing."""
         return self.closing or self.transport.is_closing()
-
-    def write(self, data: bytes) -> None:
-        """Send, unless it is closing."""
-        if not self.closing:
-            self.transport.write(data)
 
     def close(self) -> None:
         """Send what is buffered, discard what is received, and close."""

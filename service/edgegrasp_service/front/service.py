@@ -181,12 +181,13 @@ class GraspService:
             value = f"{received} bytes in {seconds:.0f} s"
             raise RequestTimeout("body", value, fix) from None
 
-    async def send(self, sending: Awaitable[None], size: int) -> None:
-        """Send `size` bytes; raises Cancelled if the client does not take them in time."""
+    @asynccontextmanager
+    async def sending(self, size: int) -> AsyncIterator[None]:
+        """Limit the time to send `size` bytes; raises Cancelled if they are not taken in time."""
         seconds = self.settings.write_seconds + size / self.settings.min_bytes_per_second
         try:
             async with asyncio.timeout(seconds):
-                await sending
+                yield
         except TimeoutError:
             raise Cancelled(f"The client did not take {size} bytes.") from None
 
@@ -335,6 +336,7 @@ class Admission:
             raise call.refusal or DeadlineExceeded() from None
         finally:
             self._release(call)
+            call.timeout = None
 
     @property
     def at_work(self) -> int:
