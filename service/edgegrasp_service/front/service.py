@@ -293,12 +293,9 @@ class Admission:
     """
 
     def __init__(self, workers: int, max_waiting: int, max_bytes: int) -> None:
-        self.held_bytes = 0
-        self._workers = workers
-        self._max_calls = workers + max_waiting
-        self._max_bytes = max_bytes
+        self._workers, self._max_calls, self._max_bytes = workers, workers + max_waiting, max_bytes
         self.calls: list[Call] = []  # of the requests in the server, in the order they came
-        self._client_bytes: Counter[str] = Counter()
+        self._bytes_beside = 0  # held, but not by those
         self._freed = asyncio.Event()  # set when a request frees bytes or its place
         self.service_seconds: deque[float] = deque(maxlen=LATEST)  # of workers' latest jobs
 
@@ -335,13 +332,20 @@ class Admission:
                 raise
             raise call.refusal or DeadlineExceeded() from None
         finally:
-            self._release(call)
             call.timeout = None
+            if call in self.calls:  # not refused
+                self.calls.remove(call)
+            self._freed.set()
 
     @property
     def at_work(self) -> int:
         """Number of requests that workers have."""
         return sum(call.at_work for call in self.calls)
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes held, by requests or beside them."""
+        return self._bytes_beside + sum(call.held_bytes for call in self.calls)
 
     def _refuse_latest(self, holder: str) -> bool:
         """Refuse the latest request of a client that is not being worked on; false without one."""
@@ -350,23 +354,21 @@ class Admission:
                 held = sum(one.client == holder for one in self.calls)
                 why = f"this client holds {held} of {self._max_calls} places, and others wait"
                 call.refuse(self._overloaded(why))
-                self._release(call)
+                self.calls.remove(call)
+                self._freed.set()
                 return True
         return False
 
     def resize(self, call: Call, size: int) -> None:
         """Set the number of bytes that a request holds."""
-        if call in self.calls:
-            self.held_bytes += size - call.held_bytes
-            self._client_bytes[call.client] += size - call.held_bytes
-            call.held_bytes = size
-            self._freed.set()
+        call.held_bytes = size
+        self._freed.set()
 
     def hold(self, size: int) -> bool:
         """Reserve bytes outside of requests, or free them (negative); returns whether they fit."""
         if size > 0 and self.held_bytes + size > self._max_bytes:
             return False
-        self.held_bytes += size
+        self._bytes_beside += size
         self._freed.set()
         return True
 
@@ -389,23 +391,20 @@ class Admission:
 
     async def _reserve(self, call: Call, size: int) -> None:
         """Wait until the limits of all clients and of this client leave room for so many bytes."""
-        while (self.held_bytes and self.held_bytes + size > self._max_bytes) or (
-            self._client_bytes[call.client]
-            and self._client_bytes[call.client] + size > self._max_bytes // 2
-        ):
-            holder, most = max(self._client_bytes.items(), key=lambda row: row[1], default=("", 0))
+        while True:
+            held: Counter[str] = Counter()
+            for one in self.calls:
+                held[one.client] += one.held_bytes
+            mine, total = held[call.client], held.total() + self._bytes_beside
+            fits = not total or total + size <= self._max_bytes
+            if fits and (not mine or mine + size <= self._max_bytes // 2):
+                break
+            holder, most = held.most_common(1)[0]
             several = sum(one.client == holder and one.held_bytes > 0 for one in self.calls) > 1
-            greedy = several and most > self._client_bytes[call.client] + size
-            if not (greedy and self._refuse_latest(holder)):
+            if not (several and most > mine + size and self._refuse_latest(holder)):
                 self._freed.clear()
                 await self._freed.wait()
         self.resize(call, size)
-
-    def _release(self, call: Call) -> None:
-        if call in self.calls:
-            self.resize(call, 0)
-            self.calls.remove(call)
-            self._client_bytes += Counter()  # forgets those without any
 
 
 # Places
