@@ -9,7 +9,7 @@ from typing import Any
 
 import grpc
 
-from edgegrasp_service.errors import InvalidSettings, PermissionDenied, Unauthenticated
+from edgegrasp_service.errors import InvalidSettings, Unauthenticated
 from edgegrasp_service.settings import Settings
 
 HEADER = "authorization"
@@ -41,28 +41,19 @@ class Tokens:
         known = _read_tokens("token_file", settings.token_file)
         known += _read_tokens("admin_token_file", settings.admin_token_file)
         # Looked up by digest, so that timing reveals nothing about a token.
-        self._known = {token.digest: token for token in known}
-        self.required = any(not token.is_admin for token in self._known.values())  # by requests
+        self.known = {token.digest: token for token in known}
+        self.required = any(not token.is_admin for token in known)  # by requests
 
-    def check(self, authorization: str | None, admin: bool = False) -> Token:
-        """The valid token of a request that needs one, by its header `authorization`.
-
-        Raises:
-            Unauthenticated: The token is missing or unknown.
-            PermissionDenied: The token does not permit the call, which needs an admin's.
-        """
-        if admin and not any(token.is_admin for token in self._known.values()):
-            raise PermissionDenied(HEADER, "an administrator's call, disabled here", ADMIN_FIX)
+    def check(self, authorization: str | None) -> Token:
+        """The token in the header `authorization`; raises Unauthenticated if it is not known."""
         if authorization is None:
             raise Unauthenticated(HEADER, "nothing", TOKEN_FIX)
         scheme, _, text = authorization.strip().partition(" ")
         if scheme.lower() != "bearer":
             raise Unauthenticated(HEADER, "another scheme than Bearer", TOKEN_FIX)
-        found = self._known.get(_digest(text.strip()))
+        found = self.known.get(_digest(text.strip()))
         if found is None:
             raise Unauthenticated(HEADER, "a token that this server does not know", TOKEN_FIX)
-        if admin and not found.is_admin:
-            raise PermissionDenied(HEADER, "a token that permits detection only", ADMIN_FIX)
         return found
 
 

@@ -104,10 +104,9 @@ class GraspService:
                 loop.call_soon(observer, call)  # once the answer is being sent
 
     def authorize(self, call: Call, authorization: str | None) -> None:
-        """Check the token of a call; raises Unauthenticated or PermissionDenied."""
-        admin = call.method == "ReloadModels"
-        if admin or self.tokens.required:
-            known = self.tokens.check(authorization, admin)
+        """Check the token of a call that needs one; raises Unauthenticated."""
+        if self.tokens.required or (call.method == "ReloadModels" and self.tokens.known):
+            known = self.tokens.check(authorization)
             call.token = call.client = known.name
             call.is_admin = known.is_admin
 
@@ -238,7 +237,7 @@ class GraspService:
                 way.
         """
         if call is not None and not call.is_admin:  # however its path is spelled
-            raise PermissionDenied(HEADER, "a call for administrators", ADMIN_FIX)
+            raise PermissionDenied(HEADER, "no token of an administrator", ADMIN_FIX)
         self.loaded()
         if self._reloading.locked():
             raise ReloadFailed("A reload is under way already. Try again later.")
