@@ -416,7 +416,7 @@ def _parts(body: bytes, boundary: str, most: int) -> Iterator[tuple[str, str | N
 
 
 def _fields_of_message(job: Job) -> dict[str, Any]:
-    """The fields of a request message; edges (M, 2) and hand poses (M, 4, 4) as arrays.
+    """The fields of a request message.
 
     Raises InvalidRequest: It is not such a message, has an invalid pose, more parts than any
     request needs, or an unknown field.
@@ -424,36 +424,60 @@ def _fields_of_message(job: Job) -> dict[str, Any]:
     scores = job.method == "ScoreGrasps"
     kind = grasp_pb2.ScoreGraspsRequest if scores else grasp_pb2.DetectGraspsRequest
     try:
-        message: Any = kind.FromString(job.body)
+        message = kind.FromString(job.body)
     except DecodeError:
         raise no_message(job.body) from None
-    _check(message, "request")
-    fields: dict[str, Any] = {}
-    if message.HasField("points"):
-        fields["points"] = message.points
-    if message.HasField("encoded"):
-        fields["cloud"] = File(message.encoded.format, message.encoded.data)
-    if message.HasField("point_cloud2"):
-        fields["point_cloud2"] = _plain_fields(message.point_cloud2)
-    if message.depth_images:
-        images = enumerate(message.depth_images)
-        fields["depth_images"] = [_depth_image(image, row) for row, image in images]
-    fields |= {name: getattr(message, name) for name in PER_POINT if message.HasField(name)}
-    fields["options"] = plain_options(message.options)
-    if scores and message.edges:
-        pairs = [(edge.approach_index, edge.contact_index) for edge in message.edges]
-        fields["edges"] = np.array(pairs)
-    if scores and message.hand_poses:
-        poses = enumerate(message.hand_poses)
-        fields["hand_poses"] = np.array(
-            [_matrix(pose.T_cloud_hand, f"hand_poses.{row}.T_cloud_hand") for row, pose in poses]
-        )
+    fields: dict[str, Any] = {"options": {}, **_plain(message, "request")}
+    if "encoded" in fields:
+        fields["cloud"] = fields.pop("encoded")
     return fields
 
 
-def plain_options(message: grasp_pb2.DetectOptions) -> dict[str, Any]:
+def _plain(value: Any, name: str) -> Any:
+    """A value as JSON has it, as bytes, or as File; `name` says where it is."""
+    if not isinstance(value, Message):
+        return value
+    if len(unknown := UnknownFieldSet(value)):
+        numbers = sorted({unknown[row].field_number for row in range(len(unknown))})[:5]
+        fix = "Send the fields of edgegrasp.v1 only; is the server older than its client?"
+        raise InvalidRequest(name, f"unknown fields numbered {numbers}", fix)
+    form: Callable[[Any, str], Any] = _FORMS.get(type(value), _all_fields)
+    return form(value, name)
+
+
+def _field(message: Message, field: Any, name: str) -> Any:
+    """A field's value; refuses lists that would take minutes and gigabytes in Python."""
+    value, here = getattr(message, field.name), f"{name}.{field.name}"
+    if not field.is_repeated:
+        return _plain(value, here)
+    is_message = field.message_type is not None
+    most = MAX_GIVEN.get(field.name, MAX_PARTS) if is_message else MAX_ROWS
+    if len(value) > most:
+        here = here.removeprefix("request.")
+        raise InvalidRequest(here, f"{len(value)} of them", f"Send at most {most}.")
+    if field.type == field.TYPE_BOOL:
+        return np.array(value, dtype=bool)  # a mask: millions of values, packed
+    if is_message:
+        return [_plain(part, f"{here}.{row}") for row, part in enumerate(value)]
+    return list(value)
+
+
+def _set_fields(message: Message, name: str) -> dict[str, Any]:
+    return {field.name: _field(message, field, name) for field, _ in message.ListFields()}
+
+
+def _all_fields(message: Message, name: str) -> dict[str, Any]:
+    """The fields of a message that are set, and all lists, even empty ones."""
+    return {
+        field.name: _field(message, field, name)
+        for field in message.DESCRIPTOR.fields
+        if field.is_repeated or not field.has_presence or message.HasField(field.name)
+    }
+
+
+def plain_options(message: grasp_pb2.DetectOptions, name: str = "options") -> dict[str, Any]:
     """The options that are set; raises InvalidRequest if one is set in two fields."""
-    options = _set_fields(message)
+    options = _set_fields(message, name)
     if "object_choice" in options:
         if "objects" in options:
             value = f"{options['objects']!r} beside object_choice"
@@ -462,85 +486,39 @@ def plain_options(message: grasp_pb2.DetectOptions) -> dict[str, Any]:
     return options
 
 
-def _check(message: Message, name: str) -> None:
-    """Refuse unknown fields, and lists that would take minutes and gigabytes in Python."""
-    if len(unknown := UnknownFieldSet(message)):
-        numbers = sorted({unknown[row].field_number for row in range(len(unknown))})[:5]
-        fix = "Send the fields of edgegrasp.v1 only; is the server older than its client?"
-        raise InvalidRequest(name, f"unknown fields numbered {numbers}", fix)
-    for each in message.DESCRIPTOR.fields:
-        here, is_message = f"{name}.{each.name}", each.message_type is not None
-        if each.is_repeated:
-            parts = getattr(message, each.name)
-            most = MAX_GIVEN.get(each.name, MAX_PARTS) if is_message else MAX_ROWS
-            if len(parts) > most:
-                here = here.removeprefix("request.")
-                raise InvalidRequest(here, f"{len(parts)} of them", f"Send at most {most}.")
-            for row, part in enumerate(parts if is_message else ()):
-                _check(part, f"{here}.{row}")
-        elif is_message and message.HasField(each.name):
-            _check(getattr(message, each.name), here)
-
-
-def _depth_image(message: grasp_pb2.DepthImage, row: int) -> dict[str, Any]:
-    fields = _plain_fields(message)
+def _depth_image(message: grasp_pb2.DepthImage, name: str) -> dict[str, Any]:
+    fields = _all_fields(message, name)
     if pose := fields.pop("T_cloud_camera"):
-        fields["T_cloud_camera"] = _matrix(pose, f"depth_images.{row}.T_cloud_camera")
+        fields["T_cloud_camera"] = _matrix(pose, f"{name}.T_cloud_camera")
     return fields
 
 
-def _matrix(numbers: Any, field: str) -> list[list[float]]:
+def _matrix(numbers: Any, name: str) -> list[list[float]]:
     if len(numbers) != 16:
-        raise InvalidRequest(field, f"{len(numbers)} numbers", "Send 16, row-major.")
+        name = name.removeprefix("request.")
+        raise InvalidRequest(name, f"{len(numbers)} numbers", "Send 16, row-major.")
     return [list(numbers[start : start + 4]) for start in range(0, 16, 4)]
 
 
-def _plain_fields(message: Message) -> dict[str, Any]:
-    """The fields of a message that are set, and all lists, even empty ones."""
-    return {
-        field.name: _field(message, field)
-        for field in message.DESCRIPTOR.fields
-        if field.is_repeated or not field.has_presence or message.HasField(field.name)
-    }
+def _in_order(message: Message, name: str) -> list[Any]:
+    return [_plain(getattr(message, each.name), name) for each in message.DESCRIPTOR.fields]
 
 
-def _set_fields(message: Message) -> dict[str, Any]:
-    return {field.name: _field(message, field) for field, _ in message.ListFields()}
-
-
-def _field(message: Message, field: Any) -> Any:
-    value = getattr(message, field.name)
-    if field.type == field.TYPE_BOOL and field.is_repeated:
-        return np.array(value, dtype=bool)  # a mask: millions of values, packed
-    if field.is_repeated:
-        return list(value) if field.message_type is None else [_plain(part) for part in value]
-    return _plain(value)
-
-
-def _plain(value: Any) -> Any:
-    if not isinstance(value, Message):
-        return value
-    form: Callable[[Any], Any] = _FORMS.get(type(value), _plain_fields)
-    return form(value)
-
-
-def _coordinates(message: Message) -> list[float]:
-    return [getattr(message, field.name) for field in message.DESCRIPTOR.fields]
-
-
-def _gripper(message: grasp_pb2.GripperChoice) -> Any:
+def _gripper(message: grasp_pb2.GripperChoice, name: str) -> Any:
     which = message.WhichOneof("choice")
-    return None if which is None else _plain(getattr(message, which))
+    return None if which is None else _plain(getattr(message, which), f"{name}.{which}")
 
 
-def _tagged(message: Message) -> dict[str, Any]:
+def _tagged(message: Message, name: str) -> dict[str, Any]:
     """The field of the oneof `kind` that is set, its name beside its fields."""
     which = message.WhichOneof("kind")
-    return {} if which is None else {"kind": which} | _plain_fields(getattr(message, which))
+    if which is None:
+        return {}
+    return {"kind": which, **_plain(getattr(message, which), f"{name}.{which}")}
 
 
-def _unless_disabled(message: Message) -> dict[str, Any] | None:
-    fields = _plain_fields(message)
+def _unless_disabled(message: Message, name: str) -> dict[str, Any] | None:
+    fields = _all_fields(message, name)
     for kind in ("ransac", "auto"):  # of a support
         if kind in fields:
             fields |= {"kind": kind} | fields.pop(kind)
@@ -548,12 +526,19 @@ def _unless_disabled(message: Message) -> dict[str, Any] | None:
 
 
 # Messages that JSON does not write field by field.
-_FORMS: dict[type[Message], Callable[[Any], Any]] = {
+_FORMS: dict[type[Message], Callable[[Any, str], Any]] = {
+    grasp_pb2.DetectGraspsRequest: _set_fields,
+    grasp_pb2.ScoreGraspsRequest: _set_fields,
+    grasp_pb2.DetectOptions: plain_options,
     grasp_pb2.Place: _set_fields,
-    grasp_pb2.Pixel: _coordinates,
-    grasp_pb2.Vector: _coordinates,
-    grasp_pb2.Quaternion: _coordinates,
-    grasp_pb2.HandBox: lambda box: [_coordinates(box.min), _coordinates(box.max)],
+    grasp_pb2.EncodedCloud: lambda file, _: File(file.format, file.data),
+    grasp_pb2.DepthImage: _depth_image,
+    grasp_pb2.HandPose: lambda hand, name: _matrix(hand.T_cloud_hand, f"{name}.T_cloud_hand"),
+    grasp_pb2.Edge: _in_order,
+    grasp_pb2.Pixel: _in_order,
+    grasp_pb2.Vector: _in_order,
+    grasp_pb2.Quaternion: _in_order,
+    grasp_pb2.HandBox: _in_order,
     grasp_pb2.GripperChoice: _gripper,
     grasp_pb2.Shape: _tagged,
     grasp_pb2.Obstacle: _tagged,
