@@ -42,15 +42,15 @@ def serve(
     if print_config:
         print(loaded.model_dump_json(indent=2))
         return
-    from edgegrasp_service.worker.process import launch
+    from edgegrasp_service.worker.process import Nursery
 
-    nursery, control = launch(loaded)  # it loads while this process imports the rest
+    nursery = Nursery(loaded)  # it loads while this process imports the rest
     try:
         from edgegrasp_service.server import run
 
-        run(loaded, (nursery, control))
+        run(loaded, nursery)
     finally:
-        nursery.kill()
+        nursery.close()
 
 
 def view(

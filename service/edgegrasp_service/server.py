@@ -24,7 +24,7 @@ from edgegrasp_service.observability import LogQueue, Metrics, start_logging, wr
 from edgegrasp_service.recording import check_outcomes
 from edgegrasp_service.security import Tokens
 from edgegrasp_service.settings import UNIX, Settings
-from edgegrasp_service.worker.process import PIECE, Launched, WorkerPool
+from edgegrasp_service.worker.process import PIECE, Nursery, WorkerPool
 
 logger = logging.getLogger(__name__)
 
@@ -46,10 +46,10 @@ class Server:
         InvalidSettings: A certificate, a token or another file of the settings cannot be used.
     """
 
-    def __init__(self, settings: Settings, launched: Launched | None = None) -> None:
+    def __init__(self, settings: Settings, nursery: Nursery | None = None) -> None:
         self._settings = settings
         self.metrics = Metrics(lambda: self.pool.models)
-        self.pool = WorkerPool(settings, self.metrics.workers_replaced.inc, launched)
+        self.pool = WorkerPool(settings, self.metrics.workers_replaced.inc, nursery)
         self.service = GraspService(settings, self.pool, self.metrics)
         if settings.outcomes_file is not None:
             check_outcomes(settings.outcomes_file)
@@ -170,10 +170,10 @@ class _LoopErrors:
             logger.error("%s (%s)", context["message"], error)
 
 
-def run(settings: Settings, launched: Launched | None = None) -> None:
+def run(settings: Settings, nursery: Nursery | None = None) -> None:
     """Serve until SIGTERM or SIGINT; prints one line with both addresses when ready.
 
-    `launched` is a nursery that loads already.
+    `nursery` loads already.
 
     Raises:
         AddressInUse: A port cannot be bound.
@@ -181,14 +181,14 @@ def run(settings: Settings, launched: Launched | None = None) -> None:
     """
     with contextlib.closing(start_logging(settings, sys.stderr)) as log:
         warn(settings)
-        asyncio.run(_serve_until_signalled(settings, log, launched))
+        asyncio.run(_serve_until_signalled(settings, log, nursery))
 
 
 async def _serve_until_signalled(
-    settings: Settings, log: LogQueue, launched: Launched | None
+    settings: Settings, log: LogQueue, nursery: Nursery | None
 ) -> None:
     stop = asyncio.Event()
-    server = Server(settings, launched)
+    server = Server(settings, nursery)
     server.metrics.watch("log_lines_dropped", "log lines not written", lambda: log.dropped)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):

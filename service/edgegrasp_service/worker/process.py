@@ -28,7 +28,7 @@ from collections.abc import Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, TypeAlias
+from typing import Any, BinaryIO, Literal
 
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import (
@@ -146,17 +146,6 @@ def receive(file: BinaryIO) -> Any:
 
 # The pool
 
-Launched: TypeAlias = tuple[subprocess.Popen[bytes], socket.socket]  # and the socket to it
-
-
-def launch(settings: Settings, command: Sequence[str] = ()) -> Launched:
-    """Start the nursery, which loads meanwhile; `command` replaces NURSERY."""
-    control, theirs = socket.socketpair()
-    with theirs:
-        environment = KEPT_MEMORY | os.environ | dict.fromkeys(ONE_THREAD, "1")
-        words = [*(command or NURSERY), settings.model_dump_json()]
-        return subprocess.Popen(words, stdin=theirs.fileno(), env=environment), control
-
 
 class WorkerPool:
     """Runs each job in a worker process of its own."""
@@ -165,16 +154,16 @@ class WorkerPool:
         self,
         settings: Settings,
         replaced: Callable[[], None],  # called for each worker that died
-        launched: Launched | None,
+        nursery: "Nursery | None",  # that loads already
     ) -> None:
         self._settings = settings
         self.command: Sequence[str] = ()  # in place of NURSERY
         self._replaced = replaced
-        self._launched = launched
+        self._launched = nursery
         self.models: list[dict[str, Any]] = []  # facts of loaded weights; empty before `start`
         self.robots: list[dict[str, Any]] = []
         self.size = settings.workers or len(os.sched_getaffinity(0))
-        self._nursery: _Nursery | None = None
+        self._nursery: Nursery | None = None
         self._workers: set[_Worker] = set()
         # Last in, first out: its caches are warm.
         self._idle: asyncio.LifoQueue[_Worker] = asyncio.LifoQueue()
@@ -196,9 +185,8 @@ class WorkerPool:
         Raises:
             EdgeGraspError: Weights cannot be used.
         """
-        launched = self._launched or launch(self._settings, self.command)
+        nursery = self._launched or Nursery(self._settings, self.command)
         self._launched = None
-        nursery = _Nursery(*launched)
         workers = [_Worker(nursery) for _ in range(self.size)]
         try:
             await nursery.loaded()
@@ -283,7 +271,7 @@ class WorkerPool:
             self._replaced()
             await self._until_done(worker.nursery, lambda: self._replace(worker.nursery))
 
-    async def _replace(self, nursery: "_Nursery") -> None:
+    async def _replace(self, nursery: "Nursery") -> None:
         worker = _Worker(nursery)
         try:
             async with asyncio.timeout(START_SECONDS if self._settings.device == "cpu" else None):
@@ -299,7 +287,7 @@ class WorkerPool:
             self._workers.add(worker)
         self.spawn(self._tend(worker))
 
-    async def _until_done(self, nursery: "_Nursery", start: Callable[[], Awaitable[None]]) -> None:
+    async def _until_done(self, nursery: "Nursery", start: Callable[[], Awaitable[None]]) -> None:
         """Retry a start until it succeeds or there is a newer nursery."""
         while nursery is self._nursery:
             try:
@@ -308,22 +296,23 @@ class WorkerPool:
                 logger.error("a dead process cannot be replaced yet: %s", error)
                 await asyncio.sleep(RETRY_SECONDS)
 
-    def _nursery_lost(self, nursery: "_Nursery") -> None:
+    def _nursery_lost(self, nursery: "Nursery") -> None:
         """Load the weights again in a new nursery; the workers continue meanwhile."""
         logger.error("the process that workers fork from died; weights are loaded again")
         self.spawn(self._until_done(nursery, self.start))
 
 
-class _Nursery:
-    """The process that has loaded the weights and forks workers."""
+class Nursery:
+    """The process that loads the weights and then forks workers; `command` replaces NURSERY."""
 
-    def __init__(self, process: subprocess.Popen[bytes], control: socket.socket) -> None:
-        self._process = process
-        self.pid = process.pid
-        self._control = control
+    def __init__(self, settings: Settings, command: Sequence[str] = ()) -> None:
+        self._control, theirs = socket.socketpair()
+        with theirs:
+            environment = KEPT_MEMORY | os.environ | dict.fromkeys(ONE_THREAD, "1")
+            words = [*(command or NURSERY), settings.model_dump_json()]
+            self._process = subprocess.Popen(words, stdin=theirs.fileno(), env=environment)
         # Whether each ended worker, by process id, ended by itself.
-        self._crashed: defaultdict[int, asyncio.Future[bool]]
-        self._crashed = defaultdict(asyncio.get_running_loop().create_future)
+        self._crashed: defaultdict[int, asyncio.Future[bool]] = defaultdict(asyncio.Future)
 
     async def loaded(self) -> None:
         """Wait until it has loaded; raises InvalidSettings on failure."""
@@ -386,7 +375,7 @@ class _Nursery:
 class _Worker:
     """One worker process, at the other end of a socket."""
 
-    def __init__(self, nursery: _Nursery) -> None:
+    def __init__(self, nursery: Nursery) -> None:
         self.nursery = nursery
         self.pid = 0
         self.ready: Any = None  # the message that it sent when it had loaded
