@@ -19,8 +19,14 @@ from datetime import UTC, datetime
 from functools import lru_cache, partial
 from typing import Any, TextIO
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
-from prometheus_client.exposition import choose_encoder
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    ProcessCollector,
+    generate_latest,
+)
 
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import Problem
@@ -250,14 +256,10 @@ class Metrics:
         """Add a gauge whose value is computed when metrics are read."""
         self._gauge(name, meaning).set_function(value)
 
-    def page(self, accept: str) -> tuple[bytes, str]:
-        """All metrics as text, and its content type.
-
-        OpenMetrics if the client asks for it.
-        """
+    def page(self) -> bytes:
+        """All metrics, as text in Prometheus' format."""
         self._model_info.clear()
         for facts in self._models():
             shown = facts | {"default": str(facts.get("default", False)).lower()}
             self._model_info.labels(*(str(shown.get(name, "")) for name in MODEL_LABELS)).set(1.0)
-        encoder, content_type = choose_encoder(accept)
-        return encoder(self.registry), content_type
+        return generate_latest(self.registry)

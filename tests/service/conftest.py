@@ -234,7 +234,7 @@ class Running:
         return reader, writer
 
     def metrics(self) -> str:
-        return self.server.metrics.page("")[0].decode()
+        return self.server.metrics.page().decode()
 
 
 Serve = Callable[..., Awaitable[Running]]

@@ -16,6 +16,7 @@ from typing import Any, cast
 
 from fastapi.encoders import jsonable_encoder
 from fastapi.openapi.docs import get_swagger_ui_html
+from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
@@ -197,8 +198,7 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
         return JSONResponse({"status": status}, status_code=200 if service.ready else 503)
 
     async def read_metrics(request: Request) -> Response:
-        body, content_type = metrics.page(request.headers.get("accept", ""))
-        return Response(body, headers={"content-type": content_type})
+        return Response(metrics.page(), headers={"content-type": CONTENT_TYPE_LATEST})
 
     page = get_swagger_ui_html(
         openapi_url="/openapi.json",
@@ -334,7 +334,7 @@ class HttpProtocol(HttpToolsProtocol):
         self.transport = _LingeringTransport(  # type: ignore[assignment]
             transport, lambda: self._in_headers or self.cycle is None or self.cycle.more_body
         )
-        self._await_headers()
+        self.on_message_begin()  # as far as limits are concerned
         try:
             owner = network_of(self.client[0] if self.client else "")
             self._place = self._places.take(owner, transport.abort)
@@ -355,11 +355,17 @@ class HttpProtocol(HttpToolsProtocol):
             self._refuse(HeadersTooLarge("headers", f"{self._header_bytes} bytes", most))
 
     def on_message_begin(self) -> None:
-        """Prepare for a new request."""
+        """Prepare for a new request, whose headers must come in time."""
         super().on_message_begin()
         self.scope["state"]["abort"] = self.transport.abort
         self._pieces = self._body_bytes = 0
-        self._await_headers()
+        self._in_headers = True
+        if self._header_timer is None:
+            seconds = self._settings.read_seconds
+            late = "headers", f"not whole in {seconds:g} s", "Send them at once."
+            self._header_timer = self.loop.call_later(
+                seconds, lambda: self._refuse(RequestTimeout(*late))
+            )
 
     def on_headers_complete(self) -> None:
         """Mark the connection as busy for requests to /v1/."""
@@ -418,15 +424,6 @@ class HttpProtocol(HttpToolsProtocol):
             self.cycle.message_event.set()
         self.transport.write(head.encode() + body)
         self.transport.close()
-
-    def _await_headers(self) -> None:
-        self._in_headers = True
-        if self._header_timer is None:
-            seconds = self._settings.read_seconds
-            late = "headers", f"not whole in {seconds:g} s", "Send them at once."
-            self._header_timer = self.loop.call_later(
-                seconds, lambda: self._refuse(RequestTimeout(*late))
-            )
 
 
 @dataclass

@@ -15,7 +15,7 @@ from collections import Counter, deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any
 
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import (
@@ -44,8 +44,6 @@ LATEST = 15  # latest service times, whose median is the pace; one slow request 
 MARGIN = 1.5  # the wait is estimated from a median, and half of the requests take longer
 
 MAX_HEADERS = 64  # or entries of gRPC's metadata
-
-T = TypeVar("T")
 
 
 class GraspService:
@@ -153,7 +151,8 @@ class GraspService:
         finally:
             self.admission.service_seconds.append(time.monotonic() - began)
             call.at_work = False
-        await self._note_deaths(job, answer)
+        if answer.facts.deaths or self._deaths:
+            await self._note_deaths(job, answer)
         call.facts, call.problem = answer.facts, answer.error
         call.stages |= answer.facts.seconds
         call.bytes_out = len(answer.body)
@@ -162,7 +161,7 @@ class GraspService:
             self.recorder.record(job, answer)
         return answer
 
-    async def receive(self, part: Awaitable[T], received: int = 0, start: float = 0.0) -> T:
+    async def receive(self, part: Awaitable[Any], received: int = 0, start: float = 0.0) -> Any:
         """The next part of a body; raises RequestTimeout if it arrives too slowly.
 
         Args:
@@ -192,12 +191,13 @@ class GraspService:
 
     async def _note_deaths(self, job: Job, answer: Answer) -> None:
         """Count the workers that a request has killed; forget them once it is answered."""
-        deaths = answer.facts.deaths
-        if deaths or (answer.error is None and self._deaths):
-            digest = await asyncio.to_thread(_digest, job)
-            _, before = self._deaths.pop(digest, (0.0, 0))
-            if deaths:
-                self._deaths[digest] = time.monotonic() + HARMFUL_SECONDS, deaths + before
+        digest = await asyncio.to_thread(_digest, job)
+        if answer.facts.deaths:
+            _, before = self._deaths.get(digest, (0.0, 0))
+            until = time.monotonic() + HARMFUL_SECONDS
+            self._deaths[digest] = until, before + answer.facts.deaths
+        elif answer.error is None:
+            self._deaths.pop(digest, None)
 
     async def drain(self, grace: float) -> None:
         """Refuse new requests and wait for accepted ones; abandon them after `grace` seconds."""

@@ -10,7 +10,7 @@ import io
 import json
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, is_dataclass
 from datetime import UTC, datetime
@@ -301,7 +301,9 @@ def read_request(job: Job) -> dict[str, Any]:
         fields: dict[str, Any] = read_json("body", job.body)
         if not isinstance(fields, dict):
             raise InvalidRequest("body", brief(fields), "Send a JSON object.")
-        _refuse_unknown(fields, known, "field")
+        for name in fields:
+            if name not in known:
+                raise _unknown(name, known, "field")
     else:
         boundary = named.get("boundary", "")
         fields = _fields_of_form(job.body, boundary, (*known, *CAMERA))
@@ -330,14 +332,12 @@ def _flat(value: Any) -> Any:
     return value
 
 
-def _refuse_unknown(fields: Iterable[str], known: tuple[str, ...], kind: str) -> None:
-    for name in fields:
-        if name not in known:
-            *names, last = known
-            fix = f"Send {', '.join(names)} and {last} only."
-            if name in DetectOptions.model_fields:
-                fix = "Send it in `options`."
-            raise InvalidRequest(name, f"an unknown {kind}", fix)
+def _unknown(name: str, known: tuple[str, ...], kind: str) -> InvalidRequest:
+    *names, last = known
+    fix = f"Send {', '.join(names)} and {last} only."
+    if name in DetectOptions.model_fields:
+        fix = "Send it in `options`."
+    return InvalidRequest(name, f"an unknown {kind}", fix)
 
 
 # JSON
@@ -370,7 +370,8 @@ def _fields_of_form(body: bytes, boundary: str, known: tuple[str, ...]) -> dict[
     """Files as File, other parts as their JSON; the parts of one camera as `depth_images`."""
     fields: dict[str, Any] = {}
     for name, file_format, data in _parts(body, boundary, len(known) + 1):
-        _refuse_unknown([name], known, "part")
+        if name not in known:
+            raise _unknown(name, known, "part")
         if name in fields:
             raise InvalidRequest(name, "two parts", "Send one.")
         if name == "cloud" and file_format is None:
