@@ -16,6 +16,7 @@ from typing import Any
 
 import uvicorn
 
+from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import AddressInUse
 from edgegrasp_service.front.grpc import GrpcServer
 from edgegrasp_service.front.http import HttpMiddleware, HttpProtocol, create_router
@@ -92,6 +93,7 @@ class Server:
             trimming = asyncio.create_task(grpc_server.trim(http_connections.taken))
             http_task = asyncio.create_task(http_server.serve(sockets=[http_socket]))
             load_task = asyncio.create_task(self._load(ready))
+            logger.info("opened %s and gRPC %s, loading", self.http_url, self.grpc_address)
             opened()
             stopped = asyncio.create_task(stop.wait())
             try:
@@ -195,22 +197,25 @@ async def _serve_until_signalled(
         loop.add_signal_handler(number, stop.set)
     terminal = _at_a_terminal()
 
+    async def reload() -> None:
+        try:
+            await server.service.reload()
+        except EdgeGraspError as error:
+            logger.warning("SIGHUP: %s", error)
+
     def hang_up() -> None:
         if terminal and not _at_a_terminal():  # stdout was closed
             stop.set()
         else:
-            server.service.reload_soon()
+            server.pool.spawn(reload())
 
     loop.add_signal_handler(signal.SIGHUP, hang_up)
-
-    def opened() -> None:
-        logger.info("opened %s and gRPC %s, loading", server.http_url, server.grpc_address)
 
     def ready() -> None:
         line = f"EdgeGrasp serves HTTP {server.http_url} gRPC {server.grpc_address}"
         write_line(sys.stdout, line)
 
-    await server.serve(stop, opened, ready)
+    await server.serve(stop, ready=ready)
 
 
 def _at_a_terminal() -> bool:

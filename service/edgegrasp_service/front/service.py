@@ -41,6 +41,7 @@ logger = logging.getLogger(__name__)
 
 HARMFUL_SECONDS = 600.0  # seconds for which a request that killed workers is refused
 LATEST = 15  # latest service times, whose median is the pace; one slow request does not change it
+SEND_SECONDS = 1.0  # seconds for the errors of abandoned requests to be sent
 MARGIN = 1.5  # the wait is estimated from a median, and half of the requests take longer
 
 MAX_HEADERS = 64  # or entries of gRPC's metadata
@@ -202,28 +203,15 @@ class GraspService:
     async def drain(self, grace: float) -> None:
         """Refuse new requests and wait for accepted ones; abandon them after `grace` seconds."""
         self.stopping.set()
-        try:
+        with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(grace):
+                return await self.admission.empty()
+        logger.warning("grace is over: requests in flight are abandoned")
+        for call in self.admission.calls:
+            call.refuse(NotReady("The server stopped before there was an answer. Try another one."))
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(SEND_SECONDS):
                 await self.admission.empty()
-        except TimeoutError:
-            logger.warning("grace is over: requests in flight are abandoned")
-            gone = "The server stopped before there was an answer. Try another one."
-            for call in self.admission.calls:
-                call.refuse(NotReady(gone))
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(1.0):  # time for the errors to be sent
-                    await self.admission.empty()
-
-    def reload_soon(self) -> None:
-        """Start a reload in the running event loop; the log has its outcome."""
-
-        async def reload() -> None:
-            try:
-                await self.reload()
-            except EdgeGraspError as error:
-                logger.warning("SIGHUP: %s", error)
-
-        self.pool.spawn(reload())
 
     async def reload(self, call: Call | None = None) -> list[dict[str, Any]]:
         """Reload weights, tokens and certificates; the old ones stay in use meanwhile.
