@@ -18,7 +18,9 @@ from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import AsyncGraspClient
+from edgegrasp_client.over_grpc import fill
 from edgegrasp_service.errors import STATUS, kind_of
+from edgegrasp_service.front.http import METHODS
 from edgegrasp_service.observability import Call
 from edgegrasp_service.server import Server
 from edgegrasp_service.settings import Settings
@@ -49,7 +51,24 @@ def bearer(token: str | None) -> dict[str, str]:
     return {"authorization": f"Bearer {token}"} if token else {}
 
 
-class Grpc:
+class Raw:
+    """A client that shows codes and errors as they are sent."""
+
+    async def detect(
+        self, points: np.ndarray, timeout: float | None = None, **options: Any
+    ) -> Reply:
+        return await self.ask("DetectGrasps", timeout, points=points, options=options)
+
+    async def score(self, points: np.ndarray, timeout: float | None = None) -> Reply:
+        return await self.ask("ScoreGrasps", timeout, points=points, edges=[[0, 1]] * 3)
+
+    async def reload(self, token: str | None = None) -> Reply:
+        return await self.ask("ReloadModels", None, bearer(token))
+
+    ask: Callable[..., Awaitable[Reply]]  # a method, with a timeout, headers and fields
+
+
+class Grpc(Raw):
     name = "grpc"
 
     def __init__(self, server: Server, *options: tuple[str, int]) -> None:
@@ -57,67 +76,41 @@ class Grpc:
         self.channel = aio.insecure_channel(server.grpc_address, options)
         self.stub = grasp_pb2_grpc.GraspServiceStub(self.channel)
 
-    async def detect(
-        self, points: np.ndarray, timeout: float | None = None, **options: Any
+    async def ask(
+        self, method: str, timeout: float | None, headers: Any = (), **fields: Any
     ) -> Reply:
-        message = grasp_pb2.DetectGraspsRequest(
-            points=points.tobytes(), options=grasp_pb2.DetectOptions(**options)
-        )
-        return await self._answer(self.stub.DetectGrasps, message, timeout)
-
-    async def score(self, points: np.ndarray, timeout: float | None = None) -> Reply:
-        edges = [grasp_pb2.Edge(approach_index=0, contact_index=1)] * 3
-        message = grasp_pb2.ScoreGraspsRequest(points=points.tobytes(), edges=edges)
-        return await self._answer(self.stub.ScoreGrasps, message, timeout)
-
-    async def reload(self, token: str | None = None) -> Reply:
-        return await self._answer(
-            self.stub.ReloadModels, grasp_pb2.ReloadModelsRequest(), None, bearer(token)
-        )
-
-    async def _answer(
-        self, method: Any, message: Any, timeout: float | None, headers: Any = ()
-    ) -> Reply:
+        message, metadata = getattr(grasp_pb2, f"{method}Request")(), tuple(dict(headers).items())
+        packed = {"points": fields["points"].tobytes()} if fields else {}
+        fill(message, fields | packed, "request")
         try:
-            body = await method(message, timeout=timeout, metadata=tuple(dict(headers).items()))
+            answer = await getattr(self.stub, method)(message, timeout=timeout, metadata=metadata)
         except aio.AioRpcError as error:
             trailers = dict(error.trailing_metadata() or ())
             detail = grasp_pb2.ErrorDetail.FromString(trailers.get("edgegrasp-error-bin", b""))
             retry_after = detail.retry_after if detail.HasField("retry_after") else None
             told = error.code().name, detail.kind, detail.field, retry_after
             return Reply(*told, error.details() or "")
-        if isinstance(body, grasp_pb2.ReloadModelsResponse):
-            return Reply("OK", digest=body.models[0].digest)
-        return Reply("OK", counts=dict(body.counts))
+        if method == "ReloadModels":
+            return Reply("OK", digest=answer.models[0].digest)
+        return Reply("OK", counts=dict(answer.counts))
 
     async def close(self) -> None:
         await self.channel.close(None)
 
 
-class Rest:
+class Rest(Raw):
     name = "rest"
 
     def __init__(self, server: Server) -> None:
         limits = httpx.Limits(max_connections=None)
         self.http = httpx.AsyncClient(base_url=server.http_url, timeout=PATIENCE, limits=limits)
 
-    async def detect(
-        self, points: np.ndarray, timeout: float | None = None, **options: Any
-    ) -> Reply:
-        body = {"points": points.tolist(), "options": options}
-        return await self._answer("/v1/grasps", body, timeout)
-
-    async def score(self, points: np.ndarray, timeout: float | None = None) -> Reply:
-        body = {"points": points.tolist(), "edges": [[0, 1]] * 3}
-        return await self._answer("/v1/grasps:score", body, timeout)
-
-    async def reload(self, token: str | None = None) -> Reply:
-        return await self._answer("/v1/models:reload", {}, None, bearer(token))
-
-    async def _answer(
-        self, path: str, body: Any, timeout: float | None, headers: Any = ()
+    async def ask(
+        self, method: str, timeout: float | None, headers: Any = (), **fields: Any
     ) -> Reply:
         headers = dict(headers) | ({} if timeout is None else {"X-Request-Timeout": str(timeout)})
+        path = next(path for path, name in METHODS.items() if name == method)
+        body = fields | ({"points": fields["points"].tolist()} if fields else {})
         response = await self.http.post(path, json=body, headers=headers)
         found = response.json()
         if response.is_success:
