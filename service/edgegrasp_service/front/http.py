@@ -16,7 +16,6 @@ from typing import Any, cast
 
 from fastapi.encoders import jsonable_encoder
 from fastapi.openapi.docs import get_swagger_ui_html
-from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
@@ -198,7 +197,7 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
         return JSONResponse({"status": status}, status_code=200 if service.ready else 503)
 
     async def read_metrics(request: Request) -> Response:
-        return Response(metrics.page(), headers={"content-type": CONTENT_TYPE_LATEST})
+        return Response(metrics.page(), media_type="text/plain; version=0.0.4")
 
     page = get_swagger_ui_html(
         openapi_url="/openapi.json",
@@ -226,13 +225,16 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
         found = {name: load_gripper(name) for name in gripper_names()}
         found |= {file.stem: load_gripper(file) for file in settings.grippers}
         grippers = JSONResponse(jsonable_encoder(found))
-        routes.append(Route(f"{PLAYGROUND}grippers.json", grippers, methods=["GET"]))
+        page_file = FileResponse(PLAYGROUND_FILES / "index.html")
+        routes += [
+            Route(PLAYGROUND.rstrip("/"), index, methods=["GET"]),
+            Route(PLAYGROUND, page_file, methods=["GET"]),
+            Route(f"{PLAYGROUND}grippers.json", grippers, methods=["GET"]),
+        ]
         if (folder := settings.samples) is not None:
             if not folder.is_dir():
                 raise InvalidSettings(f"samples: got {str(folder)!r}, which is not a folder.")
             routes.append(Mount(f"{PLAYGROUND}samples", StaticFiles(directory=folder)))
-        routes.append(Route(PLAYGROUND.rstrip("/"), index, methods=["GET"]))
-        routes.append(Route(PLAYGROUND, FileResponse(PLAYGROUND_FILES / "index.html")))
         routes.append(Mount(PLAYGROUND, StaticFiles(directory=PLAYGROUND_FILES)))
     return Router(routes, redirect_slashes=False)
 
