@@ -169,20 +169,16 @@ class Http2:
                 self._socket.settimeout(PATIENCE)
 
     def _take(self, buffer: bytes, left: dict[int, int]) -> bytes:
-        while len(buffer) >= 9:
-            size = int.from_bytes(buffer[:3], "big")
-            if len(buffer) < 9 + size:
-                break
-            kind, flags = buffer[3], buffer[4]
-            stream = int.from_bytes(buffer[5:9], "big")
-            payload, buffer = buffer[9 : 9 + size], buffer[9 + size :]
-            if kind == 8 and (stream in self._windows):
+        """Heed the whole frames in what was received; returns the rest."""
+        while len(buffer) >= 9 and len(buffer) >= (end := 9 + int.from_bytes(buffer[:3], "big")):
+            kind, flags, stream = struct.unpack(">3xBBI", buffer[:9])
+            payload, buffer = buffer[9:end], buffer[end:]
+            if kind == 8 and stream in self._windows:
                 self._windows[stream] += int.from_bytes(payload, "big")
             elif kind == 3:
                 left.pop(stream, None)
             elif kind == 4 and not flags & 1:
-                for start in range(0, size, 6):
-                    name, value = struct.unpack(">HI", payload[start : start + 6])
+                for name, value in struct.iter_unpack(">HI", payload):
                     if name == 4:
                         for each in self._windows:
                             self._windows[each] += (value - self._initial) * (each != 0)

@@ -72,7 +72,6 @@ MAX_CAMERA_TEXT = 1000  # most bytes of a part like 615,615,320,240; a longer on
 MAX_SHORT_LISTS = 20_000  # in JSON; edges take 6 bytes each
 
 MAX_PARTS = 64  # most messages in a repeated field; no option takes more
-MAX_GIVEN = {"edges": MAX_CANDIDATES, "hand_poses": MAX_CANDIDATES}
 
 
 def load_catalogue(settings: Settings) -> "ModelCatalogue":
@@ -255,10 +254,8 @@ def _given(fields: Mapping[str, Any], max_points: int) -> dict[str, Array]:
         raise InvalidRequest("edges", "nothing", "Send edges or hand_poses.")
     if len(names) == 2:
         raise InvalidRequest("hand_poses", "poses beside edges", "Send one of the two.")
-    name, given = names[0], fields[names[0]]
-    if not isinstance(given, np.ndarray):
-        given = decode_array(name, given, max_points)
-    return {name: given}
+    (name,) = names
+    return {name: decode_array(name, fields[name], max_points)}
 
 
 # Bodies
@@ -452,7 +449,7 @@ def _field(message: Message, field: Any, name: str) -> Any:
     if not field.is_repeated:
         return _plain(value, here)
     is_message = field.message_type is not None
-    most = MAX_GIVEN.get(field.name, MAX_PARTS) if is_message else MAX_ROWS
+    most = MAX_CANDIDATES if field.name in GIVEN else MAX_PARTS if is_message else MAX_ROWS
     if len(value) > most:
         here = here.removeprefix("request.")
         raise InvalidRequest(here, f"{len(value)} of them", f"Send at most {most}.")
