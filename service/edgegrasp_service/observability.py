@@ -49,7 +49,6 @@ class Call:
     token: str = ""  # name of the token it came with
     client: str = ""  # whose share of the server it uses: the token's name or the network
     is_admin: bool = False
-    long: bool = False  # a stream, whose duration means nothing
     in_stream: bool = False  # one request of a stream
     start: float = field(default_factory=time.monotonic)  # as the event loop's clock
     deadline: float = float("inf")
@@ -99,6 +98,7 @@ CALL: ContextVar[Call | None] = ContextVar("call", default=None)  # of the runni
 
 MAX_WAITING = 4096  # queued records; further ones are dropped
 STOP_SECONDS = 1.0
+LONG = ("DetectGraspsStream", "HealthWatch", "Reflection")  # their duration means nothing
 PROBES = ("Live", "Ready", "HealthCheck", "Metrics")  # called every few seconds; not logged
 LOGGED = ("request_id", "transport", "method", "code", "peer", "token", "bytes_in", "bytes_out")
 
@@ -244,7 +244,7 @@ class Metrics:
             self._results.labels(call.code).inc()
         else:
             self._requests.labels(call.transport, call.method, call.code).inc()
-            if not call.long:
+            if call.method not in LONG:
                 self._seconds.labels(call.transport, call.method).observe(call.seconds)
         for stage, seconds in call.stages.items():
             self._stages.labels(stage).observe(seconds)

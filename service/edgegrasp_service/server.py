@@ -65,16 +65,11 @@ class Server:
         watch("workers", "worker processes", lambda: len(self.pool.pids))
         self.http_url = self.grpc_address = ""  # once ports are open: http://host:port, host:port
 
-    async def serve(
-        self,
-        stop: asyncio.Event,
-        opened: Callable[[], None] = lambda: None,
-        ready: Callable[[], None] = lambda: None,
-    ) -> None:
+    async def serve(self, stop: asyncio.Event, ready: Callable[[], None]) -> None:
         """Open both ports, load the weights, serve until `stop` is set, then drain.
 
-        `opened` is called when both ports answer, though requests are refused as not ready; `ready`
-        when they are answered.
+        Both ports answer once `http_url` is set, though requests are refused as not ready until
+        `ready` is called.
 
         Raises:
             AddressInUse: A port cannot be bound.
@@ -86,15 +81,13 @@ class Server:
             http_connections = Places(settings.max_connections, spare=HEALTH_PLACES)
             grpc_server = GrpcServer(self.service)
             http_server = self._http_server(http_connections)
-            scheme = "http" if self.service.tls is None else "https"
-            self.http_url = _url(scheme, http_socket)
-            self.grpc_address = grpc_server.address
             await grpc_server.server.start()
             trimming = asyncio.create_task(grpc_server.trim(http_connections.taken))
             http_task = asyncio.create_task(http_server.serve(sockets=[http_socket]))
             load_task = asyncio.create_task(self._load(ready))
+            scheme = "http" if self.service.tls is None else "https"
+            self.http_url, self.grpc_address = _url(scheme, http_socket), grpc_server.address
             logger.info("opened %s and gRPC %s, loading", self.http_url, self.grpc_address)
-            opened()
             stopped = asyncio.create_task(stop.wait())
             try:
                 await asyncio.wait([stopped, load_task], return_when=asyncio.FIRST_COMPLETED)
@@ -215,7 +208,7 @@ async def _serve_until_signalled(
         line = f"EdgeGrasp serves HTTP {server.http_url} gRPC {server.grpc_address}"
         write_line(sys.stdout, line)
 
-    await server.serve(stop, ready=ready)
+    await server.serve(stop, ready)
 
 
 def _at_a_terminal() -> bool:

@@ -284,11 +284,10 @@ async def begin(tmp_path, monkeypatch, nursery) -> AsyncIterator[Serve]:
         server = Server(Settings(**(ours | given)))
         server.pool.command = (*nursery, str(folder))
         server.service.observers.append(note)
-        opened, ready, stop = asyncio.Event(), asyncio.Event(), asyncio.Event()
-        serving = asyncio.create_task(server.serve(stop, opened.set, ready.set))
+        ready, stop = asyncio.Event(), asyncio.Event()
+        serving = asyncio.create_task(server.serve(stop, ready.set))
         running.append(Running(server, stages, calls, stop, serving))
-        first = asyncio.create_task(opened.wait())
-        await asyncio.wait({first, serving}, return_when=asyncio.FIRST_COMPLETED)
+        await running[-1].until(lambda: serving.done() or server.http_url != "")
         return running[-1], ready
 
     yield start

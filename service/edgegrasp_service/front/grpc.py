@@ -48,7 +48,7 @@ from edgegrasp_service.errors import (
     report,
 )
 from edgegrasp_service.front.service import MAX_HEADERS, GraspService, Places
-from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, network_of
+from edgegrasp_service.observability import LONG, REQUEST_ID_HEADER, Call, network_of
 from edgegrasp_service.settings import UNIX, Settings
 from edgegrasp_service.worker.process import Job, Method
 
@@ -168,7 +168,6 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         _, _, peer = urllib.parse.unquote(context.peer()).partition(":")
         address = peer.rpartition(":")[0].strip("[]")
         call = Call("grpc", method, headers.get(REQUEST_ID_HEADER, ""), address)
-        call.long = method in ("DetectGraspsStream", "HealthWatch", "Reflection")
         with self._service.observe(call):
             name = ((REQUEST_ID_HEADER, call.request_id),)
             try:
@@ -178,7 +177,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                     raise HeadersTooLarge("metadata", value, fix)
                 if not path.startswith(f"/{HEALTH}/"):
                     self._service.authorize(call, headers.get("authorization"))
-                if call.long:
+                if method in LONG:
                     await context.send_initial_metadata(name)
                 await behave(call, context)
             except Cancelled:
