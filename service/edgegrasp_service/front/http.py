@@ -7,7 +7,6 @@ import logging
 import math
 import re
 import sys
-from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -121,7 +120,8 @@ class HttpMiddleware:
                         (b"x-content-type-options", b"nosniff"),
                     ]
                     # An answered request whose body is still arriving is not waited for.
-                    arriving = has_body and "read" not in call.stages
+                    if arriving := has_body and "read" not in call.stages:
+                        scope["state"]["linger"]()
                     if arriving or self._service.stopping.is_set():
                         extra.append((b"connection", b"close"))
                     message = {**message, "headers": [*message.get("headers", []), *extra]}
@@ -333,9 +333,6 @@ class HttpProtocol(HttpToolsProtocol):
         """Take a place, and wait for the first headers."""
         super().connection_made(transport)
         transport.max_size = PIECE  # read in one turn of the event loop
-        self.transport = _LingeringTransport(  # type: ignore[assignment]
-            transport, lambda: self._in_headers or self.cycle is None or self.cycle.more_body
-        )
         self.on_message_begin()  # as far as limits are concerned
         try:
             owner = network_of(self.client[0] if self.client else "")
@@ -359,7 +356,7 @@ class HttpProtocol(HttpToolsProtocol):
     def on_message_begin(self) -> None:
         """Prepare for a new request, whose headers must come in time."""
         super().on_message_begin()
-        self.scope["state"]["abort"] = self.transport.abort
+        self.scope["state"] |= {"abort": self.transport.abort, "linger": self._linger}
         self._pieces = self._body_bytes = 0
         self._in_headers = True
         if self._header_timer is None:
@@ -425,7 +422,14 @@ class HttpProtocol(HttpToolsProtocol):
             self.cycle.disconnected = True  # the application can send nothing more
             self.cycle.message_event.set()
         self.transport.write(head.encode() + body)
+        self._linger()
         self.transport.close()
+
+    def _linger(self) -> None:
+        """Leave the client time to read its answer, though more of its request is to come."""
+        self.transport = _LingeringTransport(self.transport)  # type: ignore[assignment]
+        if self.cycle is not None:
+            self.cycle.transport = self.transport
 
 
 @dataclass
@@ -436,7 +440,6 @@ class _LingeringTransport:
     """
 
     transport: asyncio.Transport
-    receiving: Callable[[], bool]  # whether more of a request is to come
     closing: bool = False
 
     def __getattr__(self, name: str) -> Any:
@@ -451,7 +454,7 @@ class _LingeringTransport:
         if self.is_closing():
             return
         self.closing = True
-        if self.receiving() and self.transport.can_write_eof():
+        if self.transport.can_write_eof():
             self.transport.write_eof()
             self.transport.resume_reading()
         else:
