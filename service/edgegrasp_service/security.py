@@ -41,7 +41,7 @@ class Tokens:
         known += _read_tokens("admin_token_file", settings.admin_token_file)
         # Looked up by digest, so that timing reveals nothing about a token.
         self.known = {token.digest: token for token in known}
-        self.required = any(not token.is_admin for token in known)  # by requests
+        self.required = settings.token_file is not None  # by requests
 
     def check(self, authorization: str | None) -> Token:
         """The token in the header `authorization`; raises Unauthenticated if it is not known."""

@@ -23,7 +23,6 @@ from edgegrasp_service.front.http import HttpMiddleware, HttpProtocol, create_ro
 from edgegrasp_service.front.service import GraspService, Places
 from edgegrasp_service.observability import LogQueue, Metrics, start_logging, write_line
 from edgegrasp_service.recording import check_outcomes
-from edgegrasp_service.security import Tokens
 from edgegrasp_service.settings import UNIX, Settings
 from edgegrasp_service.worker.process import PIECE, Nursery, WorkerPool
 
@@ -223,7 +222,7 @@ def warn(settings: Settings) -> None:
         local = settings.host == "localhost" or settings.host.startswith(UNIX)
     if not local and settings.tls_certificate is None:
         logger.warning("%s: others can reach this server, and nothing is encrypted", settings.host)
-    if not local and not (Tokens(settings).required or settings.tls_client_ca):
+    if not local and not (settings.token_file or settings.tls_client_ca):
         logger.warning("%s: others can reach this server without a token", settings.host)
     for folder in settings.weights:
         if folder.is_dir() and not any(folder.glob("*.safetensors")):
