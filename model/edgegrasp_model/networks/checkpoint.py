@@ -53,35 +53,23 @@ def load_checkpoint(
     """Load a checkpoint under its file's name, in evaluation mode; raises InvalidCheckpoint."""
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
-            text = (file.metadata() or {}).get(_METADATA_KEY)
+            values = dict(json.loads((file.metadata() or {})[_METADATA_KEY]))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    except (OSError, SafetensorError) as error:
-        raise InvalidCheckpoint(
-            f"checkpoint: got {path}, which cannot be read as safetensors ({error}). "
-            "Give a complete file written by `edgegrasp train` or `edgegrasp import-checkpoint`."
-        ) from error
-    metadata = replace(_read_metadata(path, text), digest=digest, name=path.stem)
-    for name, tensor in tensors.items():
-        if not tensor.isfinite().all():
-            raise InvalidCheckpoint(
-                f"checkpoint: got {path}, whose {name} holds NaN or infinity. Restore the file "
-                "from a copy, or train again."
-            )
-    if metadata.tensors_digest and _digest(tensors) != metadata.tensors_digest:
-        raise InvalidCheckpoint(
-            f"checkpoint: got {path}, whose weights are not those it was written with. Restore the "
-            "file from a copy."
-        )
-    network = build_network(metadata.network)
-    try:
+        if (written := values.pop("format")) != _FORMAT:
+            raise ValueError(f"format: got {written!r}. This version reads {_FORMAT}.")
+        metadata = CheckpointMetadata(**values)
+        if metadata.tensors_digest not in ("", _digest(tensors)):
+            raise ValueError("the weights are not those it was written with")
+        network = build_network(metadata.network)
         network.load_state_dict(tensors)
-    except RuntimeError as error:
+    except (OSError, SafetensorError, LookupError, TypeError, ValueError, RuntimeError) as error:
         raise InvalidCheckpoint(
-            f"checkpoint: got {path}, whose weights do not fit its own metadata ({error}). "
-            "Write it again with `edgegrasp train` or `edgegrasp import-checkpoint`."
+            f"checkpoint: got {path}, of which weights or edgegrasp metadata are unusable "
+            f"({error!r}). Restore the file from a copy, or write it again with `edgegrasp train` "
+            "or `edgegrasp import-checkpoint`."
         ) from error
-    return network.to(device).eval(), metadata
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return network.to(device).eval(), replace(metadata, digest=digest, name=path.stem)
 
 
 def check_reference_logits(network: nn.Module, metadata: CheckpointMetadata) -> None:
@@ -115,25 +103,6 @@ def _digest(tensors: Mapping[str, Tensor]) -> str:
         digest.update(name.encode())
         digest.update(tensors[name].numpy().tobytes())
     return digest.hexdigest()
-
-
-def _read_metadata(path: Path, text: str | None) -> CheckpointMetadata:
-    if text is None:
-        raise InvalidCheckpoint(
-            f"checkpoint: got {path}, a safetensors file without edgegrasp metadata. "
-            "Convert foreign weights with `edgegrasp import-checkpoint`."
-        )
-    try:
-        values = json.loads(text)
-        written = values.pop("format")
-        if written != _FORMAT:
-            raise ValueError(f"format: got {written!r}. This version reads {_FORMAT}.")
-        return CheckpointMetadata(**values)
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InvalidCheckpoint(
-            f"checkpoint: got {path}, whose edgegrasp metadata is unusable ({error!r}). "
-            "Write it again with `edgegrasp train` or `edgegrasp import-checkpoint`."
-        ) from error
 
 
 def build_network(config: NetworkConfig, generator: torch.Generator | None = None) -> nn.Module:

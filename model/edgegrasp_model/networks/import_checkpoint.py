@@ -69,17 +69,13 @@ def import_checkpoint(directory: Path) -> tuple[nn.Module, CheckpointMetadata]:
 
     Returns what `save_checkpoint` takes; InvalidCheckpoint: a file is missing, or does not fit.
     """
-    numbers = [
-        int(match[1])
-        for path in directory.glob("local_emd_model-ckpt-*.pt")
-        if (match := re.fullmatch(r"local_emd_model-ckpt-(\d+)\.pt", path.name))
-    ]
-    if len(numbers) != 1:
+    found = sorted(directory.glob("local_emd_model-ckpt-*.pt"))
+    if len(found) != 1:
         raise InvalidCheckpoint(
-            f"directory: got {directory} with {len(numbers)} files local_emd_model-ckpt-N.pt. "
+            f"directory: got {directory} with {len(found)} files local_emd_model-ckpt-N.pt. "
             "Give a directory with the files of exactly one checkpoint."
         )
-    number = numbers[0]
+    number = found[0].stem.rpartition("-")[2]
     is_vn = (directory / f"std-ckpt-{number}.pt").exists()
     config = replace(VN_EDGEGRASP if is_vn else EDGEGRASP, crop_radius=CROP_RADIUS)
     theirs = {
