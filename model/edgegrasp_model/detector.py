@@ -1,6 +1,5 @@
 """The pipeline: a point cloud in, ranked grasps out; and the catalogue of detectors by name."""
 
-import re
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -68,7 +67,6 @@ BALLS_AT_A_TIME = 64
 MANY_HANDS = 20  # grippers in the last training run from which weights suit any gripper
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 PREFERRED = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
-DEVICE_NAMES = re.compile(r"auto|cpu|cuda(:\d+)?")
 
 
 @dataclass(frozen=True)
@@ -480,16 +478,10 @@ def choose_device(name: str) -> torch.device:
         InvalidDevice: It is no device's name, or there is no such device here.
     """
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if not DEVICE_NAMES.fullmatch(name):
-        fix = "Use auto, cpu, cuda, or cuda:N for one GPU of several."
-    elif name == "cpu" or (name == "auto" and not gpus):
-        return torch.device("cpu")
-    elif (number := int(name.partition(":")[2] or 0)) < gpus:
-        return torch.device("cuda", number)
-    elif gpus:
-        here = "cuda:0" if gpus == 1 else f"cuda:0 to cuda:{gpus - 1}"
-        fix = f"PyTorch sees {here} here: use one of them, auto or cpu."
-    else:
-        built = "sees no GPU" if torch.version.cuda else "is built without CUDA"
-        fix = f"PyTorch {torch.__version__} {built} here: use cpu or auto."
-    raise InvalidDevice("device", repr(name), fix)
+    first = {"auto": "cuda:0", "cuda": "cuda:0"} if gpus else {"auto": "cpu"}
+    known = {"cpu": "cpu", **first} | {here: here for here in map("cuda:{}".format, range(gpus))}
+    if name not in known:
+        sees = f"PyTorch {torch.__version__} sees {gpus} GPUs here"
+        fix = f"Use auto, cpu, cuda, or cuda:N for one GPU of several; {sees}."
+        raise InvalidDevice("device", repr(name), fix)
+    return torch.device(known[name])
