@@ -1,8 +1,8 @@
 """A parallel-jaw gripper: a small data file, or the same fields in a request."""
 
+import dataclasses
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,25 +13,36 @@ from pydantic import ValidationError
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
 from edgegrasp_model.errors import InvalidGripper, InvalidRequest
-from edgegrasp_model.options import Boxes, DetectOptions, GripperGeometry, Linkage
+from edgegrasp_model.options import DetectOptions, GripperGeometry, HandPart, Linkage
 
 GRIPPER_FOLDER = Path(__file__).parent / "grippers"
+SEEN_LENGTH = 0.0465  # metres of finger length from the tips: as long as the Panda's
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Gripper:
-    """Geometry of a gripper in its hand frame: z toward the object, y the closing direction."""
+    """Geometry of a gripper in its hand frame, as in GripperGeometry, and what follows from it."""
 
     name: str
-    max_opening: float  # metres between the open fingers' inner faces
-    tip_z: float  # fingertips of the open gripper, metres along z
-    contact_z: float  # where an edge grasp puts its contact point, metres along z
-    tcp_z: float  # origin of the TCP frame, metres along z
-    palm_z: float  # palm surface between the fingers, metres along z
-    pad_half_width: float  # half width along x of the finger's contact pad, metres
-    hand_boxes: Boxes
-    finger_boxes: Boxes  # one finger of the open gripper, its inner face at y = 0
-    linkage: Linkage | None = None
+    max_opening: float  # metres, like all lengths
+    tip_z: float
+    contact_z: float
+    tcp_z: float
+    palm_z: float
+    pad_half_width: float
+    hand: HandPart
+    finger: HandPart
+    swing: Linkage | None
+
+    @cached_property
+    def seen_palm_z(self) -> float:
+        """The palm's z, but at most SEEN_LENGTH behind the tips, as if the fingers were short."""
+        return max(self.palm_z, self.tip_z - SEEN_LENGTH)
+
+    @cached_property
+    def finger_thickness(self) -> float:
+        """Metres along y from a finger's inner face to its outer one."""
+        return max(high[1] for _, high in self.finger.boxes)
 
     @cached_property
     def T_hand_tcp(self) -> Float32:  # noqa: N802
@@ -62,16 +73,16 @@ class Gripper:
     def tip_advance(self, opening: ArrayLike) -> Floats:
         """Metres along z that the fingertips have moved since it was open, by opening (...)."""
         opening = np.asarray(opening)
-        if self.linkage is None:
+        if self.swing is None:
             return np.zeros_like(opening, dtype=np.float64)
-        radius, reach = self.linkage.radius, self.linkage.reach
+        radius, reach = self.swing.radius, self.swing.reach
         outward = reach - (self.max_opening - np.clip(opening, 0.0, self.max_opening)) / 2
         advance: Floats = np.sqrt(radius**2 - outward**2) - np.sqrt(radius**2 - reach**2)
         return advance
 
     def furthest_advance(self, opening: ArrayLike) -> Floats:
         """The greatest `tip_advance` until it has closed to an opening (...)."""
-        reach = 0.0 if self.linkage is None else self.linkage.reach
+        reach = 0.0 if self.swing is None else self.swing.reach
         upright = self.max_opening - 2 * reach  # the links point straight ahead there
         return self.tip_advance(np.maximum(opening, upright))
 
@@ -86,10 +97,10 @@ class Gripper:
         have moved forward; None: as the opening implies.
         """
         ahead = float(self.tip_advance(opening)) if advance is None else advance
-        right = np.add(self.finger_boxes, (0.0, opening / 2, ahead))  # (F, 2, 3)
+        right = np.add(self.finger.boxes, (0.0, opening / 2, ahead))  # (F, 2, 3)
         left = right.copy()
         left[:, 0, 1], left[:, 1, 1] = -right[:, 1, 1], -right[:, 0, 1]
-        return np.concatenate([np.asarray(self.hand_boxes), right, left])
+        return np.concatenate([np.asarray(self.hand.boxes), right, left])
 
     @cached_property
     def open_boxes(self) -> Float64:
@@ -101,19 +112,19 @@ class Gripper:
         ahead = float(self.tip_advance(opening))
         forward = tuple(
             ((low[0], low[1], low[2] + ahead), (high[0], high[1], high[2] + ahead))
-            for low, high in self.finger_boxes
+            for low, high in self.finger.boxes
         )
-        linkage = self.linkage
-        if linkage is not None:
-            reach = linkage.reach - (self.max_opening - opening) / 2
-            linkage = Linkage(radius=linkage.radius, reach=reach)
-        return replace(
+        swing = self.swing
+        if swing is not None:
+            reach = swing.reach - (self.max_opening - opening) / 2
+            swing = Linkage(radius=swing.radius, reach=reach)
+        return dataclasses.replace(
             self,
             max_opening=opening,
             tip_z=self.tip_z + ahead,
             contact_z=self.contact_z + ahead,
-            finger_boxes=forward,
-            linkage=linkage,
+            finger=HandPart.model_construct(boxes=forward),
+            swing=swing,
         )
 
 
@@ -128,21 +139,7 @@ def gripper_from_fields(fields: Mapping[str, Any] | GripperGeometry) -> Gripper:
             fault = f"got {repr(first['input'])[:80]}. {fault}"
         field = ".".join(map(str, ("gripper", *path)))
         raise InvalidGripper(f"{field}: {fault}; see grippers/panda.toml.") from None
-    palm_z, pad = geometry.palm_z, geometry.pad
-    assert palm_z is not None
-    assert pad is not None
-    return Gripper(
-        name=geometry.name,
-        max_opening=geometry.max_opening,
-        tip_z=geometry.tip_z,
-        contact_z=geometry.contact_z,
-        tcp_z=geometry.tcp_z,
-        palm_z=palm_z,
-        pad_half_width=max(-pad[0][0], pad[1][0]),
-        hand_boxes=geometry.hand.boxes,
-        finger_boxes=geometry.finger.boxes,
-        linkage=geometry.swing,
-    )
+    return Gripper(*(getattr(geometry, one.name) for one in dataclasses.fields(Gripper)))
 
 
 def load_gripper(name_or_path: str | Path = "panda") -> Gripper:

@@ -352,43 +352,44 @@ class GripperGeometry(Strict):
             raise ValueError("finger.boxes must lie outside the inner face: no y below 0")
         if abs(max(high[2] for _, high in self.finger.boxes) - self.tip_z) > SAME:
             raise ValueError("tip_z must be the highest z of finger.boxes")
-        if self.pad is None:
-            raise ValueError(
-                "one of finger.boxes must contain the contact: y from 0, x on both sides of 0, "
-                "contact_z within its z"
-            )
         if self.swing is not None:
             reach, radius = self.swing.reach, self.swing.radius
             if max(abs(reach), abs(reach - self.max_opening / 2)) >= radius:
                 raise ValueError("swing.radius must exceed the reach, open and closed")
-        palm = self.palm_z
-        if palm is None:
-            raise ValueError("one of hand.boxes must lie behind the space between the fingers")
-        if not palm < self.contact_z < self.tip_z:
-            raise ValueError(f"contact_z must lie between the palm's z, {palm:g}, and tip_z")
+        if not self.palm_z < self.contact_z < self.tip_z:
+            raise ValueError(f"contact_z must lie between the palm's z, {self.palm_z:g}, and tip_z")
         return self
 
     @property
-    def pad(self) -> tuple[Corner, Corner] | None:
+    def pad(self) -> tuple[Corner, Corner]:
         """The box of a finger that touches the object."""
         for low, high in self.finger.boxes:
             if low[1] == 0.0 and low[0] < 0.0 < high[0] and low[2] < self.contact_z < high[2]:
                 return low, high
-        return None
+        raise ValueError(
+            "one of finger.boxes must contain the contact: y from 0, x on both sides of 0, "
+            "contact_z within its z"
+        )
 
     @property
-    def palm_z(self) -> float | None:
-        """Highest z of the hand right behind the space between the fingers."""
-        pad, half = self.pad, self.max_opening / 2
-        return max(
-            (
-                high[2]
-                for low, high in self.hand.boxes
-                if pad is not None and low[0] < pad[1][0] and high[0] > pad[0][0]
-                if low[1] < half and high[1] > -half
-            ),
-            default=None,
-        )
+    def pad_half_width(self) -> float:
+        """Half width along x of that box, metres."""
+        low, high = self.pad
+        return max(-low[0], high[0])
+
+    @property
+    def palm_z(self) -> float:
+        """Highest z of the hand right behind the space between the fingers, metres."""
+        (low_x, _, _), (high_x, _, _) = self.pad
+        half = self.max_opening / 2
+        behind = [
+            high[2]
+            for low, high in self.hand.boxes
+            if low[0] < high_x and high[0] > low_x and low[1] < half and high[1] > -half
+        ]
+        if not behind:
+            raise ValueError("one of hand.boxes must lie behind the space between the fingers")
+        return max(behind)
 
 
 class Suppression(Strict):

@@ -19,7 +19,7 @@ from edgegrasp_model.kernels import mean_of_alike, non_max_suppression
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Outcome, Ungraspable
 from edgegrasp_model.scene.scene import Scene
-from edgegrasp_model.unseen import leaves_image, seen_part, unseen_space
+from edgegrasp_model.unseen import leaves_image, unseen_space
 from edgegrasp_results import DebugInfo, DetectedObject, Grasp
 
 COLLIDING = 0.5  # factor on the score of a colliding grasp in the ranking
@@ -206,7 +206,7 @@ def grasps_in_cloud(
 
 def _far_side_hidden(scene: Scene, T_cloud_hand: Float32, met: Float32, gripper: Gripper) -> Bools:
     """Hands (E,) beyond whose fingers the object may go on unseen; `met`: what they touch first."""
-    beyond = unseen_space(scene.depths, T_cloud_hand, met, seen_part(gripper)).beyond
+    beyond = unseen_space(scene.depths, T_cloud_hand, met, gripper).beyond
     return np.asarray(np.maximum(*beyond) > HIDDEN)
 
 

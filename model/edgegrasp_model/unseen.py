@@ -1,7 +1,6 @@
 """Space around a hand that no camera saw, and the visible extent of objects."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple, Self
 
@@ -28,7 +27,6 @@ HALF = 256  # most cells from the middle of the map to its edge: some 0.5 m
 FARTHEST = 10 * HALF  # stands for everything beyond
 NUM_EXTENTS = 11
 EXTENT_POINTS = 256  # most points of an object that its extents are measured with
-SEEN_LENGTH = 0.0465  # metres of finger length from the tips: as long as the Panda's
 FARTHEST_EXTENT = 0.25  # metres; extents are clipped here
 
 
@@ -104,11 +102,6 @@ def leaves_image(
     return leaves
 
 
-def seen_part(gripper: Gripper) -> Gripper:
-    """The hand with a palm at most SEEN_LENGTH behind its tips, as if its fingers were short."""
-    return replace(gripper, palm_z=max(gripper.palm_z, gripper.tip_z - SEEN_LENGTH))
-
-
 def unseen(behind: Float32) -> Float32:
     """How unknown space is, by its distance (...) behind the first surface: 0 seen, 1 unknown."""
     share: Float32 = np.clip((behind - np.float32(BEHIND)) / np.float32(DEEP), 0.0, 1.0)
@@ -123,8 +116,8 @@ def probes(gripper: Gripper) -> list[Float32]:
     three layers, and the hand itself: each (S, 3).
     """
     half, inner = gripper.pad_half_width, gripper.max_opening / 2
-    tip, palm = gripper.tip_z, gripper.palm_z
-    thick = max(high[1] for _, high in gripper.finger_boxes) / 2
+    tip, palm = gripper.tip_z, gripper.seen_palm_z
+    thick = gripper.finger_thickness / 2
     middle, x = (tip + palm) / 2, [-0.7 * half, 0.7 * half]
     fingers = [
         _grid(x, side * (inner + np.array([0.3, 1.4]) * thick), np.linspace(low, high, 4)[1:])
@@ -140,7 +133,7 @@ def probes(gripper: Gripper) -> list[Float32]:
     ]
     inside = [
         _grid(*(np.linspace(*ends)[1:-1] for ends in zip(*box, (4, 7, 4), strict=True)))
-        for box in gripper.hand_boxes
+        for box in gripper.hand.boxes
     ]
     return [*fingers, *beyond, *between, np.concatenate(inside)]
 
@@ -149,8 +142,8 @@ def probes(gripper: Gripper) -> list[Float32]:
 def _ways(gripper: Gripper) -> list[Float32]:
     """Points of the space that each finger sweeps behind its final place: each (S, 3)."""
     half, inner = gripper.pad_half_width, gripper.max_opening / 2
-    root = min(low[2] for low, _ in gripper.finger_boxes)
-    thick = max(high[1] for _, high in gripper.finger_boxes)
+    root = min(low[2] for low, _ in gripper.finger.boxes)
+    thick = gripper.finger_thickness
     x, z = [-0.7 * half, 0.7 * half], root - np.linspace(0.0, WAY, 5)[1:]
     return [_grid(x, side * (inner + np.array([0.15, 0.7]) * thick), z) for side in (1.0, -1.0)]
 
@@ -159,7 +152,7 @@ def _ways(gripper: Gripper) -> list[Float32]:
 def _palm_ways(gripper: Gripper) -> list[Float32]:
     """Points of the space that slices of the hand sweep, from end to end: each (S, 3)."""
     slices = []
-    for low, high in gripper.hand_boxes:
+    for low, high in gripper.hand.boxes:
         x, z = 0.6 * np.array([low[0], high[0]]), np.linspace(low[2] - WAY, high[2], 7)[:-1]
         slices += [_grid(x, [y], z) for y in np.linspace(low[1], high[1], SLICES)]
     return slices
@@ -168,8 +161,8 @@ def _palm_ways(gripper: Gripper) -> list[Float32]:
 @lru_cache(maxsize=16)
 def _closing_line(gripper: Gripper) -> tuple[Float32, Float32]:
     """The y (LINE,) of places from beyond one finger to beyond the other, and points at each."""
-    half, length = gripper.pad_half_width, gripper.tip_z - gripper.palm_z
-    thick = max(high[1] for _, high in gripper.finger_boxes)
+    half, length = gripper.pad_half_width, gripper.tip_z - gripper.seen_palm_z
+    thick = gripper.finger_thickness
     end = gripper.max_opening / 2 + thick
     y = np.linspace(-end, end, LINE, dtype=np.float32)
     across = _grid([-0.5 * half, 0.5 * half], [0.0], gripper.tip_z - np.array([0.1, 0.3]) * length)
@@ -217,7 +210,7 @@ def visible_extents(
         return extents
     bounds = np.cumsum([0, *map(len, parts)])
     inner, half = gripper.max_opening / 2, 3 * gripper.pad_half_width
-    limits = np.array([inner, half, gripper.palm_z, gripper.tip_z], dtype=np.float32)
+    limits = np.array([inner, half, gripper.seen_palm_z, gripper.tip_z], dtype=np.float32)
     group = groups.reshape(-1).astype(np.int64)
     _extents(np.concatenate(parts), bounds, group, T_cloud_hand, side, limits, extents)
     extents[:, -3:] = sizes[group]

@@ -213,7 +213,7 @@ def support_clearance(
     normal_in_hand, origin_height = along[:, :3], along[:, 3] - support.offset
     corners = normal_in_hand @ middle.T - np.abs(normal_in_hand) @ half.T  # (E, B)
     ahead = gripper.furthest_advance(opening - CLOSED_FURTHER)
-    corners[:, len(gripper.hand_boxes) :] += (normal_in_hand[:, 2] * ahead)[:, None]
+    corners[:, len(gripper.hand.boxes) :] += (normal_in_hand[:, 2] * ahead)[:, None]
     clearance: Float32 = origin_height + np.min(list(corners.T), axis=0)
     return clearance.astype(np.float32)
 

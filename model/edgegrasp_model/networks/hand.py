@@ -35,7 +35,7 @@ from edgegrasp_model.networks.layers import (
 )
 from edgegrasp_model.scene.cloud import UP, unit
 from edgegrasp_model.scene.scene import Surroundings
-from edgegrasp_model.unseen import seen_part, unseen_space, visible_extents
+from edgegrasp_model.unseen import unseen_space, visible_extents
 
 # The network
 POINT_UNIT = 0.05  # metres; scale of the positions around the fingers
@@ -74,7 +74,7 @@ class HandBatch:
         description_size: int = HAND_DESCRIPTION_SIZE,
     ) -> Self:
         """The view of each candidate's hand, with at most `num_points` points."""
-        hands, ends = candidates.T_cloud_hand, seen_part(gripper)
+        hands = candidates.T_cloud_hand
         view = hand_views(around.cloud, hands, gripper)
         eye, side = None, np.ones(len(hands), dtype=np.float32)
         if around.viewpoints is not None and len(around.viewpoints) == 1:
@@ -85,7 +85,7 @@ class HandBatch:
             side = np.where(along_x < 0.0, -1.0, 1.0).astype(np.float32)
         description = describe_hands(around, candidates, gripper, view, eye, side, description_size)
         x, y = gripper.pad_half_width + BESIDE, gripper.max_opening / 2 + OUTSIDE
-        low, high = (-x, -y, ends.palm_z - BEHIND), (x, y, gripper.tip_z + BEYOND_TIPS)
+        low, high = (-x, -y, gripper.seen_palm_z - BEHIND), (x, y, gripper.tip_z + BEYOND_TIPS)
         box = np.array([low, high, (0.0, 0.0, gripper.tip_z)], dtype=np.float32)
         points = _around_fingers(view, around.cloud.normals, hands, side, box, num_points)
         return cls(*map(torch.from_numpy, (description, *points)))
@@ -192,24 +192,24 @@ def describe_hands(
     size: int,  # numbers that the network reads; the extents, which come last, may be skipped
 ) -> Float32:
     """The description (E, F) of candidates: log(1 + counts), metres and cosines."""
-    cloud, up, hands, ends = around.cloud, around.up, candidates.T_cloud_hand, seen_part(gripper)
+    cloud, up, hands = around.cloud, around.up, candidates.T_cloud_hand
     mirrored = hands[:, :3, :3].copy()
     mirrored[:, :, 0] *= side[:, None]
     seen, first_met, runs = (np.zeros((len(side), count), np.float32) for count in (37, 2, 3))
     boxes = gripper.open_boxes.astype(np.float32)
-    first, last = len(gripper.hand_boxes), len(gripper.hand_boxes) + len(gripper.finger_boxes)
+    first, last = len(gripper.hand.boxes), len(gripper.hand.boxes) + len(gripper.finger.boxes)
     across = gripper.pad_half_width, gripper.max_opening / 2
-    lengths = map(np.float32, (*across, ends.palm_z, gripper.tip_z, gripper.max_tip_z))
+    lengths = map(np.float32, (*across, gripper.seen_palm_z, gripper.tip_z, gripper.max_tip_z))
     hand = _Hand(boxes[:first], boxes[first:last], *lengths)
     looked = view, cloud.normals, mirrored, side, around.at_side, hand
     _look_from_each(*looked, seen, first_met, runs)
-    unseen = unseen_space(around.depths, hands, first_met, ends)
+    unseen = unseen_space(around.depths, hands, first_met, gripper)
     toward = np.zeros((len(mirrored), 3), dtype=np.float32)
     if eye is not None:
         toward = unit(eye - hands[:, :3, 3])
     ups = np.broadcast_to(up / np.linalg.norm(up), toward.shape)
     length, swing = gripper.tip_z - gripper.palm_z, gripper.max_tip_z - gripper.tip_z
-    thick = max(high[1] for _, high in gripper.finger_boxes)
+    thick = gripper.finger_thickness
     measures = gripper.max_opening, length, gripper.pad_half_width, thick, swing  # of a finger
     columns = [
         *seen.T,
@@ -227,7 +227,7 @@ def describe_hands(
     ]
     if size > len(columns):
         of_object = cloud.points, around.object_of_point, candidates.contact_index
-        columns += [*visible_extents(*of_object, hands, side, ends, up).T]
+        columns += [*visible_extents(*of_object, hands, side, gripper, up).T]
     return np.stack(columns, axis=1).astype(np.float32)
 
 
