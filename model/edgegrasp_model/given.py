@@ -10,7 +10,6 @@ from edgegrasp_model.candidates.edge_grasps import (
     MIN_EDGE,
     Candidates,
     edge_grasps,
-    faults_of,
     measure_edges,
     retract,
 )
@@ -78,11 +77,10 @@ def from_edges(
     point = scene.point_of_row[edges]
     reason: list[NoGrasp | None] = [NoGrasp.NO_POINT] * len(edges)
     there = np.flatnonzero((point >= 0).all(axis=1))
-    measures = measure_edges(scene.cloud, point[there, 0], point[there, 1])
-    faults = faults_of(measures, gripper)
-    faults[NoGrasp.TOO_LONG] |= measures.length >= crop_radius
+    pairs = point[there, 0], point[there, 1]
+    edge = measure_edges(scene.cloud, *pairs, gripper, crop_radius)
     for place, row in enumerate(there.tolist()):
-        reason[row] = next((fault for fault, found in faults.items() if found[place]), None)
+        reason[row] = next((fault for fault, found in edge.faults.items() if found[place]), None)
     fit = there[[reason[row] is None for row in there]]
     candidates = edge_grasps(scene.cloud, point[fit, 0], point[fit, 1], gripper)
     if scene.support is not None:

@@ -129,8 +129,8 @@ def edge_grasps(
     section III-A): z = r_perp / d, y = n_c, x = y x z. The contact lies at the gripper's contact_z
     and the approach point on the hand's axis. The pairs are rows (M,) of the cloud.
     """
-    edge = measure_edges(cloud, approach_index, contact_index)
-    pair = np.flatnonzero(~np.any(list(faults_of(edge, gripper).values()), axis=0))
+    edge = measure_edges(cloud, approach_index, contact_index, gripper)
+    pair = np.flatnonzero(~np.any(list(edge.faults.values()), axis=0))
     approach_index, contact_index = approach_index[pair], contact_index[pair]
     normal, depth = edge.normal[pair], edge.depth[pair]
     opening = 2 * np.abs(edge.along[pair])
@@ -151,28 +151,30 @@ class EdgeMeasures(NamedTuple):
     normal: Float32  # (M, 3) unit n_c
     along: Float32  # (M,) r . n_c, metres
     ahead: Float32  # (M, 3) r_perp, the part of r orthogonal to n_c
-    length: Float32  # (M,) |r|, metres
     depth: Float32  # (M,) |r_perp|, metres
+    faults: dict[NoGrasp, Bools]  # (M,) which define no edge grasp that fits the gripper
 
 
-def measure_edges(cloud: Cloud, approach_index: Int64, contact_index: Int64) -> EdgeMeasures:
+def measure_edges(
+    cloud: Cloud,
+    approach_index: Int64,
+    contact_index: Int64,
+    gripper: Gripper,
+    reach: float = np.inf,  # metres from the approach point to the contact, at most
+) -> EdgeMeasures:
     """Measure the edges of pairs (M,), (M,) of points, rows of the cloud."""
     normal = unit(cloud.normals[contact_index])
     edge = cloud.points[contact_index] - cloud.points[approach_index]  # (M, 3) r
     along = np.einsum("md,md->m", edge, normal)
     ahead = edge - along[:, None] * normal
     length, depth = np.linalg.norm(edge, axis=1), np.linalg.norm(ahead, axis=1)
-    return EdgeMeasures(normal, along, ahead, length, depth)
-
-
-def faults_of(edge: EdgeMeasures, gripper: Gripper) -> dict[NoGrasp, Bools]:
-    """Which edges (M,) define no edge grasp that fits the gripper, by reason."""
-    return {
-        NoGrasp.TOO_SHORT: edge.length <= MIN_EDGE,
-        NoGrasp.TOO_LONG: edge.length >= gripper.max_opening / 2 - EDGE_MARGIN,
-        NoGrasp.NO_DIRECTION: edge.depth <= MIN_DEPTH,
-        NoGrasp.TOO_DEEP: edge.depth >= gripper.contact_z - gripper.palm_z,
+    faults = {
+        NoGrasp.TOO_SHORT: length <= MIN_EDGE,
+        NoGrasp.TOO_LONG: length >= min(gripper.max_opening / 2 - EDGE_MARGIN, reach),
+        NoGrasp.NO_DIRECTION: depth <= MIN_DEPTH,
+        NoGrasp.TOO_DEEP: depth >= gripper.contact_z - gripper.palm_z,
     }
+    return EdgeMeasures(normal, along, ahead, depth, faults)
 
 
 def retract(
