@@ -7,17 +7,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
 from scipy.special import expit, logit
 from torch import nn
 
-from edgegrasp_camera.arrays import Array, Float32, Floats
+from edgegrasp_camera.arrays import Array, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.candidates.edge_grasps import Candidates
-from edgegrasp_model.candidates.sample import NOTHING, Sample, Sampler
+from edgegrasp_model.candidates.sample import Sample, Sampler
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import Given, check_edges, check_hand_poses, from_edges, from_hand_poses
 from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
@@ -89,13 +89,6 @@ class Prepared:
         start = time.perf_counter()
         yield
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
-
-
-class Scored(NamedTuple):
-    """The candidates of a request, E of them."""
-
-    sample: Sample
-    logits: Float32  # (E,) calibrated in training
 
 
 class GraspDetector:
@@ -191,7 +184,7 @@ class GraspDetector:
             options, gripper, radius, selected, scene, counts, warnings, seconds, followed
         )
 
-    def evaluate(self, prepared: Prepared) -> Scored | None:
+    def evaluate(self, prepared: Prepared) -> Sample | None:
         """Second stage: sample candidates and score them; None if there is no scene.
 
         In rounds: around half of the approach points; around the other half, on objects without a
@@ -204,38 +197,34 @@ class GraspDetector:
         sampler = Sampler(scene, *given, sees_hands=self.sees_hands)
         for enough in ROUNDS:
             with prepared.timed("candidates"):
-                done = NOTHING
+                done: Int64 | tuple[()] = ()
                 if scored is not None:
                     held = expit(scored.logits) >= enough
                     if prepared.options.collision.mode != "ignore":
-                        held &= scored.sample.collision_free
-                    done = scene.object_of_point[scored.sample.candidates.approach_index[held]]
+                        held &= scored.collision_free
+                    done = scene.object_of_point[scored.candidates.approach_index[held]]
                 sample = sampler.sample(done, last_resort=enough == GOOD_SCORE)
             if sample is None:
                 continue
-            logits = self._logits(prepared, scene, sample.candidates)
-            logits = (logits / self.metadata.temperature).astype(np.float32)
-            if scored is not None:
-                sample = scored.sample.and_further(sample)
-                logits = np.concatenate([scored.logits, logits])
-            scored = Scored(sample, logits)
+            logits = self._logits(prepared, scene, sample.candidates) / self.metadata.temperature
+            sample = replace(sample, logits=logits.astype(np.float32))
+            scored = sample if scored is None else scored.and_further(sample)
         return scored
 
-    def finish(self, prepared: Prepared, scored: Scored | None) -> Detection:
+    def finish(self, prepared: Prepared, sample: Sample | None) -> Detection:
         """Last stage: scores, ranking, suppression, poses."""
         scene, gripper, options = prepared.scene, prepared.gripper, prepared.options
         counts, grasps, debug = prepared.counts, [], None
-        sample = None if scored is None else scored.sample
         with prepared.timed("ranking"):
             logits, outcome = np.empty(0, dtype=np.float32), np.empty(0, dtype=np.int8)
-            if scored is not None and scene is not None:
-                logits = scored.logits
+            if sample is not None and scene is not None:
+                logits = sample.logits
                 if self.sees_hands:
-                    logits = judged_together(logits, scored.sample, scene, gripper)
+                    logits = judged_together(logits, sample, scene, gripper)
             score: Floats = expit(logits)
             if scene is not None and not scene.approach_allowed.any():
                 prepared.warnings.append(NO_APPROACH_POINT)
-            elif scored is not None and len(logits) == 0:
+            elif sample is not None and len(logits) == 0:
                 prepared.warnings.append(NO_CANDIDATE)
             elif scene is not None and sample is not None:
                 rating = score * object_probability(scene, sample.candidates.contact_index)

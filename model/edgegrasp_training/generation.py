@@ -383,7 +383,7 @@ def choose_grasps(
         scored = guide.evaluate(prepared)
         if scored is None or len(scored.logits) == 0:
             return None
-        sample = scored.sample
+        sample = scored
         rating = judged_together(scored.logits, sample, scene, prepared.gripper)
         number = scene.object_of_point[sample.candidates.contact_index]
         rows = _likely(number, scored.logits, rating, options.grasps_per_view, rng)

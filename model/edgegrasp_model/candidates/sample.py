@@ -3,7 +3,7 @@
 import math
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import reduce
 
 import numpy as np
@@ -38,7 +38,6 @@ NEAR, TURNED = 0.004, math.radians(10)  # within which hands share one score
 CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
 PRESET_ANGLE = math.radians(30)  # between a hand's direction and straight down, or the horizontal
 MIN_APPROACH_UP = -0.1  # where nothing is asked for: cosine of the outward approach and up
-NOTHING = np.empty(0, dtype=np.int64)
 APPROACH_STREAM, CANDIDATE_STREAM = 0, 1  # random streams of one request
 
 
@@ -51,6 +50,7 @@ class Sample:
     drawn: Candidates  # all of them, C
     outcome: NDArray[np.int8]  # (C,) CODE of each one's outcome; RETURNED: it is to be scored
     row: Int64  # (E,) indices of the candidates among them
+    logits: Float32 = field(default_factory=lambda: np.empty(0, np.float32))  # (E,) once scored
 
     def and_further(self, other: "Sample") -> "Sample":
         """This sample joined with a later one."""
@@ -60,6 +60,7 @@ class Sample:
             Candidates.concatenate([self.drawn, other.drawn]),
             np.concatenate([self.outcome, other.outcome]),
             np.concatenate([self.row, other.row + len(self.drawn)]),
+            np.concatenate([self.logits, other.logits]),
         )
 
 
@@ -99,7 +100,7 @@ class Sampler:
 
     def sample(
         self,
-        done: Int64 = NOTHING,  # (D,) numbers of objects that need no more
+        done: Int64 | tuple[()] = (),  # (D,) numbers of objects that need no more
         *,
         last_resort: bool = False,  # try hands that hold less often or are scored too high
     ) -> Sample | None:
