@@ -72,33 +72,33 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
     InvalidRequest, which names `cloud`, `normals`, `colors`, `segment_ids` or `view_ids`.
     """
     sent = cloud if isinstance(cloud, CloudInput) else CloudInput(cloud)
-    points, size_of_image, row, step = sent.points, None, None, 1
-    if isinstance(points, np.ndarray) and points.ndim == 3 and points.shape[2] == 3:
+    points = _checked_points(sent.points)
+    size, said, image_size, step = points.size // 3, sent.warnings, None, 1
+    row = np.arange(size)
+    if points.ndim == 3:
         # A single row of points, such as fused images, is not an image.
-        size_of_image = None if 1 in points.shape[:2] else points.shape[:2]
-        if points.dtype in (np.float32, np.float64):
-            step = 2 if thin and _is_fine(points) else 1
-            columns, points = points.shape[1], points[::step, ::step]
-            narrow, points = points.shape[1], points.reshape(-1, 3)
-            x, y, z = points.T
-            kept = np.flatnonzero(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
-            row = kept if step == 1 else kept // narrow * (step * columns) + kept % narrow * step
-            points = points.take(kept, axis=0)
-            if len(points) == 0:
-                raise InvalidRequest("cloud", "no finite points", "Send an image with readings.")
-        points = points.reshape(-1, 3)
-    valid, low, high = _valid_points(points)
-    row = np.arange(len(valid)) if row is None else row
-    size = len(sent.points.reshape(-1, 3)) if isinstance(sent.points, np.ndarray) else len(valid)
-    said = sent.warnings
+        image_size = None if 1 in points.shape[:2] else points.shape[:2]
+        step = 2 if thin and _is_fine(points) else 1
+        row = row.reshape(points.shape[:2])[::step, ::step].reshape(-1)
+        points = points[::step, ::step].reshape(-1, 3)
+        x, y, z = points.T
+        kept = np.flatnonzero(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
+        row, points = row[kept], points.take(kept, axis=0)
+    if len(points) == 0:
+        raise InvalidRequest(
+            "cloud",
+            "no points" if size == 0 else "no finite points",
+            "Send an image or points in metres.",
+        )
+    low, high = _corners(points)
     if (high - low).max() > MAX_EXTENT:
-        near = _near_points(valid)
+        near = _near_points(points)
         said += (
-            f"{len(valid) - len(near)} points are left out that lie more than "
+            f"{len(points) - len(near)} points are left out that lie more than "
             f"{MAX_EXTENT / 2:g} m from the middle of the cloud.",
         )
-        valid, row = valid[near], row[near]
-        low, high = valid.min(axis=0), valid.max(axis=0)
+        points, row = points[near], row[near]
+        low, high = _corners(points)
     if (furthest := float(np.maximum(-low, high).max())) > MAX_DISTANCE:
         value = f"points {furthest:.4g} m from the origin, where float32 rounds away millimetres"
         fix = (
@@ -106,21 +106,19 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
             "add it to the grasps."
         )
         raise InvalidRequest("cloud", value, fix)
-    if len(valid) < num_approach_points:
-        value = f"{len(valid)} points for num_approach_points = {num_approach_points}"
+    if len(points) < num_approach_points:
+        value = f"{len(points)} points for num_approach_points = {num_approach_points}"
         fix = "Send more points or lower options.num_approach_points."
         raise InvalidRequest("cloud", value, fix)
-    _beside("colors", sent.colors, size, row[:0], 3)
+    arrays = {
+        name: _beside(name, array, size, row)
+        for name in ("colors", "normals", "segment_ids", "view_ids")
+        if (array := getattr(sent, name)) is not None
+    }
+    arrays.pop("colors", None)
+    points = np.require(points, np.float32, ("C", "W"))  # loops are not compiled for read-only ones
     return CheckedCloud(
-        np.require(valid, np.float32, ("C", "W")),  # loops are not compiled for read-only ones
-        row.astype(np.int64, copy=False),
-        size,
-        _beside("normals", sent.normals, size, row, 3),
-        _beside("segment_ids", sent.segment_ids, size, row),
-        _beside("view_ids", sent.view_ids, size, row),
-        size_of_image,
-        step,
-        said,
+        points, row, size, **arrays, image_size=image_size, step=step, warnings=said
     )
 
 
@@ -167,12 +165,9 @@ def seen_from_origin(points: Float32, up: ArrayLike | None) -> bool:
     return bool(upward <= MAX_UPWARD * np.linalg.norm(middle))
 
 
-def _beside(
-    field: str, array: object | None, size: int, row: Int64, width: int = 1
-) -> Array | None:
+def _beside(field: str, array: object, size: int, row: Int64) -> Array:
     """The given rows of an array beside the cloud, of one integer or of three floats a point."""
-    if array is None:
-        return None
+    width = 1 if field.endswith("_ids") else 3
     kinds, kind = ("iu", "one integer") if width == 1 else ("fui", "three numbers")
     fix = f"Send {kind} for each of the cloud's {size} points."
     if not isinstance(array, np.ndarray):
@@ -188,7 +183,7 @@ def _beside(
                 raise InvalidRequest(field, f"the number {end}", "Send 32-bit numbers.")
         return ids.astype(np.int64)
     values = np.ascontiguousarray(array.reshape(-1, width)[row], dtype=np.float32)
-    if not np.isfinite(values).all():
+    if field == "normals" and not np.isfinite(values).all():
         bad = int(row[np.argmin(np.isfinite(values).all(axis=1))])
         raise InvalidRequest(field, f"NaN or infinity in row {bad}", "Send finite numbers.")
     return values
@@ -202,28 +197,28 @@ class Cloud:
     normals: Float32  # (N, 3)
 
 
-def _valid_points(cloud: object) -> tuple[Floats, Floats, Floats]:
-    """A caller's array (N, 3), metres, and its low and high corner (3,)."""
-    if not isinstance(cloud, np.ndarray):
-        kind = type(cloud).__name__
+def _checked_points(points: object) -> Floats:
+    """A caller's points, (N, 3) or (H, W, 3), if they are an array of that shape."""
+    if not isinstance(points, np.ndarray):
+        kind = type(points).__name__
         raise InvalidRequest("cloud", f"a {kind}", "Send an array of shape (N, 3) in metres.")
-    if cloud.ndim != 2 or cloud.shape[1] != 3:
+    if points.ndim not in (2, 3) or points.shape[-1] != 3:
         fix = "Send shape (N, 3) or (H, W, 3): x, y, z; a depth image as one of depth_images."
-        raise InvalidRequest("cloud", f"shape {cloud.shape}", fix)
-    if cloud.dtype not in (np.float32, np.float64):
-        raise InvalidRequest("cloud", f"dtype {cloud.dtype}", "Send float32 or float64 metres.")
-    if len(cloud) == 0:
-        raise InvalidRequest("cloud", "no points", "Send points in metres.")
-    low, high = (np.array([end(axis) for axis in cloud.T]) for end in (np.min, np.max))
+        raise InvalidRequest("cloud", f"shape {points.shape}", fix)
+    if points.dtype not in (np.float32, np.float64):
+        raise InvalidRequest("cloud", f"dtype {points.dtype}", "Send float32 or float64 metres.")
+    return points
+
+
+def _corners(points: Floats) -> tuple[Floats, Floats]:
+    """The low and high corner (3,) of points (N, 3), if all are finite."""
+    low, high = (np.array([end(axis) for axis in points.T]) for end in (np.min, np.max))
     if not np.isfinite([low, high]).all():
-        finite = np.isfinite(cloud).all(axis=1)
-        bad = int(np.argmin(finite))
-        raise InvalidRequest(
-            "cloud",
-            f"{int((~finite).sum())} points with NaN or infinity, the first in row {bad}",
-            "Remove points without a finite x, y, z.",
-        )
-    return cloud, low, high
+        finite = np.isfinite(points).all(axis=1)
+        value = f"{int((~finite).sum())} points with NaN or infinity, the first in row "
+        fix = "Remove points without a finite x, y, z."
+        raise InvalidRequest("cloud", value + str(int(np.argmin(finite))), fix)
+    return low, high
 
 
 def _near_points(points: Floats) -> Int64:

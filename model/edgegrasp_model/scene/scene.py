@@ -129,7 +129,9 @@ def select_points(
 ) -> SelectedPoints:
     """Correct depths, segment, remove the support, and drop what no hand at an object can reach."""
     viewpoints = camera_positions(sent, options)
-    check_regions(sent, options)
+    for name in ("approach_region", "contact_region"):
+        if (region := getattr(options, name)) is not None:
+            check_region(region, sent, name)
     counts["points"], corrected = len(sent.points), None
     if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
         sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
@@ -177,7 +179,8 @@ def select_points(
     labels[sent.row] = np.where(number >= 0, number, OBSTACLE)
     if options.debug:
         labels = sent.of_all_pixels(labels)
-    number = chosen_objects(number, sent, options, warnings)
+    if options.at or options.near or isinstance(options.objects, ObjectChoice):
+        number = chosen_objects(number, sent, options, warnings)
     kept = near_objects_along(plan, number)
     near, number = sent.take(kept), number[kept]
     return SelectedPoints(near, number, support, up, viewpoints, labels, confidence, corrected)
@@ -274,7 +277,8 @@ def build_scene(
     frame = CanonicalFrame.of_scene(sent.points, selected.up, eye)
     voxels = voxelise(canonical := frame.points(sent.points), voxel_size)
     counts["voxels"] = len(voxels.size)
-    _check_voxels(counts["voxels"], max_voxels, voxel_size, sent, options)
+    if counts["voxels"] > max_voxels:
+        raise _too_wide(counts["voxels"], max_voxels, voxel_size, sent, options)
     middles = voxels.mean(canonical)
     cloud, kept = _clean_cloud(sent, middles, voxels, frame, viewpoints)
     counts["kept"] = int(kept.sum())
@@ -371,14 +375,12 @@ def _clean_cloud(
     return Cloud(points, normals), kept
 
 
-def _check_voxels(
+def _too_wide(
     count: int, most: int, voxel_size: float, sent: CheckedCloud, options: DetectOptions
-) -> None:
-    if count <= most:
-        return
+) -> InvalidRequest:
     size = " x ".join(f"{length:.2g}" for length in np.ptp(sent.points, axis=0))
     cropped = "no workspace" if options.workspace is None else "the workspace"
-    raise InvalidRequest(
+    return InvalidRequest(
         "options.workspace",
         f"{cropped}, which leaves {count} voxels of {1000 * voxel_size:g} mm in {size} m",
         "Send a workspace around the objects, or a support plane: at most "
@@ -455,21 +457,6 @@ def camera_positions(sent: CheckedCloud, options: DetectOptions) -> Float64 | No
 # Regions, and objects that a request names
 
 
-def check_regions(cloud: CheckedCloud, options: DetectOptions) -> None:
-    """Raise InvalidRequest if `at` or a region refers to something that the cloud does not have."""
-    if options.at is not None:
-        if cloud.image_size is None:
-            fix = "Send near: x, y, z; or one depth image, or an organised cloud."
-            raise InvalidRequest("options.at", "a pixel of a cloud that is not an image", fix)
-        (column, row), (height, width) = options.at, cloud.image_size
-        if column > width - 0.5 or row > height - 0.5:
-            value = f"{column:g}, {row:g} of an image of {width} x {height} pixels"
-            raise InvalidRequest("options.at", value, "Send column, row, counted from 0.")
-    for name in ("approach_region", "contact_region"):
-        if (region := getattr(options, name)) is not None:
-            check_region(region, cloud, name)
-
-
 def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
     """Check that the rows and segments of a region exist; InvalidRequest names its `field`."""
     for part in ("include", "exclude"):
@@ -503,8 +490,8 @@ def chosen_objects(
             continue
         place: Floats = cloud.points
         most = NEAR_POINT
-        if name == "at" and cloud.image_size is not None:
-            width = cloud.image_size[1]
+        if name == "at":
+            width = _image_width(target, cloud)
             place = np.stack([cloud.row % width, cloud.row // width], axis=1)
             most = max(NEAR_PIXEL * width, 1.0)
         on = np.flatnonzero(np.isin(number, wanted))
@@ -516,6 +503,18 @@ def chosen_objects(
             shown = ", ".join(f"{value:g}" for value in target)
             warnings.append(f"{name}: there is no object to grasp at {shown}.")
     return np.where((number >= 0) & ~np.isin(number, wanted), FIXED, number)
+
+
+def _image_width(pixel: tuple[float, ...], cloud: CheckedCloud) -> int:
+    """The width of a cloud's image; InvalidRequest unless it has the pixel of `at`."""
+    if cloud.image_size is None:
+        fix = "Send near: x, y, z; or one depth image, or an organised cloud."
+        raise InvalidRequest("options.at", "a pixel of a cloud that is not an image", fix)
+    (column, row), (height, width) = pixel, cloud.image_size
+    if column > width - 0.5 or row > height - 0.5:
+        value = f"{column:g}, {row:g} of an image of {width} x {height} pixels"
+        raise InvalidRequest("options.at", value, "Send column, row, counted from 0.")
+    return width
 
 
 def numbers_chosen(found: Int64, choice: ObjectChoice | str, warnings: list[str]) -> Int64:
