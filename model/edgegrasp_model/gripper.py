@@ -16,6 +16,7 @@ from edgegrasp_model.errors import InvalidGripper, InvalidRequest
 from edgegrasp_model.options import DetectOptions, GripperGeometry, HandPart, Linkage
 
 GRIPPER_FOLDER = Path(__file__).parent / "grippers"
+APPROACH_LENGTH = 0.05  # metres of straight approach that must be free, or is described
 SEEN_LENGTH = 0.0465  # metres of finger length from the tips: as long as the Panda's
 
 

@@ -60,6 +60,7 @@ MAX_APPROACH_POINTS = 256
 MAX_CANDIDATES = 16_000
 MAX_VIEWS = 64
 MAX_PREVIOUS, MAX_SURFACE = 64, 128  # grasps or objects of an answer; points of an object
+PURPOSES = ("approach", "candidates", "support")  # of random numbers
 CollisionMode = Literal["avoid", "penalise", "ignore"]
 
 
@@ -755,6 +756,12 @@ class DetectOptions(Strict):
     debug: StrictBool = Field(
         default=False, description="whether to return the processed cloud and every candidate"
     )
+
+    def rng(self, purpose: Literal["approach", "candidates", "support"]) -> np.random.Generator:
+        """The random stream of a purpose, by the seed."""
+        return np.random.default_rng(
+            [self.seed, ("approach", "candidates", "support").index(purpose)]
+        )
 
     @property
     def known_up(self) -> NDArray[np.float64] | None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
-from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
 from edgegrasp_model.kernels import compiled, distance_behind
 
 CELL = 0.0022  # metres across a cell of the depth map, at the middle of the cloud
@@ -17,7 +17,6 @@ BEHIND = 0.004  # metres behind a surface that still count as the surface
 DEEP = 0.02  # metres farther behind at which space counts as fully unknown
 FAR = 0.10  # metres behind a surface; distances are clipped here
 UNKNOWN_SHARE = 0.25  # unseen share of the way of a part of the hand that counts as a collision
-WAY = 0.05  # metres of straight approach on which the hand sweeps space
 SLICES = 9  # of the hand, along y
 OUTSIDE_SHARE = 0.5  # of the way of a slice, from which a hand reaches out of the image
 LINE = 27  # places on the closing line, from beyond one finger to beyond the other
@@ -144,7 +143,7 @@ def _ways(gripper: Gripper) -> list[Float32]:
     half, inner = gripper.pad_half_width, gripper.max_opening / 2
     root = min(low[2] for low, _ in gripper.finger.boxes)
     thick = gripper.finger_thickness
-    x, z = [-0.7 * half, 0.7 * half], root - np.linspace(0.0, WAY, 5)[1:]
+    x, z = [-0.7 * half, 0.7 * half], root - np.linspace(0.0, APPROACH_LENGTH, 5)[1:]
     return [_grid(x, side * (inner + np.array([0.15, 0.7]) * thick), z) for side in (1.0, -1.0)]
 
 
@@ -153,7 +152,10 @@ def _palm_ways(gripper: Gripper) -> list[Float32]:
     """Points of the space that slices of the hand sweep, from end to end: each (S, 3)."""
     slices = []
     for low, high in gripper.hand.boxes:
-        x, z = 0.6 * np.array([low[0], high[0]]), np.linspace(low[2] - WAY, high[2], 7)[:-1]
+        x, z = (
+            0.6 * np.array([low[0], high[0]]),
+            np.linspace(low[2] - APPROACH_LENGTH, high[2], 7)[:-1],
+        )
         slices += [_grid(x, [y], z) for y in np.linspace(low[1], high[1], SLICES)]
     return slices
 

@@ -10,8 +10,8 @@ from tests.many_options import OWN_GRIPPER
 
 from edgegrasp_model.candidates.edge_grasps import (
     CLOSED_FURTHER,
+    MARGIN,
     MAX_INSERTION,
-    TIP_MARGIN,
     support_clearance,
 )
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue
@@ -122,7 +122,7 @@ def test_grasps_fit_the_gripper_that_was_asked_for(gripper: Gripper) -> None:
         np.testing.assert_allclose(T_hand_tcp, gripper.T_hand_tcp, atol=1e-5)
         contact = (grasp.contact_point - grasp.T_cloud_hand[:3, 3]) @ grasp.T_cloud_hand[:3, :3]
         further_in = gripper.contact_z_at(2 * abs(contact[1])) - contact[2]
-        shallowest = gripper.contact_z - gripper.tip_z + TIP_MARGIN
+        shallowest = gripper.contact_z - gripper.tip_z + MARGIN
         assert shallowest - 1e-3 < further_in < MAX_INSERTION + 2e-3
         assert grasp.width <= np.float32(gripper.max_opening)
     warned = any("trained for the gripper 'panda'" in warning for warning in found.warnings)

@@ -5,9 +5,10 @@ from typing import NamedTuple
 import numpy as np
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
-from edgegrasp_model.candidates.edge_grasps import APPROACH_LENGTH, support_clearance
-from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.candidates.edge_grasps import support_clearance
+from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
 from edgegrasp_model.kernels import (
+    SLACK,
     any_point_in_boxes,
     any_point_on_way,
     in_hands,
@@ -24,7 +25,6 @@ from edgegrasp_model.unseen import enters_unseen
 NEAR = 0.006  # metres around a finger that count as near it
 FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
 MIN_FIXED = 8  # voxels of background between the fingers that keep them from closing
-TOUCH = 1e-6  # metres between the support plane and a hand that was retracted from it
 
 
 def collides(
@@ -59,7 +59,7 @@ def collides(
         rise = -T_cloud_hand[:, :3, 2] @ normal  # per metre of way back
         lowest = np.minimum(height, height + behind * rise)
         lowest = np.minimum(lowest, height + lift * (UP @ normal))
-        hit |= np.asarray(lowest < request.margin - TOUCH)
+        hit |= np.asarray(lowest < request.margin - SLACK)
     if scene.obstacles is not None:
         solid = _hits_any(SolidBoxes.of_hands(T_cloud_hand, swept), scene.obstacles, None)
         if lift > 0:

@@ -14,16 +14,17 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from edgegrasp_camera.arrays import Bools, Float32, Int64
-from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
 from edgegrasp_model.kernels import compiled, extents_between, free_way, in_hands
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.results import NoGrasp
 from edgegrasp_model.scene.cloud import UP, Cloud, unit
 
 MIN_EDGE = 0.003  # metres between approach and contact point
-EDGE_MARGIN = 0.002  # metres an edge stays below half the opening
+# Metres that an edge stays below half the opening, a contact inside the fingertips, and a hand
+# behind what is ahead of it.
+MARGIN = 0.002
 MIN_DEPTH = 1e-4  # metres; a shallower edge has no approach direction
-TIP_MARGIN = 0.002  # metres a contact stays inside the fingertips when the hand retracts
 CLOSED_FURTHER = 0.01  # metres by which an object may be narrower than it seems
 WIDE = 0.75  # share of the opening from which an object counts as wide
 BESIDE_PADS = 0.004  # metres beside the finger pads in which points count
@@ -170,7 +171,7 @@ def measure_edges(
     length, depth = np.linalg.norm(edge, axis=1), np.linalg.norm(ahead, axis=1)
     faults = {
         NoGrasp.TOO_SHORT: length <= MIN_EDGE,
-        NoGrasp.TOO_LONG: length >= min(gripper.max_opening / 2 - EDGE_MARGIN, reach),
+        NoGrasp.TOO_LONG: length >= min(gripper.max_opening / 2 - MARGIN, reach),
         NoGrasp.NO_DIRECTION: depth <= MIN_DEPTH,
         NoGrasp.TOO_DEEP: depth >= gripper.contact_z - gripper.palm_z,
     }
@@ -182,7 +183,7 @@ def retract(
 ) -> tuple[Candidates, Bools]:
     """Move hands that cut into the support plane back along their approach, if that frees them.
 
-    The contact may move from contact_z to at most TIP_MARGIN inside the fingertips, so flat objects
+    The contact may move from contact_z to at most MARGIN inside the fingertips, so flat objects
     on a table are held by the tips. Returns the candidates, and a mask (E,) of those whose hand is
     `margin` metres above the plane now; the other hands are unchanged.
     """
@@ -191,7 +192,7 @@ def retract(
     rise = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
         back = np.where(clearance >= 0, 0.0, -clearance / rise)
-    clear = (back >= 0) & (back <= gripper.tip_z - gripper.contact_z - TIP_MARGIN)
+    clear = (back >= 0) & (back <= gripper.tip_z - gripper.contact_z - MARGIN)
     pose = pose.copy()
     pose[clear, :3, 3] += back[clear, None] * candidates.approach[clear]
     return replace(candidates, T_cloud_hand=pose), clear
@@ -254,18 +255,15 @@ def centred_grasps(
 
 # Grasps across an outline
 
-APPROACH_LENGTH = 0.05  # metres of straight approach that must be free, or is described
 OUTLINE_RADIUS = 0.016  # metres of surface from which the outline's direction is estimated
 MIN_OUTWARD = 0.002  # metres from a neighbourhood's mean to a point on the outline
 THIN = 0.003  # metres of standard deviation across a rim, all of which counts as outline
-LEAN, LEANING = np.radians(30.0), 4  # radians off vertical; directions around it
+LEAN = np.radians(30.0)  # off vertical
 DROP = 0.006  # metres below an edge from which a surface counts as another one
 GAP = 0.007  # metres without a point in which a surface ends
 ONE_VIEW = np.cos(np.radians(15.0))  # radians; directions closer than this show the same outline
-CLEARANCE = 0.002  # metres kept free ahead of the hand as it goes in
 MAX_INSERTION = 0.020  # metres deeper than an edge grasp; more does not hold better
 STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it
-LEVEL = 1e-6  # cosine below which a hand moves along the support
 
 
 class Outline(NamedTuple):
@@ -281,13 +279,13 @@ def outlines(
     viewpoints: Float32 | None,  # (W, 3); None where they are unknown
     rows: Int64,  # (M,) of the points to look at
     *,
-    leaning: bool = False,  # also from all around, LEAN off above
+    leaning: bool = False,  # also from four sides, LEAN off above
 ) -> list[Outline]:
     """The outlines of a cloud from above and, if that is another direction, from each camera."""
     toward = [np.broadcast_to(UP, points.shape)]
     toward += [unit(eye - points) for eye in ([] if viewpoints is None else viewpoints)]
     if leaning:
-        for turn in np.linspace(0.0, 2 * np.pi, LEANING, endpoint=False):
+        for turn in np.linspace(0.0, 2 * np.pi, 4, endpoint=False):
             way = np.array([np.sin(LEAN) * np.cos(turn), np.sin(LEAN) * np.sin(turn), np.cos(LEAN)])
             toward.append(np.broadcast_to(way.astype(np.float32), points.shape))
     ways = np.stack([each[rows] for each in toward])
@@ -340,7 +338,7 @@ def outline_grasps(
     # How far the surface extends between the pads from each contact, outward and inward: (M, 2).
     extent = extents_across(points, crop.ball_rows, first, last, frame[contact[row]], strip)
     width = extent[:, 1] - extent[:, 0]
-    held = (extent[:, 0] > -MIN_EDGE) & (width < gripper.max_opening - 2 * EDGE_MARGIN)
+    held = (extent[:, 0] > -MIN_EDGE) & (width < gripper.max_opening - 2 * MARGIN)
     held &= edge[1][row] < extent[:, 1] + MIN_EDGE  # the approach point lies on the same surface
     off_axis = np.hypot(edge[0][row], edge[1][row] - extent.mean(axis=1))
     nearest = np.lexsort((off_axis, contact[row], ~held))[: held.sum()]
@@ -365,17 +363,18 @@ def _inserted(
     margin: float,
 ) -> Candidates:
     """The hands moved in until something is right ahead, without those that stop early."""
-    least = gripper.contact_z + TIP_MARGIN - gripper.tip_z  # metres of way that it takes
+    least = gripper.contact_z + MARGIN - gripper.tip_z  # metres of way that it takes
     room = np.full(len(candidates), np.inf, dtype=np.float32)  # metres of way above the support
     if support is not None:
         fall = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
         pose, opening = candidates.T_cloud_hand, candidates.opening
         height = support_clearance(pose, opening, support, gripper) - margin
-        room = np.where(fall > LEVEL, height / np.maximum(fall, LEVEL), room)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            room = np.where(fall > 0, height / fall, room)
     enough = np.flatnonzero(room >= least)
     candidates = candidates.take(enough)
     boxes = gripper.open_boxes + margin * np.array([[-1.0], [1.0]])
-    way = free_way(in_hands(points, candidates.T_cloud_hand), boxes, APPROACH_LENGTH) - CLEARANCE
+    way = free_way(in_hands(points, candidates.T_cloud_hand), boxes, APPROACH_LENGTH) - MARGIN
     way = np.minimum(way, room[enough])
     row = np.flatnonzero(way >= least)
     hands = candidates.take(row)

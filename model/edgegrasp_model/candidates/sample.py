@@ -29,16 +29,14 @@ from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
-APPROACH_POINTS_EACH = 8, 64  # of an object
 MIN_APPROACH_POINTS, MAX_APPROACH_POINTS = 32, 64  # of a scene, for each view
 MOST_VIEWS = 4  # of further approach points
-FEWEST_EACH = 4  # of an object, however many there are
+FEWEST_EACH = 4  # of an object, however many there are; twice as many if there is room
 OVERSAMPLING = 4  # hands checked for collision, in multiples of num_candidates
 NEAR, TURNED = 0.004, math.radians(10)  # within which hands share one score
 CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
 PRESET_ANGLE = math.radians(30)  # between a hand's direction and straight down, or the horizontal
 MIN_APPROACH_UP = -0.1  # where nothing is asked for: cosine of the outward approach and up
-APPROACH_STREAM, CANDIDATE_STREAM = 0, 1  # random streams of one request
 
 
 @dataclass(frozen=True)
@@ -79,13 +77,12 @@ class Sampler:
         """Share the approach points among the objects."""
         self.scene, self.options, self.gripper = scene, options, gripper
         self.crop_radius, self.counts, self.sees_hands = crop_radius, counts, sees_hands
-        self._rng_approach = np.random.default_rng([options.seed, APPROACH_STREAM])
-        self._rng = np.random.default_rng([options.seed, CANDIDATE_STREAM])
+        self._rng_approach, self._rng = options.rng("approach"), options.rng("candidates")
         self._rows = np.flatnonzero(scene.approach_allowed)
         self._objects, size = np.unique(scene.object_of_point[self._rows], return_counts=True)
         most = options.num_approach_points
         if most is None and len(size) <= MAX_APPROACH_POINTS:
-            wanted = np.clip(size // POINTS_PER_APPROACH, *APPROACH_POINTS_EACH)
+            wanted = np.clip(size // POINTS_PER_APPROACH, 2 * FEWEST_EACH, MAX_APPROACH_POINTS)
             wanted = np.maximum(wanted, MIN_APPROACH_POINTS // len(size))
             wanted = np.floor(wanted * min(MAX_APPROACH_POINTS / wanted.sum(), 1.0))
             views = 1 if scene.viewpoints is None else min(len(scene.viewpoints), MOST_VIEWS)

@@ -20,8 +20,8 @@ from torch import Tensor, nn
 
 from edgegrasp_camera.arrays import Bools, Float32, Int64
 from edgegrasp_model.candidates.collision import NEAR, HandView, hand_views
-from edgegrasp_model.candidates.edge_grasps import APPROACH_LENGTH, Candidates, support_clearance
-from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.candidates.edge_grasps import Candidates, support_clearance
+from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks.config import HAND_DESCRIPTION_SIZE, NetworkConfig
 from edgegrasp_model.networks.layers import (

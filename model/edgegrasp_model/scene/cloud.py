@@ -19,7 +19,6 @@ MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more 
 OUTLIER_NEIGHBORS = 8
 OUTLIER_DEVIATIONS = 2.5
 NORMAL_NEIGHBORS = 20
-JACOBI_SWEEPS = 6  # rounds of Jacobi's method for a symmetric 3 x 3 matrix; more change nothing
 DIAGONAL = 1e-12  # off-diagonal sum, as a share of the trace, at which Jacobi's method stops
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 CUBE = 8  # voxels along the edge of a cube; points are stored cube by cube
@@ -307,12 +306,11 @@ def least_spread(points: Float32, rows: Int64) -> Float32:
                 spread[i, j] = 0.0
                 for k in range(count):
                     spread[i, j] += around[k, i] * around[k, j]
-        for _ in range(JACOBI_SWEEPS):
+        off = np.inf
+        while off > DIAGONAL * (spread[0, 0] + spread[1, 1] + spread[2, 2]):
             for turn in range(3):
                 _rotate_away(spread, axes, turn % 2, 1 if turn == 0 else 2)
             off = abs(spread[0, 1]) + abs(spread[0, 2]) + abs(spread[1, 2])
-            if off <= DIAGONAL * (spread[0, 0] + spread[1, 1] + spread[2, 2]):
-                break
         least = 0
         for d in range(1, 3):
             least = d if spread[d, d] < spread[least, least] else least

@@ -19,14 +19,13 @@ from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.scene.cloud import WIDEST_VIEW, thinned, unit
 
-HEIGHT, WIDTH = 352, 480  # pixels of the input
+PIXELS = 352 * 480  # of the input, about
 MULTIPLE = 32  # its sides are multiples of
 CLASSES = ("other", "support", "object")
 CHANNELS = 12  # of `scene_features`
 WIDTHS = (16, 32, 48, 64, 96, 128)  # channels at each resolution, the output's first
 STRIDE = 2  # pixels of the input between neighbours whose difference gives the normal
 VOTE_UNIT = 0.05  # metres
-OUTPUTS = len(CLASSES) + 3 + 2 + 3
 # Of range images:
 NEAREST = 0.05  # metres from the viewpoint
 COVERED = 0.5  # percent of the points that may lie beyond each side of the image
@@ -61,7 +60,7 @@ class SceneNet(nn.Module):
         self.context = _Block(last, dilation=3)
         self.across = nn.ModuleList([nn.Conv2d(b, a, 1) for a, b in pairs[::-1]])
         self.up = nn.ModuleList([_layer(a, a) for a, _ in pairs[::-1]])
-        self.head = nn.Conv2d(first, OUTPUTS, 1)
+        self.head = nn.Conv2d(first, len(CLASSES) + 3 + 2 + 3, 1)  # as in SceneOutput
 
     def forward(self, features: Tensor) -> SceneOutput:
         """Maps features (B, CHANNELS, H, W); H and W are multiples of 32."""
@@ -197,7 +196,7 @@ def range_image(
         turn = _camera_axes(np.array([*(low + high) / 2, 1.0]) @ turn, downward)
     in_view = apart @ turn.T
     low, high = _view(in_view)
-    finest = float(np.sqrt((high - low).prod() / (WIDTH * HEIGHT)))
+    finest = float(np.sqrt((high - low).prod() / PIXELS))
     # Distance at a depth of one metre between neighbours, from the area that points cover.
     ahead, cell = in_view[in_view[:, 2] > NEAREST], max(float((high - low).max()) / COARSE, 1e-6)
     place = ((ahead[:, :2] / ahead[:, 2:] - low) / cell).astype(np.int64)

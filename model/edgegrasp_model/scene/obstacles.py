@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Self
 
 import numpy as np
@@ -14,9 +15,8 @@ from edgegrasp_model.scene.cloud import CanonicalFrame
 
 CHUNK = 20_000  # pairs of boxes at a time
 THINNEST = 1e-6  # metres, half a box of a request at least, so that its axes have a direction
-_SIGNS = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(8, 3)
-_DIFFER = (_SIGNS[:, None] != _SIGNS).sum(axis=2)  # (8, 8) coordinates
-_EDGES = np.argwhere(np.triu(_DIFFER == 1))  # (12, 2) corners
+_SIGNS = np.array(list(product((-1, 1), repeat=3)))  # (8, 3) of the corners
+_EDGES = np.argwhere(np.triu(_SIGNS @ _SIGNS.T == 1))  # (12, 2) corners that differ in one sign
 
 
 @dataclass(frozen=True)

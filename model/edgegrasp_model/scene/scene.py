@@ -58,7 +58,6 @@ from edgegrasp_model.scene.support import Seen, Support, choose_support, correct
 from edgegrasp_model.unseen import DepthMap
 
 MIN_POINTS = 4  # fewer are too few for a surface
-MIN_NORMAL = 1e-3  # a voxel's mean normal shorter than this has no direction
 SIDE_DEPTH = 0.006  # metres from a side of the workspace within which an object may be cut off
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 REACH = 0.25  # metres around an object in which a hand at it may collide
@@ -67,7 +66,6 @@ PLAN_CELL = 0.05  # metres
 CLOSE = 0.06  # metres; no camera measures closer
 SPARE = 0.0015  # metres that hands stay above a support plane that was found, not given
 CUT_OUT = 0.95  # confidence of clusters where a cloud was cut off above its support
-HELD_SHARE = 0.5  # share of a voxel's points that must be listed for rows to hold the voxel
 NEAR_POINT = 0.1  # most metres from a position to the object it names
 NEAR_PIXEL = 0.02  # the same from a pixel, as a share of the image's width
 
@@ -368,10 +366,9 @@ def _clean_cloud(
     away = np.einsum("nd,nd->n", normals, seen_from - points) < 0
     normals = np.where(away[:, None], -normals, normals)
     if sent.normals is not None:
-        given = frame.directions(voxels.mean(unit(sent.normals))[kept])
-        length = np.linalg.norm(given, axis=1, keepdims=True)
-        given = given / np.maximum(length, MIN_NORMAL)
-        normals = np.where(length >= MIN_NORMAL, given, normals).astype(np.float32)
+        given = unit(frame.directions(voxels.mean(unit(sent.normals))[kept]))
+        none = np.linalg.norm(given, axis=1, keepdims=True) < 0.5  # opposite ones in a voxel
+        normals = np.where(none, normals, given).astype(np.float32)
     return Cloud(points, normals), kept
 
 
@@ -564,4 +561,4 @@ def _inside_shape(shape: Shape, points: Float32, voxels: Voxels, cloud: CheckedC
         case Segments():
             assert cloud.segment_ids is not None
             listed = np.isin(cloud.segment_ids, shape.ids)
-    return voxels.share(listed) >= HELD_SHARE
+    return voxels.share(listed) >= 0.5

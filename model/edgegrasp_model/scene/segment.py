@@ -34,12 +34,12 @@ SMALLEST = 45  # pixels of an object, in the network's output
 SMALLEST_AREA = 5e-4  # square metres of it, as seen
 VIEW_CELL = 0.01  # metres, in which the views of one object lie in the same place
 VIEW_SHARE = 0.25  # of the smaller one's cells that two views of one object share
-BESIDE = 0.012  # metres from an object within which missed points may belong to it
+# Metres from an object within which missed points may belong to it; from a point to its pixel, as
+# much more for each metre of depth.
+BESIDE = 0.012
 STANDS_OUT = 0.004  # least metres that such points rise above the support's margin
 FEWEST_CELLS, FEWEST_EACH = 5, 4  # cells of a cluster, each BESIDE wide; points per cell
-MOST_CELLS = 2000  # along a side of the ground plan
 LIKELY = 0.5  # confidence from which an instance is an object, not background
-REACH, REACH_GROWTH = 0.012, 0.012  # metres, and share of the depth, from a point to its pixel
 
 
 class Segmentation(NamedTuple):
@@ -296,7 +296,6 @@ def with_clusters(number: Int64, plan: Float64, among: Bools, first: int) -> Int
     if len(rows) == 0:
         return number
     cell = np.floor((plan[rows] - plan[rows].min(axis=0)) / BESIDE).astype(np.int64)
-    cell = np.minimum(cell, MOST_CELLS - 1)
     points = np.zeros(cell.max(axis=0) + 1)
     np.add.at(points, tuple(cell.T), 1)
     cluster, count = ndimage.label(points > 0, np.ones((3, 3)))
@@ -345,7 +344,7 @@ def _look_up(
     rows, columns, _ = seen.shape
     T, per_pixel = T_camera_cloud.astype(np.float32), np.float32(1.0 / pixel_size)
     left, top = np.float32(corner[0]) * per_pixel, np.float32(corner[1]) * per_pixel
-    reach, growth = np.float32(REACH), np.float32(REACH_GROWTH)
+    reach = np.float32(BESIDE)
     for n in range(len(points)):
         a, b, c = points[n, 0], points[n, 1], points[n, 2]
         z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
@@ -358,7 +357,7 @@ def _look_up(
         if u < 0 or v < 0 or u >= columns or v >= rows:
             continue
         i, j = int(v), int(u)
-        nearest, row, column = (reach + growth * z) ** 2, -1, -1
+        nearest, row, column = (reach + reach * z) ** 2, -1, -1
         for k in range(i, min(i + 2, rows)):
             for m in range(j, min(j + 2, columns)):
                 dx, dy, dz = seen[k, m, 0] - x, seen[k, m, 1] - y, seen[k, m, 2] - z

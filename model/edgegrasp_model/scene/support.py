@@ -43,7 +43,6 @@ BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the worksp
 TRIES, SAMPLE = 150, 1200  # planes tried, and points that judge them
 REFINEMENTS = 4  # least squares over the plane's points
 STIFF = 1e-6 * np.eye(6)  # keeps a support flat if little of it is seen
-SUPPORT_STREAM = 2  # random stream of one request
 # Of depths that a known plane corrects:
 NEAR = 0.01  # metres from the plane within which points belong to it
 FLAT = 0.35  # of NEAR: largest median distance of a plane's points (a wall's is 0.5)
@@ -126,7 +125,7 @@ def choose_support(
         whole = len(on) > CUT_OFF * len(seen.points) and _wide(part, request)
         found = measured(Seen(seen.points[some], seen.viewpoint), request, GIVEN_MARGIN, whole)
     else:
-        rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
+        rng = options.rng("support")
         if isinstance(request, RansacPlane):
             weight = by_surface(seen.points) * inside
             plane = fit_plane(seen, weight, rng, up, request.max_tilt)
