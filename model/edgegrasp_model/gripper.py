@@ -91,13 +91,12 @@ class Gripper:
         """Metres along z of a contact, inside the fingertips, by opening (...), metres."""
         return (self.contact_z + self.tip_advance(opening)).astype(np.float32)
 
-    def boxes(self, opening: float, advance: float | None = None) -> Float64:
+    def boxes(self, opening: float) -> Float64:
         """Boxes with the fingers `opening` metres apart: hand, then both fingers.
 
-        Least and greatest corners (B, 2, 3), hand frame. `advance` is metres that the fingertips
-        have moved forward; None: as the opening implies.
+        Least and greatest corners (B, 2, 3), hand frame.
         """
-        ahead = float(self.tip_advance(opening)) if advance is None else advance
+        ahead = float(self.tip_advance(opening))
         right = np.add(self.finger.boxes, (0.0, opening / 2, ahead))  # (F, 2, 3)
         left = right.copy()
         left[:, 0, 1], left[:, 1, 1] = -right[:, 1, 1], -right[:, 0, 1]

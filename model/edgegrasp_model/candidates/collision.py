@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
+from edgegrasp_camera.arrays import Bools, Float32, Int64
 from edgegrasp_model.candidates.edge_grasps import support_clearance
 from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
 from edgegrasp_model.kernels import (
@@ -17,7 +17,7 @@ from edgegrasp_model.kernels import (
 )
 from edgegrasp_model.options import Collision
 from edgegrasp_model.scene.cloud import UP, Cloud
-from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
+from edgegrasp_model.scene.obstacles import SolidBoxes, near_pairs, separation, signed_distance
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.segment import FIXED
 from edgegrasp_model.unseen import enters_unseen
@@ -61,11 +61,11 @@ def collides(
         lowest = np.minimum(lowest, height + lift * (UP @ normal))
         hit |= np.asarray(lowest < request.margin - SLACK)
     if scene.obstacles is not None:
-        solid = _hits_any(SolidBoxes.of_hands(T_cloud_hand, swept), scene.obstacles, None)
-        if lift > 0:
-            way = lift * UP.astype(np.float64)
-            solid |= _hits_any(SolidBoxes.of_hands(T_cloud_hand, boxes), scene.obstacles, way)
-        hit |= solid.reshape(len(hit), len(boxes)).any(axis=1)
+        for shapes, way in ((swept, 0.0), (boxes, lift)) if lift > 0 else ((swept, 0.0),):
+            solid = SolidBoxes.of_hands(T_cloud_hand, shapes)
+            for near, theirs in near_pairs(solid, scene.obstacles, way):
+                overlap = separation(solid.take(near), theirs, way * UP.astype(np.float64)) < 0
+                hit[near[overlap] // len(boxes)] = True
     if request.margin >= 0.0:
         free = np.flatnonzero(~hit)
         fixed = in_hands(scene.cloud.points[scene.object_of_point == FIXED], T_cloud_hand[free])
@@ -88,30 +88,10 @@ def clearances(scene: Scene, T_cloud_hand: Float32, opening: Float32, gripper: G
         above = support_clearance(T_cloud_hand, opening, scene.support, gripper)
         nearest = np.minimum(nearest, above)
     if scene.obstacles is not None:
-        solid = SolidBoxes.of_hands(T_cloud_hand, boxes)
-        for place in range(len(scene.obstacles)):
-            box = scene.obstacles.take(np.full(len(solid), place))
-            # A cheap lower bound leaves few boxes to measure exactly.
-            gap = np.linalg.norm(box.center - solid.center, axis=1) - solid.radius - box.radius
-            near = np.flatnonzero(gap < np.repeat(nearest, len(boxes)))
-            distance = np.full(len(solid), np.inf)
-            distance[near] = signed_distance(solid.take(near), box.take(near))
-            nearest = np.minimum(nearest, distance.reshape(len(nearest), len(boxes)).min(axis=1))
+        nearest, solid = nearest.astype(np.float64), SolidBoxes.of_hands(T_cloud_hand, boxes)
+        for near, theirs in near_pairs(solid, scene.obstacles, np.repeat(nearest, len(boxes))):
+            np.minimum.at(nearest, near // len(boxes), signed_distance(solid.take(near), theirs))
     return nearest.astype(np.float32)
-
-
-def _hits_any(boxes: SolidBoxes, obstacles: SolidBoxes, sweep: Float64 | None) -> Bools:
-    """Which boxes (M,), moved along `sweep` (3,), meet an obstacle."""
-    hit = np.zeros(len(boxes), dtype=bool)
-    way = np.zeros(3) if sweep is None else sweep
-    for center, half in zip(obstacles.center, obstacles.half, strict=True):
-        apart = np.linalg.norm(center - boxes.center - way / 2, axis=1)
-        bound = boxes.radius + np.linalg.norm(half) + np.linalg.norm(way) / 2
-        near = np.flatnonzero(~hit & (apart < bound))
-        theirs = SolidBoxes(np.tile(center, (len(near), 1)), np.tile(half, (len(near), 1, 1)))
-        moved = None if sweep is None else np.tile(sweep, (len(near), 1))
-        hit[near] = separation(boxes.take(near), theirs, moved) < 0
-    return hit
 
 
 class HandView(NamedTuple):

@@ -1,6 +1,6 @@
 """Solid boxes in any orientation: whether a moving hand hits them, and their distance."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Self
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_camera.arrays import Float32, Float64
+from edgegrasp_camera.arrays import Float32, Float64, Floats, Int64
 from edgegrasp_model.options import Box, OrientedBox
 from edgegrasp_model.scene.cloud import CanonicalFrame
 
@@ -25,9 +25,6 @@ class SolidBoxes:
 
     center: Float64  # (M, 3) metres
     half: Float64  # (M, 3, 3) rows: half extents times axes, metres
-
-    def __len__(self) -> int:
-        return len(self.center)
 
     @classmethod
     def from_shapes(cls, shapes: Sequence[Box | OrientedBox], frame: CanonicalFrame) -> Self:
@@ -77,16 +74,29 @@ def box_pose(box: Box | OrientedBox) -> tuple[Float64, Float64]:
     return pose, (high - low) / 2
 
 
+def near_pairs(
+    ours: SolidBoxes, theirs: SolidBoxes, within: Floats | float
+) -> Iterator[tuple[Int64, SolidBoxes]]:
+    """For each of theirs, rows of ours that it may be nearer to than `within` metres, and itself.
+
+    Judged by bounding spheres, which leaves few pairs to measure exactly.
+    """
+    for place, (center, radius) in enumerate(zip(theirs.center, theirs.radius, strict=True)):
+        apart = np.linalg.norm(ours.center - center, axis=1) - ours.radius - radius
+        near = np.flatnonzero(apart < within)
+        yield near, theirs.take(np.full(len(near), place))
+
+
 def separation(ours: SolidBoxes, theirs: SolidBoxes, sweep: Float64 | None = None) -> Float64:
     """Widest gap (M,) between boxes along any separating axis, row by row, metres.
 
     Negative: they overlap, by the distance they would have to move apart. Positive: a lower bound
-    of their distance. `sweep` (M, 3) is the motion over which ours are swept.
+    of their distance. `sweep` (3,) is the motion over which ours are swept.
     """
     edges = ours.half  # (M, 3 or 4, 3) generators: a swept box is a sum of four segments
     center = ours.center
-    if sweep is not None:
-        edges = np.concatenate([edges, sweep[:, None] / 2], axis=1)
+    if sweep is not None and sweep.any():
+        edges = np.concatenate([edges, np.broadcast_to(sweep / 2, (len(edges), 1, 3))], axis=1)
         center = center + sweep / 2
     own = [np.cross(edges[:, i], edges[:, j]) for i in range(edges.shape[1]) for j in range(i)]
     crossed = np.cross(edges[:, :, None], theirs.half[:, None])
