@@ -26,7 +26,7 @@ from pydantic import (
 
 from edgegrasp_model.errors import parse
 
-Pose = TypeVar("Pose", bound=tuple[Any, ...])
+Tuple = TypeVar("Tuple", bound=tuple[Any, ...])
 
 FARTHEST = 1e7  # metres from the origin, any way: beyond every place on Earth
 
@@ -55,7 +55,6 @@ Corner = Annotated[
     tuple[NearHand, NearHand, NearHand],
     Field(description="x, y, z in the hand frame, metres"),
 ]
-Boxes = tuple[tuple[Corner, Corner], ...]  # (min corner, max corner) each
 MAX_APPROACH_POINTS = 256
 MAX_CANDIDATES = 16_000
 MAX_VIEWS = 64
@@ -64,13 +63,13 @@ PURPOSES = ("approach", "candidates", "support")  # of random numbers
 CollisionMode = Literal["avoid", "penalise", "ignore"]
 
 
-def _of_length_one(value: tuple[float, ...]) -> tuple[float, ...]:
+def _of_length_one(value: Tuple) -> Tuple:
     if abs(float(np.linalg.norm(value)) - 1.0) > 1e-3:
         raise ValueError("must have length 1")
     return value
 
 
-def _not_zero(value: tuple[float, ...]) -> tuple[float, ...]:
+def _not_zero(value: Tuple) -> Tuple:
     if float(np.linalg.norm(value)) < 1e-6:
         raise ValueError("must not be the zero vector")
     return value
@@ -98,10 +97,10 @@ class Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-def ordered(low: tuple[float, ...], high: tuple[float, ...]) -> None:
-    """Raise ValueError unless every coordinate of `low` is below that of `high`."""
-    if not all(a < b for a, b in zip(low, high, strict=True)):
+def _ordered(corners: Tuple) -> Tuple:
+    if not all(low < high for low, high in zip(*corners, strict=True)):
         raise ValueError("every coordinate of min must be below that of max")
+    return corners
 
 
 class Workspace(Strict):
@@ -114,8 +113,8 @@ class Workspace(Strict):
     max: Vector = Field(description="upper corner, metres")
 
     @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        ordered(self.min, self.max)
+    def _min_below_max(self) -> Self:
+        _ordered((self.min, self.max))
         return self
 
 
@@ -313,13 +312,9 @@ class AutoPlane(Strict):
 class HandPart(Strict):
     """Boxes of the hand or of one finger, in the hand frame."""
 
-    boxes: Boxes = Field(min_length=1, max_length=16, description="[min corner, max corner] each")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        for low, high in self.boxes:
-            ordered(low, high)
-        return self
+    boxes: tuple[Annotated[tuple[Corner, Corner], AfterValidator(_ordered)], ...] = Field(
+        min_length=1, max_length=16, description="[min corner, max corner] each"
+    )
 
 
 class Linkage(Strict):
@@ -454,7 +449,7 @@ def _row_by_row(value: object) -> object:
     return [number for row in value for number in row] if nested else value  # type: ignore[attr-defined]
 
 
-def rigid(value: Pose) -> Pose:
+def rigid(value: Tuple) -> Tuple:
     """A pose T (4, 4), row by row; raises ValueError unless it is a rotation and a translation."""
     if not are_rigid(np.reshape(value, (1, 4, 4))).all():
         raise ValueError("must be a rotation and a translation, row-major, with last row 0 0 0 1")
@@ -470,7 +465,7 @@ def are_rigid(poses: NDArray[np.floating]) -> NDArray[np.bool_]:
     return np.asarray(last & (off <= 1e-3) & (np.linalg.det(turn) > 0))
 
 
-def _in_threes(value: tuple[float, ...]) -> tuple[float, ...]:
+def _in_threes(value: Tuple) -> Tuple:
     if len(value) % 3:
         raise ValueError("must be three numbers for each point")
     return value

@@ -136,6 +136,12 @@ def thinned(count: int, most: int = ENOUGH) -> slice:
     return slice(None, None, max(count // most, 1))
 
 
+def cells_of(points: Floats, side: float) -> Float64:
+    """A number (N,) for the cell, `side` metres wide, in which each point (N, D) lies."""
+    # Numbers are many times as fast to compare as rows.
+    return np.asarray(np.floor(points / side) @ 10.0 ** (5.0 * np.arange(points.shape[1])))
+
+
 def inside_workspace(points: Float32, box: Workspace | None, around: Floats | float = 0.0) -> Bools:
     """Which points (N, 3) lie in a box grown by `around` metres; all if there is no box."""
     if box is None:

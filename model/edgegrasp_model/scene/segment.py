@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.kernels import compiled
-from edgegrasp_model.scene.cloud import thinned, unit
+from edgegrasp_model.scene.cloud import cells_of, thinned, unit
 from edgegrasp_model.scene.network import NEAREST, SceneNet, range_image, scene_features
 
 WEIGHTS = Path(__file__).with_name("network.safetensors")
@@ -247,11 +247,7 @@ def joined(points: Float32, number: Int64, count: int) -> Int64:
     held = np.flatnonzero(number >= 0)
     if len(held) == 0:
         return np.arange(count)
-    cell = np.floor(points[held] / VIEW_CELL).astype(np.int64)
-    cell -= cell.min(axis=0)
-    size = cell.max(axis=0) + 1
-    key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
-    _, key = np.unique(key, return_inverse=True)
+    _, key = np.unique(cells_of(points[held], VIEW_CELL), return_inverse=True)
     shape = count, int(key.max()) + 1
     lies = coo_array((np.ones(len(held), dtype=np.int32), (number[held], key)), shape).tocsr()
     lies.data[:] = 1

@@ -15,6 +15,7 @@ from edgegrasp_model.scene.cloud import (
     MAX_DISTANCE,
     CanonicalFrame,
     CheckedCloud,
+    cells_of,
     inside_workspace,
     thinned,
 )
@@ -255,9 +256,9 @@ def _least_squares(points: Float64, toward: Float64) -> tuple[Float64, float]:
 
 def by_surface(points: Float32) -> Float64:
     """Weight of each point (N, 3), so that equal areas count alike."""
-    cell = np.floor(points / CELL).astype(np.int64)
-    _, which, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-    return np.asarray(1.0 / count[which.reshape(-1)])
+    cell = cells_of(points, CELL)
+    _, which, count = np.unique(cell, return_inverse=True, return_counts=True)
+    return np.asarray(1.0 / count[which])
 
 
 def fit_plane(
@@ -419,8 +420,7 @@ def _wide(points: Floats, plane: SupportPlane) -> bool:
 
 def _occupied(points: Float64, side: float) -> int:
     """How many cells with sides of so many metres hold points (N, D)."""
-    # One number for each cell is many times as fast as unique rows.
-    return len(np.unique(np.floor(points / side) @ 10.0 ** (5.0 * np.arange(points.shape[1]))))
+    return len(np.unique(cells_of(points, side)))
 
 
 def _middle(factors: Float64, scale: float, reach: float) -> float | None:
