@@ -174,7 +174,7 @@ def import_checkpoint(
 ) -> None:
     """Convert a checkpoint in the authors' layout to one safetensors file."""
     from edgegrasp_model.networks.checkpoint import save_checkpoint
-    from edgegrasp_model.networks.import_checkpoint import import_checkpoint as convert
+    from edgegrasp_training.import_checkpoint import import_checkpoint as convert
 
     network, metadata = convert(directory)
     path = output or Path(f"{metadata.name}.safetensors")

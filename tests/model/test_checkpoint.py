@@ -20,11 +20,12 @@ from edgegrasp_model.networks.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from edgegrasp_model.networks.config import EDGEGRASP, HAND, CheckpointMetadata
 from edgegrasp_model.networks.config import HAND_DESCRIPTION_SIZE as SIZE
-from edgegrasp_model.networks.import_checkpoint import import_checkpoint
+from edgegrasp_model.networks.config import CheckpointMetadata
+from edgegrasp_training.import_checkpoint import import_checkpoint
+from edgegrasp_training.recipes import RECIPES
 
-CONFIG = replace(HAND, crop_radius=0.04)
+CONFIG, EDGEGRASP = RECIPES["edgegrasp-plus"], RECIPES["edgegrasp"]
 METADATA = CheckpointMetadata(
     name="edgegrasp-plus",
     network=CONFIG,

@@ -12,14 +12,16 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_model.candidates.edge_grasps import crop_balls, edge_grasps
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network
-from edgegrasp_model.networks.config import EDGEGRASP_SMALL, HAND, NetworkConfig
+from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_model.scene.scene import Surroundings
+from edgegrasp_training.recipes import RECIPES
 
 from .scenes import PANDA, SEED, TINY
 
+SMALL, HAND = RECIPES["edgegrasp-small"], RECIPES["edgegrasp-plus"]
 architectures = pytest.mark.parametrize("architecture", ["edgegrasp", "vn-edgegrasp"])
 
 
@@ -116,8 +118,8 @@ def test_scores_depend_neither_on_point_order_nor_on_other_balls(architecture, s
 @pytest.mark.parametrize(
     "config",
     [
-        EDGEGRASP_SMALL,
-        replace(EDGEGRASP_SMALL, architecture="vn-edgegrasp", conv_widths=(32, 48, 64)),
+        SMALL,
+        replace(SMALL, architecture="vn-edgegrasp", conv_widths=(32, 48, 64)),
     ],
     ids=["edgegrasp", "vn-edgegrasp"],
 )

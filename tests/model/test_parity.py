@@ -8,7 +8,7 @@ import torch
 
 from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.networks.balls import BallBatch
-from edgegrasp_model.networks.import_checkpoint import import_checkpoint
+from edgegrasp_training.import_checkpoint import import_checkpoint
 
 RADIUS = 0.05  # of the reference
 scenes = pytest.mark.parametrize(

@@ -5,7 +5,6 @@ import pytest
 from benchmarks import ur5_objects
 
 from edgegrasp_model.detector import WEIGHTS_FOLDER
-from edgegrasp_model.networks.config import HAND
 from edgegrasp_sim.engine import ENGINES, choose_engine, installed, make_world
 from edgegrasp_sim.engine.urdf import parse_obj
 from edgegrasp_sim.objects import ObjectSet, SceneKind
@@ -13,6 +12,7 @@ from edgegrasp_sim.scene import load_object
 from edgegrasp_training.examples import tried_grasps
 from edgegrasp_training.generation import generate, missing_scenes
 from edgegrasp_training.options import GenerationOptions
+from edgegrasp_training.recipes import RECIPES
 from edgegrasp_training.shapes import NUM_DRAWN, drawn_shape, household_objects
 from edgegrasp_training.views import find_views, load_view
 
@@ -104,7 +104,7 @@ def test_random_hands_differ_between_scenes_and_are_what_the_network_is_told(tmp
     assert any(view.success.any() for view in views)
     for view in views:
         if len(view.tried()):
-            hand, seen = view.hand, tried_grasps(view, HAND).seen
+            hand, seen = view.hand, tried_grasps(view, RECIPES["edgegrasp-plus"]).seen
             measures = (hand.max_opening, hand.tip_z - hand.palm_z, hand.pad_half_width)
             assert seen.description[:, 71:74] == pytest.approx(
                 np.tile(measures, (len(seen.points), 1)), rel=1e-3

@@ -47,42 +47,6 @@ class NetworkConfig:
         return sum(self.conv_widths)
 
 
-# The paper's network (section IV-B and the authors' release): 3.05 M parameters.
-EDGEGRASP = NetworkConfig(
-    architecture="edgegrasp",
-    conv_widths=(32, 64, 128),
-    global_widths_1=(256, 512, 512),
-    global_widths_2=(1024, 1024),
-    classifier_widths=(512, 256, 128),
-)
-
-# Its rotation-invariant variant of Vector Neurons: 1.70 M parameters.
-VN_EDGEGRASP = NetworkConfig(
-    architecture="vn-edgegrasp",
-    conv_widths=(32, 64, 128),
-    global_widths_1=(128, 128, 128),
-    global_widths_2=(381, 381),
-    classifier_widths=(256, 128, 64),
-)
-
-# An eighth of the paper's network (0.39 M parameters), for machines without a GPU.
-EDGEGRASP_SMALL = NetworkConfig(
-    architecture="edgegrasp",
-    conv_widths=(32, 64, 128),
-    global_widths_1=(128, 128, 128),
-    global_widths_2=(256, 256),
-    classifier_widths=(256, 128),
-)
-
-# Scores each edge grasp in the frame of its own hand; 0.13 M parameters.
-HAND = NetworkConfig(
-    architecture="hand",
-    hand_widths=(32, 64, 128),
-    classifier_widths=(256, 128),
-    description_size=HAND_DESCRIPTION_SIZE,
-)
-
-
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class CheckpointMetadata:
     """Metadata of a checkpoint; saving and loading fill in and check digests, SHA-256 in hex."""

@@ -14,13 +14,9 @@ from torch import Tensor, nn
 
 from edgegrasp_model.errors import InvalidCheckpoint
 from edgegrasp_model.networks.checkpoint import build_network
-from edgegrasp_model.networks.config import (
-    EDGEGRASP,
-    VN_EDGEGRASP,
-    CheckpointMetadata,
-    NetworkConfig,
-)
+from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_model.networks.edgegrasp import GRASP_WIDTH
+from edgegrasp_training.recipes import RECIPES
 
 # Of the authors' evaluation, metres.
 VOXEL_SIZE, CROP_RADIUS, GRIPPER = 0.0045, 0.05, "panda"
@@ -77,7 +73,8 @@ def import_checkpoint(directory: Path) -> tuple[nn.Module, CheckpointMetadata]:
         )
     number = found[0].stem.rpartition("-")[2]
     is_vn = (directory / f"std-ckpt-{number}.pt").exists()
-    config = replace(VN_EDGEGRASP if is_vn else EDGEGRASP, crop_radius=CROP_RADIUS)
+    config = RECIPES["vn-edgegrasp" if is_vn else "edgegrasp"]
+    config = replace(config, crop_radius=CROP_RADIUS)
     theirs = {
         f"{part}.{name}": weight
         for part, stem in _FILES.items()
