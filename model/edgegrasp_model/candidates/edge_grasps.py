@@ -65,11 +65,7 @@ class BallCrop(NamedTuple):
 
     ball_rows: Int64  # (P,) rows of the cloud, ascending within each ball
     ball_of_point: Int64  # (P,) ascending, 0..A-1
-
-    def bounds(self, ball: Int64) -> tuple[Int64, Int64]:
-        """Places in `ball_rows` where the points of balls (M,) begin, and where they end."""
-        ends = np.searchsorted(self.ball_of_point, np.arange(ball.max(initial=-1) + 2))
-        return ends[ball], ends[ball + 1]
+    start: Int64  # (A + 1,) place in `ball_rows` where each ball begins, and the last one ends
 
 
 def crop_balls(
@@ -80,9 +76,9 @@ def crop_balls(
     """Crop a ball (paper: of radius G_w / 2) around each approach point; balls may overlap."""
     approach_index = np.asarray(approach_index, dtype=np.int64)
     members = cKDTree(points).query_ball_point(points[approach_index], radius, return_sorted=True)
-    ball_of_point = np.repeat(np.arange(len(members)), [len(rows) for rows in members])
+    start = np.cumsum([0, *map(len, members)])
     ball_rows = np.concatenate([np.empty(0), *members]).astype(np.int64)
-    return BallCrop(ball_rows, ball_of_point)
+    return BallCrop(ball_rows, np.repeat(np.arange(len(members)), np.diff(start)), start)
 
 
 @dataclass(frozen=True)
@@ -240,11 +236,11 @@ def centred_grasps(
     outward = np.einsum("ed,ed->e", points[candidates.contact_index] - origin, axes[:, :, 1])
     least = WIDE * gripper.max_opening / 2 - MAX_SHIFT  # from the hand's axis to a contact
     wide = np.flatnonzero(np.abs(outward) > least)
-    first, last = crop.bounds(crop.ball_of_point[candidates.pair[wide]])
+    ball = crop.ball_of_point[candidates.pair[wide]]
     half = gripper.pad_half_width + BESIDE_PADS
     pads = np.array([[-half, gripper.palm_z], [half, gripper.max_tip_z]], dtype=np.float32)
     hands = in_hands(points[crop.ball_rows], candidates.T_cloud_hand[wide])
-    low, high = extents_between(hands, first, last, pads).T
+    low, high = extents_between(hands, crop.start[ball], crop.start[ball + 1], pads).T
     middle, width = (low + high) / 2, high - low
     moved = (width > WIDE * gripper.max_opening) & (width < gripper.max_opening)
     moved &= (np.abs(middle) > MIN_SHIFT) & (np.abs(middle) < MAX_SHIFT)
@@ -333,7 +329,8 @@ def outline_grasps(
     edge = np.einsum("md,mkd->km", apart, frame[contact, 1:])
     between = (np.abs(edge[0]) < gripper.pad_half_width) & (edge[2] > -DROP)
     row = np.flatnonzero(between & (edge[1] > MIN_EDGE) & (edge[1] < gripper.max_opening))
-    first, last = crop.bounds(crop.ball_of_point[pair[row]])
+    ball = crop.ball_of_point[pair[row]]
+    first, last = crop.start[ball], crop.start[ball + 1]
     strip = np.array([gripper.pad_half_width, gripper.max_opening, DROP, GAP], dtype=np.float32)
     # How far the surface extends between the pads from each contact, outward and inward: (M, 2).
     extent = extents_across(points, crop.ball_rows, first, last, frame[contact[row]], strip)

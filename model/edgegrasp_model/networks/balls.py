@@ -54,10 +54,9 @@ class BallBatch:
     ) -> Self:
         """Pack a cloud and its balls; contacts are rows of the crop, as each belongs to a ball."""
         centred = points[crop.ball_rows] - points[approach_index][crop.ball_of_point]
-        bounds = np.searchsorted(crop.ball_of_point, np.arange(len(approach_index) + 1))
         # The nearest points of the same ball, the point itself first; it fills up small balls.
         neighbors = np.repeat(np.arange(len(centred))[:, None], k, axis=1)
-        for start, stop in pairwise(bounds.tolist()):
+        for start, stop in pairwise(crop.start.tolist()):
             ball = centred[start:stop]
             there = min(k, len(ball))
             nearest = cKDTree(ball).query(ball, k=range(1, there + 1))[1]
