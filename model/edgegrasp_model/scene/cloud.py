@@ -89,7 +89,9 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
             "no points" if size == 0 else "no finite points",
             "Send an image or points in metres.",
         )
-    low, high = _corners(points)
+    low, high = (np.array([end(axis) for axis in points.T]) for end in (np.min, np.max))
+    if not np.isfinite([low, high]).all():
+        raise _not_finite(points)
     if (high - low).max() > MAX_EXTENT:
         near = _near_points(points)
         said += (
@@ -97,7 +99,7 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
             f"{MAX_EXTENT / 2:g} m from the middle of the cloud.",
         )
         points, row = points[near], row[near]
-        low, high = _corners(points)
+        low, high = points.min(axis=0), points.max(axis=0)
     if (furthest := float(np.maximum(-low, high).max())) > MAX_DISTANCE:
         value = f"points {furthest:.4g} m from the origin, where float32 rounds away millimetres"
         fix = (
@@ -215,15 +217,11 @@ def _checked_points(points: object) -> Floats:
     return points
 
 
-def _corners(points: Floats) -> tuple[Floats, Floats]:
-    """The low and high corner (3,) of points (N, 3), if all are finite."""
-    low, high = (np.array([end(axis) for axis in points.T]) for end in (np.min, np.max))
-    if not np.isfinite([low, high]).all():
-        finite = np.isfinite(points).all(axis=1)
-        value = f"{int((~finite).sum())} points with NaN or infinity, the first in row "
-        fix = "Remove points without a finite x, y, z."
-        raise InvalidRequest("cloud", value + str(int(np.argmin(finite))), fix)
-    return low, high
+def _not_finite(points: Floats) -> InvalidRequest:
+    finite = np.isfinite(points).all(axis=1)
+    bad = f"the first in row {int(np.argmin(finite))}"
+    value = f"{int((~finite).sum())} points with NaN or infinity, {bad}"
+    return InvalidRequest("cloud", value, "Remove points without a finite x, y, z.")
 
 
 def _near_points(points: Floats) -> Int64:
