@@ -42,7 +42,6 @@ from edgegrasp_model.scene.scene import (
     Scene,
     SelectedPoints,
     build_scene,
-    object_probability,
     select_points,
 )
 from edgegrasp_model.tracking import (
@@ -227,8 +226,7 @@ class GraspDetector:
             elif sample is not None and len(logits) == 0:
                 prepared.warnings.append(NO_CANDIDATE)
             elif scene is not None and sample is not None:
-                rating = score * object_probability(scene, sample.candidates.contact_index)
-                score = self._rescaled(rating)
+                rating, score = self._scores(scene, sample.candidates.contact_index, score)
                 rows, outcome = select(scene, sample, score, rating, gripper, options, counts)
                 best, free = sample.candidates.take(rows), sample.collision_free[rows]
                 grasps = grasps_in_cloud(scene, best, gripper, score[rows], free)
@@ -318,8 +316,8 @@ class GraspDetector:
         candidates, gripper = given.candidates, prepared.gripper
         logits = self._logits(prepared, scene, candidates).astype(np.float64)
         with prepared.timed("network"):
-            found = object_probability(scene, candidates.contact_index)
-            score = self._rescaled(expit(logits / self.metadata.temperature) * found)
+            held = expit(logits / self.metadata.temperature)
+            _, score = self._scores(scene, candidates.contact_index, held)
             hands = candidates.T_cloud_hand, candidates.opening
             free = ~collides(scene, *hands, gripper, request)
             if given.T_cloud_hand is not None:
@@ -330,13 +328,18 @@ class GraspDetector:
             evaluations[number] = Evaluation(grasp, None)
         return evaluations
 
-    def _rescaled(self, score: Floats) -> Floats:
-        """Scores (E,) as outcomes of a robot rescaled them (Platt scaling), if there are any."""
+    def _scores(self, scene: Scene, contact: Int64, held: Floats) -> tuple[Floats, Floats]:
+        """Ratings and scores (E,), by the probability (E,) that each hand holds what is there.
+
+        Ratings count whether the object of the contact, rows (E,) of the cloud, is real; scores are
+        ratings as outcomes of a robot rescaled them (Platt scaling), if there are any.
+        """
+        number = scene.object_of_point[contact].tolist()
+        rating = held * np.array([scene.confidence.get(which, 1.0) for which in number])
         if (fitted := self.metadata.training.get("rescaled_by_outcomes")) is None:
-            return score
+            return rating, rating
         scale, shift = fitted
-        rescaled: Floats = expit(scale * logit(score) + shift)
-        return rescaled
+        return rating, expit(scale * logit(rating) + shift)
 
     def _logits(self, prepared: Prepared, scene: Scene, candidates: Candidates) -> Float32:
         """The network's logits (E,) of candidates: of all hands at once, or of some balls."""

@@ -318,7 +318,9 @@ def _plane_under_hands(plane: SupportPlane, frame: CanonicalFrame, spare: float)
     length = float(np.linalg.norm(normal))
     foot = frame.points(normal * (plane.offset / length**2))
     turned = frame.directions(normal) / length
-    return SupportPlane(normal=tuple(turned.tolist()), offset=float(foot @ turned) + spare)
+    return SupportPlane.model_construct(
+        normal=tuple(turned.tolist()), offset=float(foot @ turned) + spare
+    )
 
 
 def _projection(
@@ -395,12 +397,6 @@ def _up(options: DetectOptions, support: Support | None, shown: Segmentation | N
     if support is not None:
         return np.asarray(support.frame.T_canonical_cloud[2, :3])
     return np.array([0.0, 0.0, 1.0]) if shown is None else shown.up
-
-
-def object_probability(scene: Scene, points: Int64) -> Float64:
-    """Confidence of the objects of points (E,), rows of the cloud; 1 if given by the caller."""
-    number = scene.object_of_point[points].tolist()
-    return np.array([scene.confidence.get(which, 1.0) for which in number])
 
 
 def near_objects_along(plan: Float64, number: Int64) -> Bools:
