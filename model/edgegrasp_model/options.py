@@ -59,7 +59,7 @@ MAX_APPROACH_POINTS = 256
 MAX_CANDIDATES = 16_000
 MAX_VIEWS = 64
 MAX_PREVIOUS, MAX_SURFACE = 64, 128  # grasps or objects of an answer; points of an object
-PURPOSES = ("approach", "candidates", "support")  # of random numbers
+APPROACH_STREAM, CANDIDATE_STREAM, SUPPORT_STREAM = range(3)  # of random numbers, for a seed
 CollisionMode = Literal["avoid", "penalise", "ignore"]
 
 
@@ -751,12 +751,6 @@ class DetectOptions(Strict):
     debug: StrictBool = Field(
         default=False, description="whether to return the processed cloud and every candidate"
     )
-
-    def rng(self, purpose: Literal["approach", "candidates", "support"]) -> np.random.Generator:
-        """The random stream of a purpose, by the seed."""
-        return np.random.default_rng(
-            [self.seed, ("approach", "candidates", "support").index(purpose)]
-        )
 
     @property
     def known_up(self) -> NDArray[np.float64] | None:

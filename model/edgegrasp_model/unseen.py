@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import product
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -90,7 +91,7 @@ def leaves_image(
     places = np.stack(_palm_ways(gripper))  # (slices, S, 3)
     low, high = places.min(axis=(0, 1)), places.max(axis=(0, 1))
     P_image_hand = P_image_cloud @ T_cloud_hand.astype(np.float64)  # (E, 3, 4)
-    corners = _grid(*zip(low, high, strict=True))
+    corners = np.array(list(product(*zip(low, high, strict=True))))
     seen = P_image_hand[:, :, :3] @ corners.T + P_image_hand[:, :, 3:]  # (E, 3, 8)
     leaves: Bools = np.asarray((np.abs(seen[:, :2]) > seen[:, 2:]).any(axis=(1, 2)))
     # A hand whose box is within the image needs no closer look.

@@ -23,7 +23,12 @@ from edgegrasp_model.candidates.edge_grasps import (
 )
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import non_max_suppression
-from edgegrasp_model.options import ApproachDirection, DetectOptions
+from edgegrasp_model.options import (
+    APPROACH_STREAM,
+    CANDIDATE_STREAM,
+    ApproachDirection,
+    DetectOptions,
+)
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
@@ -77,7 +82,8 @@ class Sampler:
         """Share the approach points among the objects."""
         self.scene, self.options, self.gripper = scene, options, gripper
         self.crop_radius, self.counts, self.sees_hands = crop_radius, counts, sees_hands
-        self._rng_approach, self._rng = options.rng("approach"), options.rng("candidates")
+        self._rng_approach = np.random.default_rng([options.seed, APPROACH_STREAM])
+        self._rng = np.random.default_rng([options.seed, CANDIDATE_STREAM])
         self._rows = np.flatnonzero(scene.approach_allowed)
         self._objects, size = np.unique(scene.object_of_point[self._rows], return_counts=True)
         most = options.num_approach_points

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.kernels import compiled
-from edgegrasp_model.options import DetectOptions, RansacPlane, SupportPlane
+from edgegrasp_model.options import SUPPORT_STREAM, DetectOptions, RansacPlane, SupportPlane
 from edgegrasp_model.scene.cloud import (
     MAX_DISTANCE,
     CanonicalFrame,
@@ -126,7 +126,7 @@ def choose_support(
         whole = len(on) > CUT_OFF * len(seen.points) and _wide(part, request)
         found = measured(Seen(seen.points[some], seen.viewpoint), request, GIVEN_MARGIN, whole)
     else:
-        rng = options.rng("support")
+        rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
         if isinstance(request, RansacPlane):
             weight = by_surface(seen.points) * inside
             plane = fit_plane(seen, weight, rng, up, request.max_tilt)
@@ -200,7 +200,9 @@ def _assumed(
     if up is None:
         return None
     offset = float(np.percentile(seen.points.astype(np.float64) @ up, LOWEST)) - UNDER
-    return measured(seen, SupportPlane(normal=tuple(up.tolist()), offset=offset), 0.0, False)
+    return measured(
+        seen, SupportPlane.model_construct(normal=tuple(up.tolist()), offset=offset), 0.0, False
+    )
 
 
 def _up_of_cut(cloud: Float32, viewpoint: Float64) -> Float64 | None:
@@ -243,7 +245,7 @@ def _close_to(plane: SupportPlane, points: Float32) -> SupportPlane:
         if len(near) < FEWEST:
             break
         normal, offset = _least_squares(near, normal)
-    return SupportPlane(normal=tuple(normal.tolist()), offset=offset)
+    return SupportPlane.model_construct(normal=tuple(normal.tolist()), offset=offset)
 
 
 def _least_squares(points: Float64, toward: Float64) -> tuple[Float64, float]:
@@ -305,7 +307,7 @@ def fit_plane(
         normal, offset = _least_squares(points[near], normal)
     if up is not None and normal @ up < math.cos(max_tilt + 1e-9):
         return None
-    return SupportPlane(normal=tuple(normal.tolist()), offset=offset)
+    return SupportPlane.model_construct(normal=tuple(normal.tolist()), offset=offset)
 
 
 def measured(seen: Seen, plane: SupportPlane, least: float, whole: bool) -> Support:
