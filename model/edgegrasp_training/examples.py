@@ -4,6 +4,7 @@ Labels are the outcomes of grasps that were tried, and the scores of a teacher.
 """
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -206,6 +207,17 @@ def pack_balls(
     batch = replace(batch, points=batch.points / LENGTH_UNIT, depth=batch.depth / LENGTH_UNIT)
     label, weight = label[inside].astype(np.float32), weight[inside]
     return Packed(turned(batch, grasps.turn), torch.from_numpy(label), torch.from_numpy(weight))
+
+
+def joined(batches: Sequence[BallBatch | HandBatch]) -> BallBatch | HandBatch:
+    """Batches of one kind as one; scores come out in the same order."""
+    columns = {name: [vars(batch)[name] for batch in batches] for name in vars(batches[0])}
+    if balls := [batch for batch in batches if isinstance(batch, BallBatch)]:
+        points = np.cumsum([0, *(len(batch.points) for batch in balls)]).tolist()
+        first = np.cumsum([0, *(batch.num_balls for batch in balls)]).tolist()
+        for name, begins in (("neighbors", points), ("contact", points), ("ball_of_point", first)):
+            columns[name] = [rows + at for rows, at in zip(columns[name], begins, strict=False)]
+    return type(batches[0])(*map(torch.cat, columns.values()))
 
 
 def pack_hands(

@@ -25,6 +25,7 @@ from edgegrasp_training.examples import (
     Rotations,
     Teacher,
     TriedGrasps,
+    joined,
     pack_balls,
     pack_hands,
     random_turn,
@@ -228,8 +229,7 @@ class Trainer:
                 packed = packed._replace(batch=turned(packed.batch, turn))
             parts.append(packed)
         batches, labels, weights = zip(*parts, strict=True)
-        join: Any = type(batches[0]).concatenate
-        return Packed(join(batches), torch.cat(labels), torch.cat(weights))
+        return Packed(joined(batches), torch.cat(labels), torch.cat(weights))
 
     def _packed(
         self,

@@ -1,6 +1,5 @@
 """The batch that the ball networks score: the neighbourhoods of the approach points."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Self
@@ -69,23 +68,6 @@ class BallBatch:
             contact=torch.from_numpy(np.asarray(contact, dtype=np.int64)),
             approach=torch.from_numpy(np.ascontiguousarray(approach)),
             depth=torch.from_numpy(depth),
-        )
-
-    @staticmethod
-    def concatenate(batches: Sequence["BallBatch"]) -> "BallBatch":
-        """Join batches into one, as training does; scores come out in the same order."""
-        first_point = np.cumsum([0, *(len(batch.points) for batch in batches)]).tolist()
-        first_ball = np.cumsum([0, *(batch.num_balls for batch in batches)]).tolist()
-        points = list(zip(batches, first_point, strict=False))  # with the row at which each begins
-        balls = list(zip(batches, first_ball, strict=False))
-        return BallBatch(
-            points=torch.cat([batch.points for batch in batches]),
-            normals=torch.cat([batch.normals for batch in batches]),
-            neighbors=torch.cat([batch.neighbors + first for batch, first in points]),
-            ball_of_point=torch.cat([batch.ball_of_point + first for batch, first in balls]),
-            contact=torch.cat([batch.contact + first for batch, first in points]),
-            approach=torch.cat([batch.approach for batch in batches]),
-            depth=torch.cat([batch.depth for batch in batches]),
         )
 
     @classmethod

@@ -9,7 +9,6 @@ oriented to gravity and support, how much of the space around it the camera did 
 own measures, and the visible extent of the object around it.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
@@ -89,12 +88,6 @@ class HandBatch:
         box = np.array([low, high, (0.0, 0.0, gripper.tip_z)], dtype=np.float32)
         points = _around_fingers(view, around.cloud.normals, hands, side, box, num_points)
         return cls(*map(torch.from_numpy, (description, *points)))
-
-    @staticmethod
-    def concatenate(batches: Sequence["HandBatch"]) -> "HandBatch":
-        """Join batches into one, as training does; scores come out in the same order."""
-        parts = zip(*(vars(batch).values() for batch in batches), strict=True)
-        return HandBatch(*map(torch.cat, parts))
 
     @classmethod
     def made_up(cls, config: NetworkConfig) -> Self:
