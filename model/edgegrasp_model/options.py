@@ -47,6 +47,9 @@ Vector = Annotated[tuple[Finite, Finite, Finite], Field(description="x, y, z in 
 Row = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
 MAX_SHAPES = 64
 MAX_ROWS = 5_000_000
+ObjectNumbers = Annotated[tuple[Row, ...], Field(max_length=4096)]
+Name = Annotated[str, Field(max_length=100)]
+Share = Annotated[float, Field(ge=0.0, le=1.0), numeric]
 Length = Annotated[float, Field(gt=0.0, le=1000.0), numeric]
 HandLength = Annotated[float, Field(gt=0.0, le=1.0), numeric]  # metres
 SAME = 1e-6  # metres; lengths of a gripper that differ by less are the same
@@ -209,6 +212,7 @@ class Segments(Strict):
 
 Rows = Indices | Mask | Segments
 Shape = Annotated[Box | OrientedBox | Sphere | HalfSpace | Rows, Field(discriminator="kind")]
+Shapes = Annotated[tuple[Shape, ...], Field(max_length=MAX_SHAPES)]
 
 
 class Region(Strict):
@@ -218,12 +222,8 @@ class Region(Strict):
     contain a voxel if they contain at least half of its points.
     """
 
-    include: tuple[Shape, ...] = Field(
-        default=(), max_length=MAX_SHAPES, description="union of shapes; empty: everywhere"
-    )
-    exclude: tuple[Shape, ...] = Field(
-        default=(), max_length=MAX_SHAPES, description="union of shapes taken away"
-    )
+    include: Shapes = Field(default=(), description="union of shapes; empty: everywhere")
+    exclude: Shapes = Field(default=(), description="union of shapes taken away")
 
 
 class Cone(Strict):
@@ -327,7 +327,7 @@ class Linkage(Strict):
 class GripperGeometry(Strict):
     """A parallel-jaw gripper, as in a gripper file; z towards the object, y the closing axis."""
 
-    name: str = Field(default="custom", max_length=100, description="shown in results")
+    name: Name = Field(default="custom", description="shown in results")
     max_opening: HandLength = Field(description="metres between the open fingers' inner faces")
     tip_z: HandLength = Field(description="fingertips of the open gripper, metres along z")
     contact_z: HandLength = Field(
@@ -414,7 +414,7 @@ class Collision(Strict):
         le=0.1,
         description="metres by which the hand's boxes are grown on every side",
     )
-    opening: Annotated[float, Field(gt=0.0, le=1.0), numeric] | None = Field(
+    opening: HandLength | None = Field(
         default=None,
         description="metres between the fingers during the approach; null: the gripper's maximum",
     )
@@ -435,12 +435,8 @@ class Collision(Strict):
 class ObjectChoice(Strict):
     """Some of the objects that are found, by their numbers in an answer to the same cloud."""
 
-    include: tuple[Row, ...] = Field(
-        default=(), max_length=4096, description="numbers of objects; empty: all"
-    )
-    exclude: tuple[Row, ...] = Field(
-        default=(), max_length=4096, description="numbers of objects to leave out"
-    )
+    include: ObjectNumbers = Field(default=(), description="numbers of objects; empty: all")
+    exclude: ObjectNumbers = Field(default=(), description="numbers of objects to leave out")
 
 
 def _row_by_row(value: object) -> object:
@@ -504,7 +500,7 @@ class Place(Strict):
 class RobotArm(Strict):
     """The arm that executes the grasp; each grasp in the answer has its joints and motion."""
 
-    name: str = Field(max_length=100, description="one of the server's robots")
+    name: Name = Field(description="one of the server's robots")
     T_base_cloud: RigidPose = Field(
         description="pose of the cloud's frame in the arm's base frame: a 4 x 4 matrix, row by row"
     )
@@ -543,9 +539,7 @@ class PreviousObject(Strict):
         AfterValidator(_in_threes),
         BeforeValidator(_row_by_row, json_schema_input_type=Places),
     ] = Field(description="as in that answer: x, y, z of points on it, one after another, metres")
-    confidence: Annotated[float, Field(ge=0.0, le=1.0), numeric] | None = Field(
-        default=None, description="as in that answer"
-    )
+    confidence: Share | None = Field(default=None, description="as in that answer")
 
 
 class Previous(Strict):
@@ -554,9 +548,7 @@ class Previous(Strict):
     All of it is in the frame of the cloud that is sent now.
     """
 
-    gripper: str = Field(
-        default="", max_length=100, description="name of the gripper in that answer"
-    )
+    gripper: Name = Field(default="", description="name of the gripper in that answer")
     next_id: Row = Field(default=0, description="as in that answer")
     grasps: tuple[PreviousGrasp, ...] = Field(
         default=(), max_length=MAX_PREVIOUS, description="best first; the first is the one to keep"
@@ -727,9 +719,7 @@ class DetectOptions(Strict):
         default=None,
         description="arm that executes the grasp; grasps within its reach come first; null: no arm",
     )
-    min_score: Number = Field(
-        default=0.3, ge=0.0, le=1.0, description="lowest score returned; 0: all"
-    )
+    min_score: Share = Field(default=0.3, description="lowest score returned; 0: all")
     top_k: Integer = Field(
         default=50, ge=1, le=MAX_CANDIDATES, description="grasps returned at most"
     )
