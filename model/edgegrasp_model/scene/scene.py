@@ -148,10 +148,8 @@ def select_points(
     named = number if sent.segment_ids is not None or shown is None else shown.number
     support = choose_support(seen, inside, shown, named >= 0, options, warnings)
     up = _up(options, support, None if viewpoints is None else shown)
-    # Without a support, everything counts as above it.
-    height, margin = np.ones(len(inside), np.float32), np.zeros(len(inside), np.float32)
-    if support is not None:
-        height, margin = support.heights(seen)
+    above_all = np.ones(len(inside), np.float32), np.zeros(len(inside), np.float32)
+    height, margin = above_all if support is None else support.heights(seen)
     labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
     labels[sent.row[np.abs(height) <= margin]] = SUPPORT
     above = np.flatnonzero(height > margin)
@@ -175,8 +173,7 @@ def select_points(
             )
     number = np.where(inside | (number == FIXED), number, UNKNOWN)
     labels[sent.row] = np.where(number >= 0, number, OBSTACLE)
-    if options.debug:
-        labels = sent.of_all_pixels(labels)
+    labels = sent.of_all_pixels(labels) if options.debug else labels
     if options.at or options.near or isinstance(options.objects, ObjectChoice):
         number = chosen_objects(number, sent, options, warnings)
     kept = near_objects_along(plan, number)
