@@ -4,13 +4,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgegrasp_camera.arrays import Array, Float32, Floats, Int64
+from edgegrasp_camera.arrays import Array, Bools, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import HandView, hand_views
 from edgegrasp_model.candidates.edge_grasps import (
     MIN_EDGE,
     Candidates,
     edge_grasps,
-    measure_edges,
     retract,
 )
 from edgegrasp_model.errors import InvalidRequest
@@ -77,15 +76,13 @@ def from_edges(
     point = scene.point_of_row[edges]
     reason: list[NoGrasp | None] = [NoGrasp.NO_POINT] * len(edges)
     there = np.flatnonzero((point >= 0).all(axis=1))
-    pairs = point[there, 0], point[there, 1]
-    edge = measure_edges(scene.cloud, *pairs, gripper, crop_radius)
+    pairs, faults = (point[there, 0], point[there, 1]), dict[NoGrasp, Bools]()
+    candidates = edge_grasps(scene.cloud, *pairs, gripper, crop_radius, faults)
     for place, row in enumerate(there.tolist()):
-        reason[row] = next((fault for fault, found in edge.faults.items() if found[place]), None)
-    fit = there[[reason[row] is None for row in there]]
-    candidates = edge_grasps(scene.cloud, point[fit, 0], point[fit, 1], gripper)
+        reason[row] = next((fault for fault, found in faults.items() if found[place]), None)
     if scene.support is not None:
         candidates, _ = retract(candidates, scene.support, gripper, margin)
-    return Given(replace(candidates, pair=fit[candidates.pair]), reason)
+    return Given(replace(candidates, pair=there[candidates.pair]), reason)
 
 
 def from_hand_poses(

@@ -118,60 +118,45 @@ class Candidates:
 
 
 def edge_grasps(
-    cloud: Cloud, approach_index: Int64, contact_index: Int64, gripper: Gripper
+    cloud: Cloud,
+    approach_index: Int64,  # (M,) rows of the cloud
+    contact_index: Int64,  # (M,) rows of the cloud
+    gripper: Gripper,
+    reach: float = np.inf,  # metres from the approach point to the contact, at most
+    faults: dict[NoGrasp, Bools] | None = None,  # gets which pairs (M,) define none, by reason
 ) -> Candidates:
     """The pairs of approach and contact points that define an edge grasp which fits the gripper.
 
     r = p_c - p_a; its part r_perp orthogonal to n_c points from the hand to the object (paper
     section III-A): z = r_perp / d, y = n_c, x = y x z. The contact lies at the gripper's contact_z
-    and the approach point on the hand's axis. The pairs are rows (M,) of the cloud.
+    and the approach point on the hand's axis.
     """
-    edge = measure_edges(cloud, approach_index, contact_index, gripper)
-    pair = np.flatnonzero(~np.any(list(edge.faults.values()), axis=0))
-    approach_index, contact_index = approach_index[pair], contact_index[pair]
-    normal, depth = edge.normal[pair], edge.depth[pair]
-    opening = 2 * np.abs(edge.along[pair])
-    contact_z = gripper.contact_z_at(opening)
-    z = edge.ahead[pair] / depth[:, None]
-    y = normal - np.einsum("ed,ed->e", normal, z)[:, None] * z
-    y = y / np.linalg.norm(y, axis=1, keepdims=True)
-    pose = np.zeros((len(z), 4, 4), dtype=np.float32)
-    pose[:, :3, :3] = np.stack([np.cross(y, z), y, z], axis=2)
-    pose[:, :3, 3] = cloud.points[approach_index] + (depth - contact_z)[:, None] * z
-    pose[:, 3, 3] = 1.0
-    return Candidates(pair, approach_index, contact_index, depth, opening, pose)
-
-
-class EdgeMeasures(NamedTuple):
-    """Edges r = p_c - p_a, decomposed along the normal at the contact."""
-
-    normal: Float32  # (M, 3) unit n_c
-    along: Float32  # (M,) r . n_c, metres
-    ahead: Float32  # (M, 3) r_perp, the part of r orthogonal to n_c
-    depth: Float32  # (M,) |r_perp|, metres
-    faults: dict[NoGrasp, Bools]  # (M,) which define no edge grasp that fits the gripper
-
-
-def measure_edges(
-    cloud: Cloud,
-    approach_index: Int64,
-    contact_index: Int64,
-    gripper: Gripper,
-    reach: float = np.inf,  # metres from the approach point to the contact, at most
-) -> EdgeMeasures:
-    """Measure the edges of pairs (M,), (M,) of points, rows of the cloud."""
     normal = unit(cloud.normals[contact_index])
     edge = cloud.points[contact_index] - cloud.points[approach_index]  # (M, 3) r
     along = np.einsum("md,md->m", edge, normal)
-    ahead = edge - along[:, None] * normal
+    ahead = edge - along[:, None] * normal  # (M, 3) r_perp
     length, depth = np.linalg.norm(edge, axis=1), np.linalg.norm(ahead, axis=1)
-    faults = {
+    found = {
         NoGrasp.TOO_SHORT: length <= MIN_EDGE,
         NoGrasp.TOO_LONG: length >= min(gripper.max_opening / 2 - MARGIN, reach),
         NoGrasp.NO_DIRECTION: depth <= MIN_DEPTH,
         NoGrasp.TOO_DEEP: depth >= gripper.contact_z - gripper.palm_z,
     }
-    return EdgeMeasures(normal, along, ahead, depth, faults)
+    if faults is not None:
+        faults |= found
+    pair = np.flatnonzero(~np.any(list(found.values()), axis=0))
+    approach_index, contact_index = approach_index[pair], contact_index[pair]
+    normal, depth, opening = normal[pair], depth[pair], 2 * np.abs(along[pair])
+    z = ahead[pair] / depth[:, None]
+    y = normal - np.einsum("ed,ed->e", normal, z)[:, None] * z
+    y = y / np.linalg.norm(y, axis=1, keepdims=True)
+    pose = np.zeros((len(z), 4, 4), dtype=np.float32)
+    pose[:, :3, :3] = np.stack([np.cross(y, z), y, z], axis=2)
+    pose[:, :3, 3] = (
+        cloud.points[approach_index] + (depth - gripper.contact_z_at(opening))[:, None] * z
+    )
+    pose[:, 3, 3] = 1.0
+    return Candidates(pair, approach_index, contact_index, depth, opening, pose)
 
 
 def retract(
