@@ -28,6 +28,7 @@ MIN_HORIZONTAL = 1e-3  # metres; a shorter horizontal offset has no direction
 ENOUGH = 6000  # points that stand for a whole cloud where a fit, a mean or a view is asked for
 LARGE = 704, 960  # pixels of an image of which every second row and column may be enough
 FINE = 0.00125  # metres between its neighbouring pixels, at most, if they are
+STRAY = 0.5  # percent of the points that may lie beyond the end of a range
 
 Vectors = TypeVar("Vectors", bound=Floats)
 

@@ -17,9 +17,8 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.kernels import compiled
-from edgegrasp_model.scene.cloud import WIDEST_VIEW, thinned, unit
+from edgegrasp_model.scene.cloud import LARGE, STRAY, WIDEST_VIEW, thinned, unit
 
-PIXELS = 352 * 480  # of the input, about
 MULTIPLE = 32  # its sides are multiples of
 CLASSES = ("other", "support", "object")
 CHANNELS = 12  # of `scene_features`
@@ -28,7 +27,6 @@ STRIDE = 2  # pixels of the input between neighbours whose difference gives the 
 VOTE_UNIT = 0.05  # metres
 # Of range images:
 NEAREST = 0.05  # metres from the viewpoint
-COVERED = 0.5  # percent of the points that may lie beyond each side of the image
 COARSE = 40  # cells across the view in which the density of points is measured
 SPACING = 1.25  # side of a pixel, in distances of sparser points, so that few stay empty
 FILLED = 1.6  # pixels between neighbouring points up to which holes are filled from around them
@@ -196,7 +194,8 @@ def range_image(
         turn = _camera_axes(np.array([*(low + high) / 2, 1.0]) @ turn, downward)
     in_view = apart @ turn.T
     low, high = _view(in_view)
-    finest = float(np.sqrt((high - low).prod() / PIXELS))
+    # As many pixels as a large image has with half of its rows and columns.
+    finest = float(np.sqrt(4 * (high - low).prod() / np.prod(LARGE)))
     # Distance at a depth of one metre between neighbours, from the area that points cover.
     ahead, cell = in_view[in_view[:, 2] > NEAREST], max(float((high - low).max()) / COARSE, 1e-6)
     place = ((ahead[:, :2] / ahead[:, 2:] - low) / cell).astype(np.int64)
@@ -237,7 +236,7 @@ def _view(points: Float64) -> tuple[Float64, Float64]:
     ahead = points[points[:, 2] > NEAREST]
     if len(ahead) == 0:
         return np.full(2, -0.1), np.full(2, 0.1)
-    low, high = np.percentile(ahead[:, :2] / ahead[:, 2:], (COVERED, 100 - COVERED), axis=0)
+    low, high = np.percentile(ahead[:, :2] / ahead[:, 2:], (STRAY, 100 - STRAY), axis=0)
     edge = 0.02 * (high - low) + 1e-3
     low, high = np.maximum(low - edge, -WIDEST_VIEW), np.minimum(high + edge, WIDEST_VIEW)
     return low.round(9), high.round(9)

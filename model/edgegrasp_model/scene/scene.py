@@ -62,7 +62,6 @@ SIDE_DEPTH = 0.006  # metres from a side of the workspace within which an object
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 REACH = 0.25  # metres around an object in which a hand at it may collide
 FOLLOWED_REACH = 0.16  # the same if only known grasps are checked
-PLAN_CELL = 0.05  # metres
 CLOSE = 0.06  # metres; no camera measures closer
 SPARE = 0.0015  # metres that hands stay above a support plane that was found, not given
 CUT_OUT = 0.95  # confidence of clusters where a cloud was cut off above its support
@@ -400,11 +399,11 @@ def near_objects_along(plan: Float64, number: Int64) -> Bools:
     """Which points (M,), at (M, 2) along the support, a hand at any object could reach."""
     if not (number >= 0).any():
         return np.zeros(len(plan), dtype=bool)
-    x, y = (((axis - axis.min()) / PLAN_CELL).astype(np.int64) for axis in plan.T)
+    x, y = (((axis - axis.min()) / (REACH / 5)).astype(np.int64) for axis in plan.T)
     held = np.zeros((x.max() + 1, y.max() + 1), dtype=bool)
     held[x[number >= 0], y[number >= 0]] = True
     square = np.ones((3, 3), dtype=bool)
-    near = ndimage.binary_dilation(held, square, iterations=math.ceil(REACH / PLAN_CELL))
+    near = ndimage.binary_dilation(held, square, iterations=5)
     return np.asarray(near[x, y])
 
 

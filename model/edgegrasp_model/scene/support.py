@@ -13,6 +13,7 @@ from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import SUPPORT_STREAM, DetectOptions, RansacPlane, SupportPlane
 from edgegrasp_model.scene.cloud import (
     MAX_DISTANCE,
+    STRAY,
     CanonicalFrame,
     CheckedCloud,
     cells_of,
@@ -37,7 +38,7 @@ ALL_OBJECTS = 0.8  # share of points of objects above which nothing else is left
 LOOKS_DOWN = 0.17  # least sine of the angle at which a camera looks down on a cloud that was cut
 TOUCHED, CANDIDATES = 0.006, 40  # metres from a plane that touches a cloud; such planes compared
 UPRIGHT = 0.9  # how much more a plane counts that is level in an upright image
-LOWEST, UNDER = 0.5, 0.003  # percent and metres: an assumed support lies so far under the points
+UNDER = 0.003  # metres that an assumed support lies under the lowest points
 LEAST_AREA = 0.008  # square metres of a support that are seen; the top of an object is smaller
 USUAL_DISTANCE = 0.7  # metres to a camera that is not known
 BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
@@ -199,7 +200,7 @@ def _assumed(
         up = _up_of_cut(seen.points[objects], seen.viewpoint)
     if up is None:
         return None
-    offset = float(np.percentile(seen.points.astype(np.float64) @ up, LOWEST)) - UNDER
+    offset = float(np.percentile(seen.points.astype(np.float64) @ up, STRAY)) - UNDER
     return measured(
         seen, SupportPlane.model_construct(normal=tuple(up.tolist()), offset=offset), 0.0, False
     )
