@@ -13,10 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from edgegrasp_model.errors import InvalidCheckpoint
-from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_model.networks.edgegrasp import GRASP_WIDTH
-from edgegrasp_training.recipes import RECIPES
+from edgegrasp_training.recipes import RECIPES, build_network
 
 # Of the authors' evaluation, metres.
 VOXEL_SIZE, CROP_RADIUS, GRIPPER = 0.0045, 0.05, "panda"

@@ -5,12 +5,14 @@ from copy import deepcopy
 import torch
 from torch import Tensor, nn
 
+from edgegrasp_model.networks.checkpoint import NETWORKS
 from edgegrasp_model.networks.config import (
     HAND_DESCRIPTION_SIZE,
     CheckpointMetadata,
     NetworkConfig,
 )
 from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
+from edgegrasp_model.networks.hand import HandNet
 from edgegrasp_model.networks.vn_edgegrasp import VNEdgeGraspNet
 
 CROP_RADIUS = 0.04  # metres; half the gripper's opening, as in the paper
@@ -18,6 +20,7 @@ VOXEL_SIZE = 0.0045  # metres; that of the training views
 # Metres. In metres the positions in a ball are far smaller than its normals, and learned late. A
 # power of two, so that converting weights back to metres is exact.
 LENGTH_UNIT = 1 / 64
+CONSTANT = 1e-6  # standard deviation below which a number of the description counts as constant
 GAIN = 3**0.5  # with PyTorch's initial weights a dozen layers would shrink signals to nothing
 RECIPES = {
     # The paper's network (section IV-B and the authors' release): 3.05 M parameters.
@@ -65,6 +68,22 @@ def recipe(name: str) -> CheckpointMetadata:
     return CheckpointMetadata(name, RECIPES[name], VOXEL_SIZE, gripper="panda")
 
 
+def build_network(config: NetworkConfig, generator: torch.Generator | None = None) -> nn.Module:
+    """Build a network with random weights, from the generator or from seed 0."""
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    # Layers initialise themselves from the global random stream, which is restored here.
+    with torch.random.fork_rng(devices=[]):
+        network = NETWORKS[config.architecture](config)
+    for module in network.modules():
+        if isinstance(module, nn.Linear):
+            # PyTorch's default, U(-1, 1) / sqrt(inputs), drawn from the given generator.
+            bound = module.in_features**-0.5
+            nn.init.uniform_(module.weight, -bound, bound, generator=generator)
+            if module.bias is not None:
+                nn.init.uniform_(module.bias, -bound, bound, generator=generator)
+    return network
+
+
 def prepare_to_train(network: nn.Module) -> None:
     """Scale the random weights of a network of balls so that signals keep their size."""
     if isinstance(network, EdgeGraspNet | VNEdgeGraspNet):
@@ -72,6 +91,15 @@ def prepare_to_train(network: nn.Module) -> None:
             for module in network.modules():
                 if isinstance(module, nn.Linear):
                     module.weight.mul_(GAIN)
+
+
+def set_statistics(network: HandNet, mean: Tensor, std: Tensor) -> None:
+    """Store mean (F,) and standard deviation (F,) of the training data's descriptions."""
+    size = network.config.description_size
+    network.mean.copy_(mean[:size])
+    # A number that never varied in training, such as the only hand's opening, must have little
+    # weight.
+    network.std.copy_(torch.where(std < CONSTANT, 1.0, std.clamp_min(1e-3))[:size])
 
 
 def start_from(network: nn.Module, start: nn.Module) -> None:

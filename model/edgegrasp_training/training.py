@@ -16,7 +16,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import nn
 
 from edgegrasp_model.networks.balls import BallBatch
-from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgegrasp_model.networks.checkpoint import load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandNet
 from edgegrasp_training.evaluation import Evaluation, evaluate_scores, write_model_card
@@ -33,7 +33,14 @@ from edgegrasp_training.examples import (
     turned,
 )
 from edgegrasp_training.options import TrainingOptions
-from edgegrasp_training.recipes import LENGTH_UNIT, prepare_to_train, rescaled, start_from
+from edgegrasp_training.recipes import (
+    LENGTH_UNIT,
+    build_network,
+    prepare_to_train,
+    rescaled,
+    set_statistics,
+    start_from,
+)
 from edgegrasp_training.views import different, load_view
 
 VIEWS_IN_MEMORY = 8000
@@ -257,7 +264,7 @@ class Trainer:
         seen = [self._tried(path, True).seen for path in self.train_paths]
         values = np.concatenate([hands.description.numpy() for hands in seen if hands is not None])
         mean, std = values.mean(axis=0, dtype=np.float64), values.std(axis=0, dtype=np.float64)
-        network.set_statistics(torch.from_numpy(mean), torch.from_numpy(std))
+        set_statistics(network, torch.from_numpy(mean), torch.from_numpy(std))
         self.average.load_state_dict(network.state_dict())
 
     def _save_average(self, metadata: CheckpointMetadata) -> None:

@@ -7,10 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_model.scene.cloud import UP, CanonicalFrame, Cloud
 from edgegrasp_model.scene.scene import Scene
+from edgegrasp_training.recipes import build_network
 
 SEED = 2**32 - 1  # the greatest
 PANDA = load_gripper("panda")

@@ -15,7 +15,6 @@ from safetensors.torch import load, load_file, save_file
 
 from edgegrasp_model.errors import InvalidCheckpoint
 from edgegrasp_model.networks.checkpoint import (
-    build_network,
     check_reference_logits,
     load_checkpoint,
     save_checkpoint,
@@ -23,7 +22,7 @@ from edgegrasp_model.networks.checkpoint import (
 from edgegrasp_model.networks.config import HAND_DESCRIPTION_SIZE as SIZE
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_training.import_checkpoint import import_checkpoint
-from edgegrasp_training.recipes import RECIPES
+from edgegrasp_training.recipes import RECIPES, build_network, set_statistics
 
 CONFIG, EDGEGRASP = RECIPES["edgegrasp-plus"], RECIPES["edgegrasp"]
 METADATA = CheckpointMetadata(
@@ -51,7 +50,7 @@ class Trap:
 def network() -> torch.nn.Module:
     """A hand network with statistics."""
     network = build_network(CONFIG, torch.Generator().manual_seed(7))
-    network.set_statistics(torch.linspace(-1, 1, SIZE), torch.linspace(1, 2, SIZE))
+    set_statistics(network, torch.linspace(-1, 1, SIZE), torch.linspace(1, 2, SIZE))
     return network
 
 

@@ -13,7 +13,7 @@ from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue, choose_device
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, UnknownModel
 from edgegrasp_model.kernels import mean_of_alike
-from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
+from edgegrasp_model.networks.checkpoint import save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, parse_options
 from edgegrasp_model.ranking import surrounded_first
@@ -21,6 +21,7 @@ from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene import network
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Detection, Grasp
+from edgegrasp_training.recipes import build_network
 
 from .rendered import FOCAL_LENGTH, HEIGHT, SCENE, WIDTH, box, boxes_on_table, camera, render, table
 from .scenes import PANDA, TINY, box_on_table, detector, scene_of

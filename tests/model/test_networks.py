@@ -11,13 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.candidates.edge_grasps import crop_balls, edge_grasps
 from edgegrasp_model.networks.balls import BallBatch
-from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_model.scene.scene import Surroundings
-from edgegrasp_training.recipes import RECIPES
+from edgegrasp_training.recipes import RECIPES, build_network
 
 from .scenes import PANDA, SEED, TINY
 

@@ -10,13 +10,13 @@ from scipy.special import expit, logit
 from tests.model.scenes import VIEW, box_on_table
 
 from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector
-from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgegrasp_model.networks.checkpoint import load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_training.evaluation import fit, read_outcomes, recalibrate
 from edgegrasp_training.examples import GRASPS_PER_BALL, Teacher
 from edgegrasp_training.options import TrainingOptions
-from edgegrasp_training.recipes import RECIPES
+from edgegrasp_training.recipes import RECIPES, build_network
 from edgegrasp_training.training import Trainer
 from edgegrasp_training.views import find_views, split_by_scene
 

@@ -9,14 +9,14 @@ import torch
 from scipy.special import expit
 
 from edgegrasp_model.gripper import gripper_fields, load_gripper
-from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
+from edgegrasp_model.networks.checkpoint import save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.scene.scene import Surroundings, near_workspace_side
 from edgegrasp_sim.objects import CLUTTER, ObjectSet
 from edgegrasp_training.evaluation import evaluate_scores, reliability, score_views
 from edgegrasp_training.examples import pack_balls, pack_hands, tried_grasps
-from edgegrasp_training.recipes import LENGTH_UNIT
+from edgegrasp_training.recipes import LENGTH_UNIT, build_network
 from edgegrasp_training.views import (
     TABLE,
     UP,

@@ -60,8 +60,9 @@ def load_checkpoint(
         metadata = CheckpointMetadata(**values)
         if metadata.tensors_digest not in ("", _digest(tensors)):
             raise ValueError("the weights are not those it was written with")
-        network = build_network(metadata.network)
-        network.load_state_dict(tensors)
+        with torch.device("meta"):
+            network = NETWORKS[metadata.network.architecture](metadata.network)
+        network.load_state_dict(tensors, assign=True)
     except (OSError, SafetensorError, LookupError, TypeError, ValueError, RuntimeError) as error:
         raise InvalidCheckpoint(
             f"checkpoint: got {path}, of which weights or edgegrasp metadata are unusable "
@@ -103,19 +104,3 @@ def _digest(tensors: Mapping[str, Tensor]) -> str:
         digest.update(name.encode())
         digest.update(tensors[name].numpy().tobytes())
     return digest.hexdigest()
-
-
-def build_network(config: NetworkConfig, generator: torch.Generator | None = None) -> nn.Module:
-    """Build a network with random weights, from the generator or from seed 0."""
-    generator = torch.Generator().manual_seed(0) if generator is None else generator
-    # Layers initialise themselves from the global random stream, which is restored here.
-    with torch.random.fork_rng(devices=[]):
-        network = NETWORKS[config.architecture](config)
-    for module in network.modules():
-        if isinstance(module, nn.Linear):
-            # PyTorch's default, U(-1, 1) / sqrt(inputs), drawn from the given generator.
-            bound = module.in_features**-0.5
-            nn.init.uniform_(module.weight, -bound, bound, generator=generator)
-            if module.bias is not None:
-                nn.init.uniform_(module.bias, -bound, bound, generator=generator)
-    return network

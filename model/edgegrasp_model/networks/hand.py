@@ -39,7 +39,6 @@ from edgegrasp_model.unseen import unseen_space, visible_extents
 # The network
 POINT_UNIT = 0.05  # metres; scale of the positions around the fingers
 DROPOUT = 0.1  # dropout of the classifier's inputs
-CONSTANT = 1e-6  # standard deviation below which a number of the description counts as constant
 CHUNK = 64  # hands at a time, so that the work stays in cache
 
 # The description
@@ -121,14 +120,6 @@ class HandNet(nn.Module):
         self.point_encoder = mlp((6, *config.hand_widths))
         inputs = config.description_size + 2 * config.hand_widths[-1]
         self.classifier = mlp((inputs, *config.classifier_widths, 1))
-
-    def set_statistics(self, mean: Tensor, std: Tensor) -> None:
-        """Stores mean (F,) and standard deviation (F,) of the training data's descriptions."""
-        size = self.config.description_size
-        self.mean.copy_(mean[:size])
-        # A number that never varied in training, such as the only hand's opening, must have little
-        # weight.
-        self.std.copy_(torch.where(std < CONSTANT, 1.0, std.clamp_min(1e-3))[:size])
 
     def forward(self, batch: HandBatch, left_out: torch.Generator | None = None) -> Tensor:
         """Logits (E,) of success; in training `left_out` draws what dropout removes."""
