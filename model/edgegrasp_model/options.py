@@ -60,6 +60,8 @@ Corner = Annotated[
 ]
 MAX_APPROACH_POINTS = 256
 MAX_CANDIDATES = 16_000
+ApproachPoints = Annotated[int, Field(ge=1, le=MAX_APPROACH_POINTS), numeric]
+Candidates = Annotated[int, Field(ge=1, le=MAX_CANDIDATES), numeric]
 MAX_VIEWS = 64
 MAX_PREVIOUS, MAX_SURFACE = 64, 128  # grasps or objects of an answer; points of an object
 APPROACH_STREAM, CANDIDATE_STREAM, SUPPORT_STREAM = range(3)  # of random numbers, for a seed
@@ -629,16 +631,11 @@ class DetectOptions(Strict):
         default=None,
         description="gripper, by name or geometry; null: the one the weights were trained for",
     )
-    num_approach_points: Annotated[int, Field(ge=1, le=MAX_APPROACH_POINTS), numeric] | None = (
-        Field(
-            default=None,
-            description="approach points sampled, spread over the objects; null: as many as they "
-            "need",
-        )
+    num_approach_points: ApproachPoints | None = Field(
+        default=None,
+        description="approach points sampled, spread over the objects; null: as many as they need",
     )
-    num_candidates: Integer = Field(
-        default=2000, ge=1, le=MAX_CANDIDATES, description="candidates scored at most"
-    )
+    num_candidates: Candidates = Field(default=2000, description="candidates scored at most")
     sampling: Literal["farthest", "uniform"] = Field(
         default="farthest", description="how approach points are sampled"
     )
@@ -720,9 +717,7 @@ class DetectOptions(Strict):
         description="arm that executes the grasp; grasps within its reach come first; null: no arm",
     )
     min_score: Share = Field(default=0.3, description="lowest score returned; 0: all")
-    top_k: Integer = Field(
-        default=50, ge=1, le=MAX_CANDIDATES, description="grasps returned at most"
-    )
+    top_k: Candidates = Field(default=50, description="grasps returned at most")
     suppression: Suppression | None = Field(
         default=Suppression(), description="non-maximum suppression; null: none"
     )
