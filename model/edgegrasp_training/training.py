@@ -151,7 +151,7 @@ class Trainer:
     def finish(self, provenance: dict[str, Any], command: str) -> Evaluation:
         """Calibrate the best network on all validation views; write it and its card."""
         path = self.folder / f"{self.metadata.name}.safetensors"
-        best, saved = load_checkpoint(path, self.device)
+        best, saved = load_checkpoint(path)
         self.average.load_state_dict(rescaled(best, LENGTH_UNIT).state_dict())
         # Mixed once with where it started (Wortsman et al., CVPR 2022).
         if self.start is not None and not saved.training:

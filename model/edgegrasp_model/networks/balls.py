@@ -60,15 +60,9 @@ class BallBatch:
             there = min(k, len(ball))
             nearest = cKDTree(ball).query(ball, k=range(1, there + 1))[1]
             neighbors[start:stop, :there] = start + nearest
-        return cls(
-            points=torch.from_numpy(centred),
-            normals=torch.from_numpy(normals[crop.ball_rows]),
-            neighbors=torch.from_numpy(neighbors),
-            ball_of_point=torch.from_numpy(crop.ball_of_point),
-            contact=torch.from_numpy(np.asarray(contact, dtype=np.int64)),
-            approach=torch.from_numpy(np.ascontiguousarray(approach)),
-            depth=torch.from_numpy(depth),
-        )
+        edges = np.asarray(contact, dtype=np.int64), np.ascontiguousarray(approach), depth
+        arrays = centred, normals[crop.ball_rows], neighbors, crop.ball_of_point, *edges
+        return cls(*map(torch.from_numpy, arrays))
 
     @classmethod
     def made_up(cls, config: NetworkConfig) -> Self:

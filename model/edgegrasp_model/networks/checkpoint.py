@@ -47,9 +47,7 @@ def save_checkpoint(path: Path, network: nn.Module, metadata: CheckpointMetadata
     partial.replace(path)
 
 
-def load_checkpoint(
-    path: Path, device: torch.device | str = "cpu"
-) -> tuple[nn.Module, CheckpointMetadata]:
+def load_checkpoint(path: Path) -> tuple[nn.Module, CheckpointMetadata]:
     """Load a checkpoint under its file's name, in evaluation mode; raises InvalidCheckpoint."""
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
@@ -70,7 +68,7 @@ def load_checkpoint(
             "or `edgegrasp import-checkpoint`."
         ) from error
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    return network.to(device).eval(), replace(metadata, digest=digest, name=path.stem)
+    return network.eval(), replace(metadata, digest=digest, name=path.stem)
 
 
 def check_reference_logits(network: nn.Module, metadata: CheckpointMetadata) -> None:
