@@ -1,12 +1,16 @@
-"""Objects for the protocols `ur5-hard` and `ur5-adversarial`, since the paper's cannot be had.
+"""Hard and adversarial objects, for `ur5-hard` and `ur5-adversarial` and for piles.
+
+The paper's objects cannot be had.
 
     python benchmarks/ur5_objects.py FOLDER
     edgegrasp benchmark --robot ur5 --protocol ur5-hard --objects FOLDER/hard
     edgegrasp benchmark --robot ur5 --protocol ur5-adversarial --objects FOLDER/adversarial
+    edgegrasp benchmark --scene pile --objects FOLDER/shapes
 
-Hard: twenty household objects, each convex part its own contact. Adversarial: meshes of eight
-kinds (bodies stuck together, rings, spindles, stars, pots, bows), made as those of the training
-data; which the benchmark scales to the hand and decomposes. No weights were trained on these.
+Hard: twenty household objects, each convex part its own contact. Adversarial: eight meshes, bodies
+stuck together, rings, bottles, plates, pots and bows, made as those of the training data; the
+benchmark scales them to the hand and decomposes them. Shapes: forty more of them. No weights were
+trained on these.
 """
 
 import sys
@@ -16,15 +20,15 @@ import numpy as np
 
 from edgegrasp_training.shapes import free_shape, household_objects
 
-SEED, HARD, ADVERSARIAL = 2211, 20, 8
+SEED, HARD, ADVERSARIAL, SHAPES = 2211, 20, 8, 40
 
 
 def write(folder: Path) -> None:
-    """Write both sets, always the same."""
+    """Write the three sets, always the same."""
     household_objects(folder / "hard", HARD, np.random.default_rng(SEED))
-    meshes = folder / "adversarial"
-    meshes.mkdir(parents=True)
-    for index in range(ADVERSARIAL):
+    for index in range(ADVERSARIAL + SHAPES):
+        meshes = folder / ("adversarial" if index < ADVERSARIAL else "shapes")
+        meshes.mkdir(parents=True, exist_ok=True)
         shape = free_shape(np.random.default_rng([SEED, index]), index)
         (meshes / f"shape-{index}.obj").write_text(shape)
 
