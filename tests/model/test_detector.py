@@ -83,6 +83,16 @@ def test_several_depth_images_show_each_object_once() -> None:
     assert found.grasps
 
 
+def test_normals_that_contradict_each_other_are_estimated() -> None:
+    sheet = np.random.default_rng(0).uniform(-0.1, 0.1, (3000, 3)).astype(np.float32)
+    sheet[:, 2] = 0.3
+    normals = np.repeat([(1.0, 0.0, 0.0), (-1.0, 1e-3, 0.0)], 3000, axis=0)
+    asked = {"support": None, "objects": "off", "debug": True}
+    found = detect(CloudInput(np.concatenate([sheet, sheet]), normals), **asked)
+    assert found.debug is not None
+    assert (found.debug.normals[:, 2] > 0.99).all()
+
+
 def test_each_camera_orients_the_normals_of_what_it_saw() -> None:
     sheets = np.random.default_rng(0).uniform(-0.1, 0.1, (6000, 3)).astype(np.float32)
     sheets[:, 2] = np.repeat([0.3, 0.2], 3000)

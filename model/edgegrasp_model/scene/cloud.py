@@ -24,7 +24,7 @@ UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 CUBE = 8  # voxels along the edge of a cube; points are stored cube by cube
 WIDEST_VIEW = 1.2  # tangent of half the angle that a depth camera sees
 MAX_UPWARD = 0.5  # sine of the angle from the level at which a camera looks up
-MIN_HORIZONTAL = 1e-3  # metres; a shorter horizontal offset has no direction
+SHORTEST = 1e-3  # a shorter horizontal offset (metres) or mean normal has no direction
 ENOUGH = 6000  # points that stand for a whole cloud where a fit, a mean or a view is asked for
 LARGE = 704, 960  # pixels of an image of which every second row and column may be enough
 FINE = 0.00125  # metres between its neighbouring pixels, at most, if they are
@@ -367,7 +367,7 @@ class CanonicalFrame:
         for offsets in (eyes - origin, points - origin, np.eye(3)):
             level = offsets - (offsets @ z)[:, None] * z  # as seen from above
             length = np.linalg.norm(level, axis=1)
-            if length.max(initial=0.0) >= MIN_HORIZONTAL:
+            if length.max(initial=0.0) >= SHORTEST:
                 x = level[length.argmax()] / length.max()
                 break
         T_canonical_cloud = np.eye(4)

@@ -30,6 +30,7 @@ from edgegrasp_model.options import (
 )
 from edgegrasp_model.results import OBSTACLE, SUPPORT, UNLABELLED
 from edgegrasp_model.scene.cloud import (
+    SHORTEST,
     UP,
     CanonicalFrame,
     CheckedCloud,
@@ -364,9 +365,9 @@ def _clean_cloud(
     away = np.einsum("nd,nd->n", normals, seen_from - points) < 0
     normals = np.where(away[:, None], -normals, normals)
     if sent.normals is not None:
-        given = unit(frame.directions(voxels.mean(unit(sent.normals))[kept]))
-        none = np.linalg.norm(given, axis=1, keepdims=True) < 0.5  # opposite ones in a voxel
-        normals = np.where(none, normals, given).astype(np.float32)
+        given = frame.directions(voxels.mean(unit(sent.normals))[kept])
+        none = np.linalg.norm(given, axis=1) < SHORTEST  # opposite ones in a voxel
+        normals = np.where(none[:, None], normals, unit(given)).astype(np.float32)
     return Cloud(points, normals), kept
 
 
