@@ -20,7 +20,7 @@ from torch.optim import swa_utils
 from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_camera.depth import Intrinsics, unproject
 from edgegrasp_model.scene.network import VOTE_UNIT, SceneNet, SceneOutput, scene_features
-from edgegrasp_model.scene.segment import group, look, mean_probability
+from edgegrasp_model.scene.segment import group, look
 from edgegrasp_training.scene_images import DEPTH_UNIT, SceneImage
 from edgegrasp_training.scene_layouts import OBJECT
 
@@ -186,17 +186,17 @@ def evaluate(network: SceneNet, images: Sequence[SceneImage]) -> dict[str, float
 
 
 def fit_confidence(network: SceneNet, images: Sequence[SceneImage]) -> list[float]:
-    """Logistic regression from `mean_probability` to whether most of an instance is an object."""
+    """Logistic regression from mean probabilities to whether most of an instance is an object."""
     means, right = [], []
     for row, image in enumerate(images):
         known = image.up.astype(np.float64) if row % 2 else None
         pixels, _ = look(network, image_points(image), known, 1.0 / float(image.camera[0]))
         number = group(pixels)
-        size = np.bincount(number[number >= 0])
-        on_object = (number >= 0) & (image.label[::2, ::2] >= OBJECT)
-        held = np.bincount(number[on_object], minlength=len(size))
-        means.append(mean_probability(number, pixels.classes))
-        right.append(held >= 0.5 * np.maximum(size, 1))
+        held = number >= 0
+        size = np.maximum(np.bincount(number[held]), 1)
+        on_object = held & (image.label[::2, ::2] >= OBJECT)
+        means.append(np.bincount(number[held], pixels.classes[2][held]) / size)
+        right.append(np.bincount(number[on_object], minlength=len(size)) >= 0.5 * size)
     sign, mean = np.where(np.concatenate(right), 1.0, -1.0), np.concatenate(means)
 
     def loss(weights: Float64) -> float:

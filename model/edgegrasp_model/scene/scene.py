@@ -51,6 +51,7 @@ from edgegrasp_model.scene.segment import (
     Segmentation,
     confidences,
     segment,
+    segment_views,
     with_clusters,
     with_risen,
     without_long,
@@ -195,18 +196,23 @@ def _segmentation(
     needed = isinstance(options.support, AutoPlane) or not _objects_given(sent, options)
     if len(sent.points) == 0 or options.support is None or not needed:
         return None
-    views: list[tuple[Float64, Int64 | None]]  # position of each camera, and the rows it saw
-    if viewpoints is None:  # one above the points
-        up = np.array([0.0, 0.0, 1.0]) if options.known_up is None else options.known_up
-        low, high = np.percentile(sent.points, (1, 99), axis=0)
+    points, up, down = sent.points, options.known_up, None
+    if viewpoints is None:  # from above the points, in an image that turns with them
+        low, high = np.percentile(points, (1, 99), axis=0)
         away = max(1.0, 1.5 * float((high - low).max()))
-        views = [((low + high) / 2 + away * up, None)]
-    elif len(viewpoints) == 1:
-        views = [(viewpoints[0], None)]
-    else:
+        eye = (low + high) / 2 + away * (np.array([0.0, 0.0, 1.0]) if up is None else up)
+        apart = points - points.mean(axis=0)
+        down = unit(apart[np.linalg.norm(apart, axis=1).argmax()]).astype(np.float64)
+        return segment(points, eye, up, down)
+    if len(viewpoints) > 1:
         assert sent.view_ids is not None
-        views = [(eye, np.flatnonzero(sent.view_ids == k)) for k, eye in enumerate(viewpoints)]
-    return segment(sent.points, views, options.known_up, _down_in_image(sent, viewpoints))
+        return segment_views(points, viewpoints, sent.view_ids, up)
+    if sent.image_size is not None:
+        some = thinned(len(sent.row), 5000)
+        row = sent.row[some] // sent.image_size[1]
+        down = np.asarray((row - row.mean()) @ unit(points[some] - viewpoints[0]), dtype=np.float64)
+        down = unit(down) if down.any() else None
+    return segment(points, viewpoints[0], up, down)
 
 
 def _recognised(
@@ -228,28 +234,12 @@ def _recognised(
             number = with_clusters(number, plan, likely | cut_off, first)
             new = np.flatnonzero(number >= first)
             which = number[new] - first
-            mean = np.bincount(which, shown.object[above[new]]) / np.bincount(which)
-            certain = np.full(len(mean), CUT_OUT) if cut_off else confidences(mean)
+            certain = confidences(which, shown.object[above[new]])
+            if cut_off:
+                certain[:] = CUT_OUT
             confidence |= enumerate(certain.tolist(), first)
             number[new[certain[which] <= LIKELY]] = FIXED
     return number, confidence
-
-
-def _down_in_image(sent: CheckedCloud, viewpoints: Float64 | None) -> Float64 | None:
-    """(3,) unit, cloud frame, downward in the image; None: unknown.
-
-    Without a camera, a direction that rotates with the cloud.
-    """
-    if viewpoints is None:
-        apart = sent.points - sent.points.mean(axis=0)
-        return np.asarray(unit(apart[np.linalg.norm(apart, axis=1).argmax()]), dtype=np.float64)
-    if sent.image_size is None or len(viewpoints) > 1:
-        return None
-    some = thinned(len(sent.row), 5000)
-    row = sent.row[some] // sent.image_size[1]
-    sight = unit(sent.points[some] - viewpoints[0])
-    down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
-    return unit(down) if down.any() else None
 
 
 def build_scene(

@@ -66,8 +66,8 @@ class Pixels(NamedTuple):
 def shipped() -> tuple[SceneNet, Float64]:
     """The `scene` network with the shipped weights, loaded once per process, and its confidence.
 
-    The log odds that an instance is an object are that confidence (2,): a constant and a factor of
-    its `mean_probability`.
+    The log odds that an instance is an object are that confidence (2,): a constant, and a factor of
+    the mean probability of an object over its pixels.
     """
     network = SceneNet()
     network.load_state_dict(load_file(WEIGHTS))
@@ -76,50 +76,32 @@ def shipped() -> tuple[SceneNet, Float64]:
         return network, np.array(json.loads(file.metadata()["confidence"]))
 
 
-def confidences(probability: Float64) -> Float64:
-    """The confidence (O,) of instances by the mean probability (O,) of an object."""
+def confidences(number: Int64, probability: Float32) -> Float64:
+    """The confidence (O,) of instances, by the mean probability of an object over each one's parts.
+
+    `number` (...) is the instance of each part, from 0, negative: none; `probability` (...) its
+    probability of an object.
+    """
+    held = number >= 0
+    total = np.bincount(number[held], probability[held])
+    mean = total / np.maximum(np.bincount(number[held]), 1)
     constant, factor = shipped()[1]
-    return np.asarray(1.0 / (1.0 + np.exp(-(constant + factor * probability))))
+    return np.asarray(1.0 / (1.0 + np.exp(-(constant + factor * mean))))
 
 
 def segment(
     points: Float32,  # (N, 3) cloud frame, metres
-    # of each camera: position (3,), rows (M,) of its points; None: all
-    views: list[tuple[Float64, Int64 | None]],
+    viewpoint: Float64,  # (3,) of the camera that saw them
     up: Float64 | None,  # (3,) unit, away from gravity; None: unknown
     down: Float64 | None = None,  # (3,) unit, downward in the image, used if `up` is unknown
 ) -> Segmentation:
-    """Segment points view by view; an object seen in several views gets one number."""
-    number, seen_up = np.full(len(points), UNKNOWN), np.zeros(3)
-    objects, support = np.zeros((2, len(points)), dtype=np.float32)
-    confidence = np.empty(0)
-    for viewpoint, rows in views:
-        if rows is None:
-            return _segment_view(points, viewpoint, up, down)
-        if len(rows) == 0:
-            continue
-        own = _segment_view(points[rows], viewpoint, up, down)
-        number[rows] = np.where(own.number >= 0, own.number + len(confidence), own.number)
-        objects[rows], support[rows] = own.object, own.support
-        confidence = np.concatenate([confidence, own.confidence])
-        seen_up += own.up * len(rows)
-    merged = joined(points, number, len(confidence))
-    best = np.zeros(int(merged.max(initial=-1)) + 1)
-    np.maximum.at(best, merged, confidence)
-    number = np.where(number >= 0, merged[np.maximum(number, 0)], number) if len(merged) else number
-    return Segmentation(number, objects, support, best, unit(seen_up))
-
-
-def _segment_view(
-    points: Float32, viewpoint: Float64, up: Float64 | None, down: Float64 | None
-) -> Segmentation:
-    """The segmentation of M points seen by one camera."""
+    """Segment points seen by one camera."""
     image = range_image(points, viewpoint, up, down)
     turn, (network, _) = image.T_cloud_camera[:3, :3], shipped()
     up_in_view = None if up is None else up @ turn
     pixels, seen_up = look(network, image.points, up_in_view, image.footprint)
     of_pixel = group(pixels)
-    confidence = confidences(mean_probability(of_pixel, pixels.classes))
+    confidence = confidences(of_pixel, pixels.classes[2])
     likely = confidence > LIKELY
     new = np.append(np.where(likely, np.cumsum(likely) - 1, FIXED), [UNKNOWN, FIXED])
     of_pixel = new[of_pixel]
@@ -129,6 +111,30 @@ def _segment_view(
     arrays = pixels.points, of_pixel, pixels.classes, number, objects, support
     _look_up(points, T_camera_cloud, image.corner, 2 * image.footprint, *arrays)
     return Segmentation(number, objects, support, confidence[likely], turn @ seen_up)
+
+
+def segment_views(
+    points: Float32,  # (N, 3) cloud frame, metres
+    viewpoints: Float64,  # (W, 3) of the cameras
+    view_ids: Int64,  # (N,) the camera that saw each point
+    up: Float64 | None,  # (3,) unit, away from gravity; None: unknown
+) -> Segmentation:
+    """Segment points view by view; an object seen in several views gets one number."""
+    number, seen_up = np.full(len(points), UNKNOWN), np.zeros(3)
+    objects, support = np.zeros((2, len(points)), dtype=np.float32)
+    confidence = np.empty(0)
+    for view in np.unique(view_ids):
+        rows = np.flatnonzero(view_ids == view)
+        own = segment(points[rows], viewpoints[view], up)
+        number[rows] = np.where(own.number >= 0, own.number + len(confidence), own.number)
+        objects[rows], support[rows] = own.object, own.support
+        confidence = np.concatenate([confidence, own.confidence])
+        seen_up += own.up * len(rows)
+    merged = joined(points, number, len(confidence))
+    best = np.zeros(int(merged.max(initial=-1)) + 1)
+    np.maximum.at(best, merged, confidence)
+    number = np.where(number >= 0, merged[np.maximum(number, 0)], number) if len(merged) else number
+    return Segmentation(number, objects, support, best, unit(seen_up))
 
 
 def look(
@@ -230,16 +236,6 @@ def _join(
         while component[root] != root:
             root = component[root]
         component[n] = root
-
-
-def mean_probability(number: Int64, classes: Float32) -> Float64:
-    """The mean probability (O,) of an object over each instance's pixels.
-
-    `number` (H, W) is as from `group`, of O instances; `classes` (3, H, W) are probabilities.
-    """
-    held = number >= 0
-    total = np.bincount(number[held], classes[2][held])
-    return total / np.maximum(np.bincount(number[held]), 1)
 
 
 def joined(points: Float32, number: Int64, count: int) -> Int64:
