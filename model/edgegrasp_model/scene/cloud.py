@@ -139,10 +139,15 @@ def thinned(count: int, most: int = ENOUGH) -> slice:
     return slice(None, None, max(count // most, 1))
 
 
-def cells_of(points: Floats, side: float) -> Float64:
-    """A number (N,) for the cell, `side` metres wide, in which each point (N, D) lies."""
+def cells_of(points: Floats, side: float) -> tuple[Int64, Int64]:
+    """The cell (N,), from 0, in which each point (N, D) lies, and the points (C,) in each cell.
+
+    They are `side` metres wide.
+    """
     # Numbers are many times as fast to compare as rows.
-    return np.asarray(np.floor(points / side) @ 10.0 ** (5.0 * np.arange(points.shape[1])))
+    keys = np.floor(points / side) @ 10.0 ** (5.0 * np.arange(points.shape[1]))
+    _, cell, count = np.unique(keys, return_inverse=True, return_counts=True)
+    return cell, count
 
 
 def inside_workspace(points: Float32, box: Workspace | None, around: Floats | float = 0.0) -> Bools:

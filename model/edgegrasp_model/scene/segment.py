@@ -243,9 +243,9 @@ def joined(points: Float32, number: Int64, count: int) -> Int64:
     held = np.flatnonzero(number >= 0)
     if len(held) == 0:
         return np.arange(count)
-    _, key = np.unique(cells_of(points[held], VIEW_CELL), return_inverse=True)
-    shape = count, int(key.max()) + 1
-    lies = coo_array((np.ones(len(held), dtype=np.int32), (number[held], key)), shape).tocsr()
+    cell, points_in = cells_of(points[held], VIEW_CELL)
+    shape = count, len(points_in)
+    lies = coo_array((np.ones(len(held), dtype=np.int32), (number[held], cell)), shape).tocsr()
     lies.data[:] = 1
     shared = (lies @ lies.T).toarray()
     cells = np.diag(shared)

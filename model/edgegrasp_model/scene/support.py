@@ -175,10 +175,19 @@ def _fitted(
         weight[plane.heights(part.points) > -MOST_MARGIN] = 0.0
     else:
         return None
-    found = measured(part, _close_to(plane, part.points[apart < CLOSE]), THICK, True)
+    # Of the points close to objects: the plane of a bin's floor, not the table's.
+    close = part.points[apart < CLOSE]
+    near = close[np.abs(plane.heights(close)) < MOST_MARGIN].astype(np.float64)
+    for within in CLOSER:
+        if len(near) < FEWEST:
+            break
+        height = plane.heights(near)
+        near = near[np.abs(height - np.median(height)) < within]
+        plane = _least_squares(near, plane) if len(near) >= FEWEST else plane
+    found = measured(part, plane, THICK, True)
     places = found.frame.points(part.points)
-    near = places[np.abs(places[:, 2]) < MOST_MARGIN]
-    if _occupied(near[:, :2], CELL) * CELL**2 <= LEAST_AREA:
+    _, count = cells_of(places[np.abs(places[:, 2]) < MOST_MARGIN, :2], CELL)
+    if len(count) * CELL**2 <= LEAST_AREA:
         return None
     return replace(found, share=found.share * len(on) / len(seen.points))  # of all that is seen
 
@@ -225,7 +234,7 @@ def _up_of_cut(cloud: Float32, viewpoint: Float64) -> Float64 | None:
     planes = planes[behind]
     near = points @ planes[:, :3].T + planes[:, 3] > -TOUCHED
     fullest = np.argsort(-near.sum(axis=0), kind="stable")[:CANDIDATES]
-    places = [_occupied(points[near[:, k]], TOUCHED) for k in fullest]
+    places = [len(cells_of(points[near[:, k]], TOUCHED)[1]) for k in fullest]
     if not places:
         return None
     # Alone, the sides of a box are touched as often as what it stands on; most images are upright.
@@ -234,34 +243,19 @@ def _up_of_cut(cloud: Float32, viewpoint: Float64) -> Float64 | None:
     return up
 
 
-def _close_to(plane: SupportPlane, points: Float32) -> SupportPlane:
-    """The plane of the points (N, 3) close to objects: of a bin's floor, not the table's."""
-    held = np.abs(plane.heights(points)) < MOST_MARGIN
-    near, normal, offset = points[held].astype(np.float64), np.array(plane.normal), plane.offset
-    if len(near) < FEWEST:
-        return plane
-    for within in CLOSER:
-        height = near @ normal - offset
-        near = near[np.abs(height - np.median(height)) < within]
-        if len(near) < FEWEST:
-            break
-        normal, offset = _least_squares(near, normal)
-    return SupportPlane.model_construct(normal=tuple(normal.tolist()), offset=offset)
-
-
-def _least_squares(points: Float64, toward: Float64) -> tuple[Float64, float]:
-    """Normal (3,), on the side of `toward` (3,), and offset of the plane through points (N, 3)."""
+def _least_squares(points: Float64, like: SupportPlane) -> SupportPlane:
+    """The plane through points (N, 3), facing the same way as another one."""
     middle = points.mean(axis=0)
     _, vectors = np.linalg.eigh(np.cov((points - middle).T))  # ascending
-    normal = vectors[:, 0] if vectors[:, 0] @ toward >= 0 else -vectors[:, 0]
-    return normal, float(normal @ middle)
+    normal = vectors[:, 0] if vectors[:, 0] @ like.normal >= 0 else -vectors[:, 0]
+    offset = float(normal @ middle)
+    return SupportPlane.model_construct(normal=tuple(normal.tolist()), offset=offset)
 
 
 def by_surface(points: Float32) -> Float64:
     """Weight of each point (N, 3), so that equal areas count alike."""
-    cell = cells_of(points, CELL)
-    _, which, count = np.unique(cell, return_inverse=True, return_counts=True)
-    return np.asarray(1.0 / count[which])
+    cell, count = cells_of(points, CELL)
+    return np.asarray(1.0 / count[cell])
 
 
 def fit_plane(
@@ -300,15 +294,15 @@ def fit_plane(
     heights = points @ normals.T - np.einsum("td,td->t", normals, origin)
     worth = (np.abs(heights) < thick[:, None]).sum(axis=0)
     best = int(worth.argmax())
-    normal, offset = normals[best], float(normals[best] @ origin[best])
+    offset = float(normals[best] @ origin[best])
+    plane = SupportPlane.model_construct(normal=tuple(normals[best].tolist()), offset=offset)
     for within in (1.0, 0.7, 0.5):
-        near = np.abs(points @ normal - offset) < within * thick
+        near = np.abs(plane.heights(points)) < within * thick
         if near.sum() < FEWEST // 2:
             break
-        normal, offset = _least_squares(points[near], normal)
-    if up is not None and normal @ up < math.cos(max_tilt + 1e-9):
-        return None
-    return SupportPlane.model_construct(normal=tuple(normal.tolist()), offset=offset)
+        plane = _least_squares(points[near], plane)
+    level_enough = up is None or np.dot(up, plane.normal) >= math.cos(max_tilt + 1e-9)
+    return plane if level_enough else None
 
 
 def measured(seen: Seen, plane: SupportPlane, least: float, whole: bool) -> Support:
@@ -418,12 +412,8 @@ def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> floa
 def _wide(points: Floats, plane: SupportPlane) -> bool:
     """Whether points (N, 3) cover more of a plane than an object's flat top."""
     frame = CanonicalFrame.of_scene(points, plane.normal, None)
-    return _occupied(frame.points(points)[:, :2], CELL) * CELL**2 > LEAST_SCALED_AREA
-
-
-def _occupied(points: Float64, side: float) -> int:
-    """How many cells with sides of so many metres hold points (N, D)."""
-    return len(np.unique(cells_of(points, side)))
+    _, count = cells_of(frame.points(points)[:, :2], CELL)
+    return len(count) * CELL**2 > LEAST_SCALED_AREA
 
 
 def _middle(factors: Float64, scale: float, reach: float) -> float | None:
