@@ -1,13 +1,12 @@
 """The HTTP transport: the middleware around every request, routes, and limits on connections."""
 
 import asyncio
-import ipaddress
 import json
 import logging
 import math
 import re
 import sys
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -152,12 +151,20 @@ class HttpMiddleware:
         """Refuse headers that are too large, a foreign host, a wrong token, a compressed body."""
         size = sum(len(name) + len(value) for name, value in scope["headers"])
         size += len(scope["raw_path"]) + len(scope["query_string"])
-        count, most = len(scope["headers"]), self._service.settings.max_header_bytes
+        settings, count = self._service.settings, len(scope["headers"])
+        most = settings.max_header_bytes
         if count > MAX_HEADERS or size > most:
             fix = f"Send at most {MAX_HEADERS}, of {most} bytes."
             raise HeadersTooLarge("headers", f"{count} entries of {size} bytes", fix)
+        # A name that a web page points at this server is refused. Nobody can register one without a
+        # dot, or with a number at its end.
         host = headers.get("host", "")
-        if call.method not in ("Live", "Ready") and not self._serves(host):
+        name = re.sub(r":\d*$", "", host).strip("[]").lower()
+        allowed = [one.lower() for one in settings.allowed_hosts]
+        unregistered = "." not in name or name.rpartition(".")[2].isdecimal()
+        served = name in (*allowed, settings.host.lower()) or "*" in allowed
+        served |= not allowed and (self._service.tokens.required or unregistered)
+        if not served and call.method not in ("Live", "Ready"):
             fix = "Use an address of the server, or name it in the setting allowed_hosts."
             raise InvalidRequest("Host", brief(host), fix)
         if call.method not in PUBLIC:
@@ -165,21 +172,6 @@ class HttpMiddleware:
         if (encoding := headers.get("content-encoding", "identity").lower()) != "identity":
             fix = "Send the body as it is; .npz and .pcd files may be compressed inside."
             raise UnsupportedMediaType("Content-Encoding", repr(encoding[:40]), fix)
-
-    def _serves(self, host: str) -> bool:
-        """Whether a Host header names this server, not a name that a web page pointed at it."""
-        name = re.sub(r":\d*$", "", host).strip("[]").lower()
-        settings = self._service.settings
-        allowed = [one.lower() for one in settings.allowed_hosts]
-        if name in allowed or "*" in allowed or name == settings.host.lower():
-            return True
-        if allowed:
-            return False
-        if self._service.tokens.required or "." not in name:  # nobody can register such a name
-            return True
-        with suppress(ValueError):
-            return bool(ipaddress.ip_address(name))
-        return False
 
 
 def create_router(service: GraspService, metrics: Metrics) -> Router:
