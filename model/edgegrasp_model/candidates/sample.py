@@ -120,18 +120,25 @@ class Sampler:
         self._used = np.concatenate([self._used, more])
         if len(more) == 0:
             return None
-        options = self.options
+        options, mode = self.options, self.options.collision.mode
         drawn, outcome = self._constrained(more, last_resort=last_resort)
-        row, free = self._checked(drawn, outcome)
-        new = free | (options.collision.mode != "avoid")
-        new[new] = different(drawn.T_cloud_hand[row[new]], free[new], self.gripper, options)
+        passed = np.flatnonzero(outcome == CODE[Outcome.RETURNED])
+        row = some_of(passed, OVERSAMPLING * options.num_candidates, self._rng)
+        checked = drawn.take(row)
+        hands = checked.T_cloud_hand, checked.opening
+        free = ~collides(self.scene, *hands, self.gripper, options.collision)
+        outcome[passed], outcome[row] = CODE[Outcome.NOT_CHECKED], CODE[Outcome.NOT_SCORED]
+        if mode != "ignore":
+            outcome[row[~free]] = CODE[Outcome.COLLISION]
+        self.counts["checked"] += len(row)
+        self.counts["collision_free"] += int(free.sum())
+        new = free | (mode != "avoid")
+        new[new] = different(checked.T_cloud_hand[new], free[new], self.gripper, options)
         most = options.num_candidates - self.counts["scored"]
-        clear = np.flatnonzero(new & (free | (options.collision.mode == "ignore")))
-        scored = clear[random_rows(len(clear), most, self._rng)]
-        if options.collision.mode == "penalise":  # then those that collide
-            hit = np.flatnonzero(new & ~free)
-            rest = random_rows(len(hit), most - len(scored), self._rng)
-            scored = np.sort(np.concatenate([scored, hit[rest]]))
+        scored = some_of(np.flatnonzero(new & (free | (mode == "ignore"))), most, self._rng)
+        if mode == "penalise":  # then those that collide
+            rest = some_of(np.flatnonzero(new & ~free), most - len(scored), self._rng)
+            scored = np.sort(np.concatenate([scored, rest]))
         row, free = row[scored], free[scored]
         outcome[row] = CODE[Outcome.RETURNED]
         self.counts["scored"] += len(row)
@@ -185,23 +192,6 @@ class Sampler:
         self.counts["clear_of_support"] += int((outcome == CODE[Outcome.RETURNED]).sum())
         return candidates, outcome
 
-    def _checked(self, candidates: Candidates, outcome: NDArray[np.int8]) -> tuple[Int64, Bools]:
-        """Some of the remaining candidates (K,), and a mask (K,) of those that do not collide."""
-        rule = self.options.collision
-        passed = np.flatnonzero(outcome == CODE[Outcome.RETURNED])
-        most = OVERSAMPLING * self.options.num_candidates
-        row = passed[random_rows(len(passed), most, self._rng)]
-        outcome[passed] = CODE[Outcome.NOT_CHECKED]
-        checked = candidates.take(row)
-        hands = checked.T_cloud_hand, checked.opening
-        free = ~collides(self.scene, *hands, self.gripper, rule)
-        outcome[row] = CODE[Outcome.NOT_SCORED]
-        if rule.mode != "ignore":
-            outcome[row[~free]] = CODE[Outcome.COLLISION]
-        self.counts["checked"] += len(row)
-        self.counts["collision_free"] += int(free.sum())
-        return row, free
-
     def _spread(self, counts: Int64) -> Int64:
         """Further approach points, `counts` (O,) on each of the objects; rows of the cloud."""
         number, chosen = self.scene.object_of_point[self._rows], [self._rows[:0]]
@@ -231,11 +221,9 @@ def different(
     return kept
 
 
-def random_rows(size: int, limit: int, rng: np.random.Generator) -> Int64:
-    """Ascending rows of at most `limit` out of `size`."""
-    if size <= limit:
-        return np.arange(size, dtype=np.int64)
-    return np.sort(rng.choice(size, limit, replace=False)).astype(np.int64)
+def some_of(rows: Int64, limit: int, rng: np.random.Generator) -> Int64:
+    """At most `limit` of ascending rows, at random."""
+    return rows if len(rows) <= limit else np.sort(rng.choice(rows, limit, replace=False))
 
 
 def allowed_directions(
