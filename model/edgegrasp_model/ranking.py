@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Array, Bools, Float32, Floats, Int64
-from edgegrasp_model.candidates.collision import FINGER_CLEARANCE, clearances, met_first
+from edgegrasp_model.candidates.collision import FINGER_CLEARANCE, clearances, hand_views
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
@@ -179,8 +179,7 @@ def grasps_in_cloud(
     """Grasps in the cloud's frame, of E candidates; all arrays are (E,)."""
     T_cloud_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     T_cloud_tcp = T_cloud_hand @ gripper.T_hand_tcp
-    met = met_first(scene.cloud, candidates.T_cloud_hand, gripper)
-    hidden = _far_side_hidden(scene, candidates.T_cloud_hand, met, gripper)
+    met, hidden = _touched_first(scene, candidates.T_cloud_hand, gripper)
     width = 2 * (np.abs(met).max(axis=1) + np.float32(FINGER_CLEARANCE))
     widest = np.float32(gripper.max_opening)
     width = np.where(hidden, widest, np.minimum(width, widest))
@@ -204,10 +203,21 @@ def grasps_in_cloud(
     ]
 
 
-def _far_side_hidden(scene: Scene, T_cloud_hand: Float32, met: Float32, gripper: Gripper) -> Bools:
-    """Hands (E,) beyond whose fingers the object may go on unseen; `met`: what they touch first."""
+def _touched_first(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> tuple[Float32, Bools]:
+    """Where the fingers of hands (E, 4, 4) touch first, and whether the object may go on unseen.
+
+    Greatest and least y (E, 2) of the points between the open fingers, hand frame, 0 without any;
+    and which hands (E,) have unseen space beyond a finger.
+    """
+    view = hand_views(scene.cloud, T_cloud_hand, gripper)
+    between = gripper.between_fingers(view.position)
+    hand, place = view.candidate[between], view.position[1, between]
+    met = np.full((len(T_cloud_hand), 2), (-np.inf, np.inf), dtype=np.float32)
+    np.maximum.at(met[:, 0], hand, place)
+    np.minimum.at(met[:, 1], hand, place)
+    met = np.where(np.isfinite(met), met, np.float32(0.0))
     beyond = unseen_space(scene.depths, T_cloud_hand, met, gripper).beyond
-    return np.asarray(np.maximum(*beyond) > HIDDEN)
+    return met, np.asarray(np.maximum(*beyond) > HIDDEN)
 
 
 def detected_objects(
@@ -266,8 +276,7 @@ def _why(
         allowed = outcome != CODE[Outcome.DIRECTION]
         return Ungraspable.BLOCKED if allowed.any() else None
     hands = sample.candidates.T_cloud_hand[scored]
-    met = met_first(scene.cloud, hands, gripper)
-    hidden = _far_side_hidden(scene, hands, met, gripper)
+    _, hidden = _touched_first(scene, hands, gripper)
     return Ungraspable.HIDDEN if hidden.mean() > 0.5 else None
 
 

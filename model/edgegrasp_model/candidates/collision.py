@@ -113,14 +113,3 @@ def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandVie
     hand, row, position = points_in_hand_boxes(in_hands(cloud.points, T_cloud_hand), *reach)
     bounds = np.searchsorted(hand, np.arange(len(T_cloud_hand) + 1))
     return HandView(hand, row, position, bounds)
-
-
-def met_first(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
-    """Greatest and least y (E, 2) of the points between open fingers, hand frame; 0 without any."""
-    view = hand_views(cloud, T_cloud_hand, gripper)
-    between = gripper.between_fingers(view.position)
-    hand, place = view.candidate[between], view.position[1, between]
-    met = np.full((len(T_cloud_hand), 2), (-np.inf, np.inf), dtype=np.float32)
-    np.maximum.at(met[:, 0], hand, place)
-    np.minimum.at(met[:, 1], hand, place)
-    return np.where(np.isfinite(met), met, np.float32(0.0))
