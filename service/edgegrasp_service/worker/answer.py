@@ -110,8 +110,27 @@ def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
         MemoryError: Out of memory; the process should be replaced.
     """
     work = _Work(job, catalogue, settings, time.monotonic() + job.remaining)
+    facts = work.facts
     try:
-        return Answer(work.answer(), work.facts)
+        if job.method == "RecordOutcome":
+            work.record_outcome()
+        if job.method in ("Beat", "RecordOutcome"):
+            return Answer(b"{}", facts)
+        with work.stage("decode"):
+            detector, cloud, options, given = work.decode()
+        result: Any
+        if job.method == "DetectGrasps":
+            result = work.detect(detector, cloud, options)
+            facts.grasps = len(result.grasps)
+        else:
+            with work.stage("score"):
+                most = settings.max_voxels
+                result = detector.score(cloud, options, **given, max_voxels=most)
+            facts.grasps = len(result.evaluations)
+        facts.model, facts.counts = result.model, dict(result.counts)
+        with work.stage("encode"):
+            body = write(job.transport, result)
+        return Answer(body, facts)
     except EdgeGraspError as error:
         problem = report(error)
     except Exception as error:
@@ -120,10 +139,10 @@ def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
         if isinstance(error, MemoryError) or torch_error or "can't allocate memory" in str(error):
             raise MemoryError(str(error)) from None
         problem = report(error)
-        work.facts.traceback = traceback.format_exc()
+        facts.traceback = traceback.format_exc()
         if work.options is not None:  # rows in it may be millions
-            work.facts.options = work.options.model_dump_json(exclude_defaults=True)[:2000]
-    return Answer(b"", work.facts, problem)
+            facts.options = work.options.model_dump_json(exclude_defaults=True)[:2000]
+    return Answer(b"", facts, problem)
 
 
 @dataclass
@@ -137,34 +156,7 @@ class _Work:
     facts: Facts = field(default_factory=Facts)
     options: DetectOptions | None = None  # known once they are parsed
 
-    def answer(self) -> bytes:
-        """The body of the answer; may raise any error."""
-        if self.job.method == "Beat":
-            return b"{}"
-        if self.job.method == "RecordOutcome":
-            self._record_outcome()
-            return b"{}"
-        with self._stage("decode"):
-            detector, cloud, options, given = self._decode()
-        result: Any
-        if self.job.method == "DetectGrasps":
-            result = self._detect(detector, cloud, options)
-            self.facts.grasps = len(result.grasps)
-        else:
-            if options.robot is not None:
-                fix = "Leave it out, or detect: reach is planned for detected grasps."
-                raise InvalidRequest("options.robot", "a robot beside given grasps", fix)
-            with self._stage("score"):
-                most = self.settings.max_voxels
-                result = detector.score(cloud, options, **given, max_voxels=most)
-            self.facts.grasps = len(result.evaluations)
-        self.facts.model = result.model
-        self.facts.counts = dict(result.counts)
-        with self._stage("encode"):
-            body = write(self.job.transport, result)
-        return body
-
-    def _record_outcome(self) -> None:
+    def record_outcome(self) -> None:
         """Append a tried grasp, the digest of its weights and the time to the outcomes' file."""
         kind, path = self.job.content_type, self.settings.outcomes_file
         if not kind.lower().startswith(JSON):  # foreign web pages cannot send it
@@ -180,7 +172,7 @@ class _Work:
         line["time"] = datetime.now(UTC).isoformat()
         recording.append_line(path, orjson.dumps(line) + b"\n")
 
-    def _detect(self, detector: Any, cloud: CloudInput, options: DetectOptions) -> Detection:
+    def detect(self, detector: Any, cloud: CloudInput, options: DetectOptions) -> Detection:
         """Detect, and plan an arm's motions where the request names a robot."""
         asked, robot = options, None
         if asked.robot is not None:
@@ -192,21 +184,21 @@ class _Work:
 
             robot = robots[name]
             options = with_robot(options, robot)
-        with self._stage("prepare"):
+        with self.stage("prepare"):
             most = self._within_deadline(self.settings.max_voxels, self.catalogue.pace.voxel)
             prepared = detector.prepare(cloud, options, most)
             self.facts.counts = dict(prepared.counts)
-        with self._stage("network"):
+        with self.stage("network"):
             logits = detector.evaluate(prepared)
-        with self._stage("finish"):
+        with self.stage("finish"):
             detection: Detection = detector.finish(prepared, logits)
         if robot is not None:
             until = self.deadline - ENCODE_SHARE * self.job.remaining
-            with self._stage("arm"):
+            with self.stage("arm"):
                 detection = plan_picks(detection, prepared.scene, cloud.points, asked, robot, until)
         return detection
 
-    def _decode(self) -> tuple[Any, CloudInput, DetectOptions, dict[str, Array]]:
+    def decode(self) -> tuple[Any, CloudInput, DetectOptions, dict[str, Array]]:
         """Decode a request within the limits: detector, cloud, options, given grasps."""
         size, most = len(self.job.body), self.settings.max_points
         in_time = most
@@ -215,7 +207,8 @@ class _Work:
                 fields = read_request(self.job)
                 self.options = options = parse_options(fields["options"])
                 detector = self.catalogue.get(options.model)
-                given = {} if self.job.method == "DetectGrasps" else _given(fields, most)
+                scores = self.job.method == "ScoreGrasps"
+                given = _given(fields, options, most) if scores else {}
                 in_time = self._within_deadline(most, self.catalogue.pace.point)
                 cloud, options = decode_cloud(fields, options, in_time)
         except MemoryError:
@@ -236,7 +229,7 @@ class _Work:
         return int(min(most, remaining / seconds)) if seconds else most
 
     @contextmanager
-    def _stage(self, name: str) -> Iterator[None]:
+    def stage(self, name: str) -> Iterator[None]:
         """Time a stage; raises DeadlineExceeded instead of starting it too late."""
         start = time.monotonic()
         if start > self.deadline:
@@ -247,8 +240,11 @@ class _Work:
             self.facts.seconds[name] = time.monotonic() - start
 
 
-def _given(fields: Mapping[str, Any], max_points: int) -> dict[str, Array]:
+def _given(fields: Mapping[str, Any], options: DetectOptions, max_points: int) -> dict[str, Array]:
     """The edges or hand poses to score; raises InvalidRequest unless there is one of the two."""
+    if options.robot is not None:
+        fix = "Leave it out, or detect: reach is planned for detected grasps."
+        raise InvalidRequest("options.robot", "a robot beside given grasps", fix)
     names = [name for name in GIVEN if fields.get(name) is not None]
     if not names:
         raise InvalidRequest("edges", "nothing", "Send edges or hand_poses.")
