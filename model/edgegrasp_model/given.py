@@ -16,6 +16,7 @@ from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.options import MAX_CANDIDATES, are_rigid
 from edgegrasp_model.results import NoGrasp
+from edgegrasp_model.scene.cloud import wrong_array
 from edgegrasp_model.scene.scene import Scene
 
 FIRST_TOUCH = 0.004  # metres behind the outermost point within which points count as touched first
@@ -56,10 +57,12 @@ def check_hand_poses(poses: object) -> Float32:
 
 def _checked(field: str, array: object, kinds: str, shape: tuple[int, ...], fix: str) -> Array:
     """An array of 1 to MAX_CANDIDATES rows of a shape, and of one of the kinds of dtype."""
-    if not isinstance(array, np.ndarray):
-        raise InvalidRequest(field, f"a {type(array).__name__}", fix)
-    if array.dtype.kind not in kinds or array.shape[1:] != shape:
-        raise InvalidRequest(field, f"dtype {array.dtype}, shape {array.shape}", fix)
+    if (
+        not isinstance(array, np.ndarray)
+        or array.dtype.kind not in kinds
+        or array.shape[1:] != shape
+    ):
+        raise wrong_array(field, array, fix)
     if not 1 <= len(array) <= MAX_CANDIDATES:
         raise InvalidRequest(field, f"{len(array)} of them", f"Send 1 to {MAX_CANDIDATES}.")
     return array

@@ -1,7 +1,7 @@
 """From the caller's array to the small, clean cloud with normals that the network sees."""
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Self, TypeVar, cast
+from typing import Any, NamedTuple, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -72,7 +72,11 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
     InvalidRequest, which names `cloud`, `normals`, `colors`, `segment_ids` or `view_ids`.
     """
     sent = cloud if isinstance(cloud, CloudInput) else CloudInput(cloud)
-    points = _checked_points(sent.points)
+    points: Any = sent.points
+    is_array = isinstance(points, np.ndarray) and points.dtype in (np.float32, np.float64)
+    if not is_array or points.ndim not in (2, 3) or points.shape[-1] != 3:
+        fix = "Send float32 or float64 metres, (N, 3) or (H, W, 3), or depth_images."
+        raise wrong_array("cloud", points, fix)
     size, said, image_size, step = points.size // 3, sent.warnings, None, 1
     row = np.arange(size)
     if points.ndim == 3:
@@ -103,10 +107,7 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
         low, high = points.min(axis=0), points.max(axis=0)
     if (furthest := float(np.maximum(-low, high).max())) > MAX_DISTANCE:
         value = f"points {furthest:.4g} m from the origin, where float32 rounds away millimetres"
-        fix = (
-            "Subtract an origin near the cloud from it and from every position of the request, and "
-            "add it to the grasps."
-        )
+        fix = "Subtract an origin near the cloud from all positions, and add it to the grasps."
         raise InvalidRequest("cloud", value, fix)
     if len(points) < num_approach_points:
         value = f"{len(points)} points for num_approach_points = {num_approach_points}"
@@ -182,13 +183,13 @@ def _beside(field: str, array: object, size: int, row: Int64) -> Array:
     """The given rows of an array beside the cloud, of one integer or of three floats a point."""
     width = 1 if field.endswith("_ids") else 3
     kinds, kind = ("iu", "one integer") if width == 1 else ("fui", "three numbers")
-    fix = f"Send {kind} for each of the cloud's {size} points."
-    if not isinstance(array, np.ndarray):
-        raise InvalidRequest(field, f"a {type(array).__name__}", fix)
-    if array.dtype.kind not in kinds:
-        raise InvalidRequest(field, f"dtype {array.dtype}", fix)
-    if array.size != width * size or (width > 1 and array.shape[-1:] != (width,)):
-        raise InvalidRequest(field, f"shape {array.shape}", fix)
+    if (
+        not isinstance(array, np.ndarray)
+        or array.dtype.kind not in kinds
+        or array.size != width * size
+        or (width > 1 and array.shape[-1:] != (width,))
+    ):
+        raise wrong_array(field, array, f"Send {kind} for each of the cloud's {size} points.")
     if width == 1:
         ids = array.reshape(-1)[row]
         for end in (int(ids.min(initial=0)), int(ids.max(initial=0))):
@@ -210,17 +211,12 @@ class Cloud:
     normals: Float32  # (N, 3)
 
 
-def _checked_points(points: object) -> Floats:
-    """A caller's points, (N, 3) or (H, W, 3), if they are an array of that shape."""
-    if not isinstance(points, np.ndarray):
-        kind = type(points).__name__
-        raise InvalidRequest("cloud", f"a {kind}", "Send an array of shape (N, 3) in metres.")
-    if points.ndim not in (2, 3) or points.shape[-1] != 3:
-        fix = "Send shape (N, 3) or (H, W, 3): x, y, z; a depth image as one of depth_images."
-        raise InvalidRequest("cloud", f"shape {points.shape}", fix)
-    if points.dtype not in (np.float32, np.float64):
-        raise InvalidRequest("cloud", f"dtype {points.dtype}", "Send float32 or float64 metres.")
-    return points
+def wrong_array(field: str, array: object, fix: str) -> InvalidRequest:
+    """The error for something that is no array, or an array of a wrong type or shape."""
+    value = f"a {type(array).__name__}"
+    if isinstance(array, np.ndarray):
+        value = f"dtype {array.dtype}, shape {array.shape}"
+    return InvalidRequest(field, value, fix)
 
 
 def _not_finite(points: Floats) -> InvalidRequest:
