@@ -99,7 +99,7 @@ Quaternion = Annotated[
 class Strict(BaseModel):
     """Base of every option object: unknown fields are refused, instances are frozen."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 def _ordered(corners: Tuple) -> Tuple:
@@ -134,9 +134,8 @@ class OrientedBox(Strict):
 
     kind: Literal["oriented_box"] = "oriented_box"
     center: Vector = Field(description="centre, metres")
-    half_extents: tuple[Length, Length, Length] = Field(
-        description="half lengths along the box's axes, metres"
-    )
+    half_extents: tuple[Length, Length, Length]
+    """half lengths along the box's axes, metres"""
     quaternion: Quaternion = Field(
         default=(0.0, 0.0, 0.0, 1.0),
         description="x, y, z, w: turns the box's axes into the cloud's (T_cloud_box)",
@@ -163,9 +162,8 @@ class Indices(Strict):
     """Points by their row in the cloud as it was sent."""
 
     kind: Literal["indices"] = "indices"
-    indices: tuple[Row, ...] = Field(
-        max_length=MAX_ROWS, description="rows of the cloud as sent; row-major if organised"
-    )
+    indices: tuple[Row, ...] = Field(max_length=MAX_ROWS)
+    """rows of the cloud as sent; row-major if organised"""
 
 
 def _byte_for_each(value: object) -> bytes:
@@ -198,9 +196,8 @@ class Mask(Strict):
             ]
             | Annotated[list[bool], Field(max_length=MAX_ROWS)],
         ),
-    ] = Field(
-        description="one value for each row of the cloud; in JSON also base64 of one byte each"
-    )
+    ]
+    """one value for each row of the cloud; in JSON also base64 of one byte each"""
 
 
 class Segments(Strict):
@@ -234,9 +231,8 @@ class Cone(Strict):
     direction: Direction = Field(
         description="direction in which the hand moves, its +z axis; any length but zero"
     )
-    max_angle: Annotated[float, Field(ge=0.0, le=math.pi), numeric] = Field(
-        description="greatest angle between it and the hand's direction, radians"
-    )
+    max_angle: Annotated[float, Field(ge=0.0, le=math.pi), numeric]
+    """greatest angle between it and the hand's direction, radians"""
 
 
 class ApproachDirection(Strict):
@@ -247,12 +243,10 @@ class ApproachDirection(Strict):
     than 6 degrees below the horizontal.
     """
 
-    cones: tuple[Cone, ...] = Field(
-        default=(), max_length=64, description="directions are allowed in any of these"
-    )
-    preset: Literal["top-down", "side"] | None = Field(
-        default=None, description="or in this, relative to up"
-    )
+    cones: tuple[Cone, ...] = Field(default=(), max_length=64)
+    """directions are allowed in any of these"""
+    preset: Literal["top-down", "side"] | None = None
+    """or in this, relative to up"""
 
     @model_validator(mode="after")
     def _not_empty(self) -> Self:
@@ -287,17 +281,12 @@ class RansacPlane(Strict):
     """
 
     kind: Literal["ransac"] = "ransac"
-    distance: Annotated[float, Field(gt=0.0, le=0.1), numeric] = Field(
-        default=0.005,
-        description="points within this distance belong to the plane, metres; noise may raise it",
-    )
-    max_tilt: Annotated[float, Field(ge=0.0, le=1.6), numeric] = Field(
-        default=0.35,
-        description="greatest angle between its normal and up, radians; π/2: any plane",
-    )
-    min_share: Annotated[float, Field(gt=0.0, le=1.0), numeric] = Field(
-        default=0.1, description="least share of the visible surface that must lie in it"
-    )
+    distance: Annotated[float, Field(gt=0.0, le=0.1), numeric] = 0.005
+    """points within this distance belong to the plane, metres; noise may raise it"""
+    max_tilt: Annotated[float, Field(ge=0.0, le=1.6), numeric] = 0.35
+    """greatest angle between its normal and up, radians; π/2: any plane"""
+    min_share: Annotated[float, Field(gt=0.0, le=1.0), numeric] = 0.1
+    """least share of the visible surface that must lie in it"""
 
 
 class AutoPlane(Strict):
@@ -393,13 +382,10 @@ class GripperGeometry(Strict):
 class Suppression(Strict):
     """Drops a grasp that is nearer to a better one than both distances."""
 
-    translation: Number = Field(default=0.01, ge=0.0, le=1.0, description="metres between TCPs")
-    rotation: Number = Field(
-        default=0.5,
-        ge=0.0,
-        le=3.2,
-        description="radians between hands, ignoring a turn by 180 degrees about the approach",
-    )
+    translation: Number = Field(default=0.01, ge=0.0, le=1.0)
+    """metres between TCPs"""
+    rotation: Number = Field(default=0.5, ge=0.0, le=3.2)
+    """radians between hands, ignoring a turn by 180 degrees about the approach"""
 
 
 class Collision(Strict):
@@ -410,25 +396,16 @@ class Collision(Strict):
         description="avoid: grasps whose hand collides are left out; penalise: they are ranked by "
         "half their score; ignore: collisions are not checked",
     )
-    margin: Number = Field(
-        default=0.0,
-        ge=0.0,
-        le=0.1,
-        description="metres by which the hand's boxes are grown on every side",
-    )
-    opening: HandLength | None = Field(
-        default=None,
-        description="metres between the fingers during the approach; null: the gripper's maximum",
-    )
-    approach_length: Number = Field(
-        default=0.05, ge=0.0, le=1.0, description="length of the straight approach, metres"
-    )
-    retreat_length: Number = Field(
-        default=0.0, ge=0.0, le=1.0, description="length of the straight retreat, metres"
-    )
-    retreat_direction: Literal["back", "up"] = Field(
-        default="back", description="direction of the retreat: back along the approach, or along up"
-    )
+    margin: Number = Field(default=0.0, ge=0.0, le=0.1)
+    """metres by which the hand's boxes are grown on every side"""
+    opening: HandLength | None = None
+    """metres between the fingers during the approach; null: the gripper's maximum"""
+    approach_length: Number = Field(default=0.05, ge=0.0, le=1.0)
+    """length of the straight approach, metres"""
+    retreat_length: Number = Field(default=0.0, ge=0.0, le=1.0)
+    """length of the straight retreat, metres"""
+    retreat_direction: Literal["back", "up"] = "back"
+    """direction of the retreat: back along the approach, or along up"""
     obstacles: tuple[Annotated[Box | OrientedBox, Field(discriminator="kind")], ...] = Field(
         default=(), max_length=64, description="solid boxes in addition to the cloud"
     )
@@ -502,26 +479,21 @@ class Place(Strict):
 class RobotArm(Strict):
     """The arm that executes the grasp; each grasp in the answer has its joints and motion."""
 
-    name: Name = Field(description="one of the server's robots")
-    T_base_cloud: RigidPose = Field(
-        description="pose of the cloud's frame in the arm's base frame: a 4 x 4 matrix, row by row"
-    )
-    joints: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=16)] = Field(
-        description="the arm's joints now, radians or metres, in the order of the robot file"
-    )
-    plan: Literal["reach", "motion"] = Field(
-        default="motion",
-        description="reach: joints at each pregrasp and grasp; motion: also a timed trajectory",
-    )
+    name: Name
+    """one of the server's robots"""
+    T_base_cloud: RigidPose
+    """pose of the cloud's frame in the arm's base frame: a 4 x 4 matrix, row by row"""
+    joints: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=16)]
+    """the arm's joints now, radians or metres, in the order of the robot file"""
+    plan: Literal["reach", "motion"] = "motion"
+    """reach: joints at each pregrasp and grasp; motion: also a timed trajectory"""
     place: Place | None = Field(
         default=None,
         description="where to put the object; a grasp is within reach only if this place is too; "
         "null: the motion ends with the object lifted",
     )
-    avoid_unseen: StrictBool = Field(
-        default=False,
-        description="whether unseen space behind a surface is an obstacle for the arm",
-    )
+    avoid_unseen: StrictBool = False
+    """whether unseen space behind a surface is an obstacle for the arm"""
 
 
 class PreviousGrasp(Strict):
@@ -620,26 +592,24 @@ SupportRequest = Annotated[
 class DetectOptions(Strict):
     """Options of one detection; the defaults suit a tabletop scene seen by one camera."""
 
-    model: str = Field(default="", description="weights to use; empty: the server's default")
+    model: str = ""
+    """weights to use; empty: the server's default"""
     gripper: (
         Annotated[
             Annotated[str, Tag("name")] | Annotated[GripperGeometry, Tag("inline")],
             Discriminator(lambda value: "name" if isinstance(value, str) else "inline"),
         ]
         | None
-    ) = Field(
-        default=None,
-        description="gripper, by name or geometry; null: the one the weights were trained for",
-    )
-    num_approach_points: ApproachPoints | None = Field(
-        default=None,
-        description="approach points sampled, spread over the objects; null: as many as they need",
-    )
-    num_candidates: Candidates = Field(default=2000, description="candidates scored at most")
-    sampling: Literal["farthest", "uniform"] = Field(
-        default="farthest", description="how approach points are sampled"
-    )
-    seed: Integer = Field(default=0, ge=0, lt=2**63, description="seed of every random choice")
+    ) = None
+    """gripper, by name or geometry; null: the one the weights were trained for"""
+    num_approach_points: ApproachPoints | None = None
+    """approach points sampled, spread over the objects; null: as many as they need"""
+    num_candidates: Candidates = 2000
+    """candidates scored at most"""
+    sampling: Literal["farthest", "uniform"] = "farthest"
+    """how approach points are sampled"""
+    seed: Integer = Field(default=0, ge=0, lt=2**63)
+    """seed of every random choice"""
     viewpoint: (
         Annotated[
             Annotated[Vector, Tag("one")]
@@ -676,51 +646,36 @@ class DetectOptions(Strict):
         "everything above the support (off); all else is an obstacle. If segment_ids are sent, "
         "those above 0 are the objects",
     )
-    at: Pixel | None = Field(
-        default=None,
-        description="pixel of the image; grasps are for the object at this pixel",
-    )
-    near: Vector | None = Field(
-        default=None,
-        description="position, metres; grasps are for the nearest object, at most 0.1 m away",
-    )
-    max_object_size: Number = Field(
-        default=0.4,
-        gt=0.0,
-        le=10.0,
-        description="longest side of an object, metres; larger ones are obstacles",
-    )
-    workspace: Workspace | None = Field(
-        default=None,
-        description="where grasps may be; points outside remain obstacles; null: everywhere",
-    )
-    approach_region: Region | None = Field(
-        default=None, description="where approach points may lie; null: everywhere"
-    )
-    contact_region: Region | None = Field(
-        default=None, description="where contact points may lie; null: everywhere"
-    )
-    approach_direction: ApproachDirection | None = Field(
-        default=None, description="directions in which the hand may move; null: all but from below"
-    )
+    at: Pixel | None = None
+    """pixel of the image; grasps are for the object at this pixel"""
+    near: Vector | None = None
+    """position, metres; grasps are for the nearest object, at most 0.1 m away"""
+    max_object_size: Number = Field(default=0.4, gt=0.0, le=10.0)
+    """longest side of an object, metres; larger ones are obstacles"""
+    workspace: Workspace | None = None
+    """where grasps may be; points outside remain obstacles; null: everywhere"""
+    approach_region: Region | None = None
+    """where approach points may lie; null: everywhere"""
+    contact_region: Region | None = None
+    """where contact points may lie; null: everywhere"""
+    approach_direction: ApproachDirection | None = None
+    """directions in which the hand may move; null: all but from below"""
     collision: Annotated[
         Collision,
         BeforeValidator(
             lambda value: {"mode": value} if isinstance(value, str) else value,
             json_schema_input_type=CollisionMode | Collision,
         ),
-    ] = Field(
-        default=Collision(), description="collision checks of the hand; a mode alone is allowed"
-    )
-    robot: RobotArm | None = Field(
-        default=None,
-        description="arm that executes the grasp; grasps within its reach come first; null: no arm",
-    )
-    min_score: Share = Field(default=0.3, description="lowest score returned; 0: all")
-    top_k: Candidates = Field(default=50, description="grasps returned at most")
-    suppression: Suppression | None = Field(
-        default=Suppression(), description="non-maximum suppression; null: none"
-    )
+    ] = Collision()
+    """collision checks of the hand; a mode alone is allowed"""
+    robot: RobotArm | None = None
+    """arm that executes the grasp; grasps within its reach come first; null: no arm"""
+    min_score: Share = 0.3
+    """lowest score returned; 0: all"""
+    top_k: Candidates = 50
+    """grasps returned at most"""
+    suppression: Suppression | None = Suppression()
+    """non-maximum suppression; null: none"""
     order: Literal["score", "highest", "clearance"] = Field(
         default="score",
         description="score: first, for each object with a grasp of 0.5 or more, one surrounded by "
@@ -733,9 +688,8 @@ class DetectOptions(Strict):
         description="grasps and objects of an earlier answer, which keep their ids, numbers and "
         "order; an empty object for the first image; null: no tracking",
     )
-    debug: StrictBool = Field(
-        default=False, description="whether to return the processed cloud and every candidate"
-    )
+    debug: StrictBool = False
+    """whether to return the processed cloud and every candidate"""
 
     @property
     def known_up(self) -> NDArray[np.float64] | None:
