@@ -191,6 +191,7 @@ class PointCloud2(Strict):
 
 FocalLength = Annotated[float, Field(gt=0.0, le=FARTHEST), numeric]
 PoseRow = tuple[Finite, Finite, Finite, Finite]
+CameraPose = Annotated[tuple[PoseRow, PoseRow, PoseRow, PoseRow], AfterValidator(rigid)]
 
 
 class Intrinsics(Strict):
@@ -222,20 +223,14 @@ class DepthImage(Strict):
             lambda sent: sent if isinstance(sent, Mapping) else intrinsics_of(sent)._asdict(),
             json_schema_input_type=Intrinsics | list[float] | list[list[float]],
         ),
-    ] = Field(description="by name, or fx, fy, cx, cy, or the 3 x 3 matrix")
-    T_cloud_camera: Annotated[tuple[PoseRow, PoseRow, PoseRow, PoseRow], AfterValidator(rigid)] = (
-        Field(
-            default=((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
-            description="maps camera coordinates to cloud coordinates, metres",
-        )
-    )
-    depth_scale: Annotated[float, Field(gt=0.0, le=1.0), numeric] | None = Field(
-        default=None,
-        description="metres for one unit of depth; null: 0.001 for integers, 1 for floats",
-    )
-    depth: SkipValidation[list[list[float]] | Depth] = Field(
-        description="rows of metres, or an object as Depth"
-    )
+    ]
+    """by name, or fx, fy, cx, cy, or the 3 x 3 matrix"""
+    T_cloud_camera: CameraPose = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
+    """maps camera coordinates to cloud coordinates, metres"""
+    depth_scale: Annotated[float, Field(gt=0.0, le=1.0), numeric] | None = None
+    """metres for one unit of depth; null: 0.001 for integers, 1 for floats"""
+    depth: SkipValidation[list[list[float]] | Depth]
+    """rows of metres, or an object as Depth"""
 
 
 CAMERA = tuple(DepthImage.model_fields)  # what a form may have as parts, of one image
