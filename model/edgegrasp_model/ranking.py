@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Array, Bools, Float32, Floats, Int64
-from edgegrasp_model.candidates.collision import FINGER_CLEARANCE, clearances, hand_views
+from edgegrasp_model.candidates.collision import clearances, hand_views
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
@@ -25,6 +25,7 @@ from edgegrasp_results import DebugInfo, DetectedObject, Grasp
 COLLIDING = 0.5  # factor on the score of a colliding grasp in the ranking
 GOOD_SCORE = 0.5  # score from which an object has a good grasp
 SURE_SCORE = 0.9  # score from which the order `highest` goes by height (the paper's robot policy)
+FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
 HIDDEN = 0.004  # metres of unseen space into which an object may extend
 FLAT = 0.012  # metres of visible height below which the support may block grasps
 DRAWBACK, FAR = 0.02, 0.1  # of a rating; metres from an object's middle

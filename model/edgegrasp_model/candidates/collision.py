@@ -23,7 +23,6 @@ from edgegrasp_model.scene.segment import FIXED
 from edgegrasp_model.unseen import enters_unseen
 
 NEAR = 0.006  # metres around a finger that count as near it
-FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
 MIN_FIXED = 8  # voxels of background between the fingers that keep them from closing
 
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from edgegrasp_camera.arrays import Bools, Float32, Int64
 from edgegrasp_model.candidates.collision import NEAR, HandView, hand_views
-from edgegrasp_model.candidates.edge_grasps import Candidates, support_clearance
+from edgegrasp_model.candidates.edge_grasps import GAP, Candidates, support_clearance
 from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks.config import HAND_DESCRIPTION_SIZE, NetworkConfig
@@ -49,7 +49,6 @@ ABOVE = 0.001  # metres over the camera
 # Metres beyond the pads' sides, the open fingers' inner faces, the palm and the tips.
 BESIDE, OUTSIDE, BEHIND, BEYOND_TIPS = 0.027, 0.06, 0.026, 0.012
 UNKNOWN_HEIGHT = 0.10  # metres; heights are clipped here, and unknown ones get this value
-GAP = 0.007  # metres; a gap this long ends what lies between the fingers
 HEIGHTS = slice(58, 61)  # numbers that are heights over the support plane
 BEYOND = slice(65, 67)  # unseen metres outward from what each finger meets first
 

@@ -249,7 +249,7 @@ def _gathered_relu_rows(
 ) -> None:
     """`relu` of u_j - offset p_i for the neighbours (p, k) of each of p points."""
     width, k = result.shape[2], neighbors.shape[1]
-    zero, tiny = np.float32(0.0), np.float32(1e-7)
+    zero, tiny = np.float32(0.0), np.float32(_TINY)
     for i in range(len(neighbors)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         for j in range(k):
