@@ -242,7 +242,7 @@ THIN = 0.003  # metres of standard deviation across a rim, all of which counts a
 LEAN = np.radians(30.0)  # off vertical
 DROP = 0.006  # metres below an edge from which a surface counts as another one
 GAP = 0.007  # metres without a point in which a surface ends
-ONE_VIEW = np.cos(np.radians(15.0))  # radians; directions closer than this show the same outline
+ONE_VIEW = np.cos(LEAN / 2)  # directions closer than that to up show the same outline
 MAX_INSERTION = 0.020  # metres deeper than an edge grasp; more does not hold better
 STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it
 

@@ -265,7 +265,8 @@ def build_scene(
     if counts["voxels"] > max_voxels:
         raise _too_wide(counts["voxels"], max_voxels, voxel_size, sent, options)
     middles = voxels.mean(canonical)
-    cloud, kept = _clean_cloud(sent, middles, voxels, frame, viewpoints)
+    eyes = None if viewpoints is None else frame.points(viewpoints)
+    cloud, kept = _clean_cloud(sent, middles, voxels, frame, eyes)
     counts["kept"] = int(kept.sum())
     if cloud is None:
         return None
@@ -291,10 +292,10 @@ def build_scene(
         object_of_point=number,
         support=None if support is None else _plane_under_hands(support.plane, frame, spare),
         at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, sent.points),
-        viewpoints=None if viewpoints is None else frame.points(viewpoints).astype(np.float32),
+        viewpoints=None if eyes is None else eyes.astype(np.float32),
         confidence=selected.confidence,
         obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
-        P_image_cloud=_projection(sent, viewpoints, frame),
+        P_image_cloud=_projection(sent, eyes, frame),
         corrected=selected.corrected,
     )
 
@@ -310,25 +311,23 @@ def _plane_under_hands(plane: SupportPlane, frame: CanonicalFrame, spare: float)
     )
 
 
-def _projection(
-    sent: CheckedCloud, viewpoints: Float64 | None, frame: CanonicalFrame
-) -> Float64 | None:
+def _projection(sent: CheckedCloud, eyes: Float64 | None, frame: CanonicalFrame) -> Float64 | None:
     """The projection (3, 4) of canonical points into the image of one camera that was sent.
 
-    By direct linear transformation. None without such an image.
+    By direct linear transformation. None without such an image. `eyes` (W, 3) are the cameras,
+    canonical frame.
     """
-    if sent.image_size is None or viewpoints is None or len(viewpoints) > 1:
+    if sent.image_size is None or eyes is None or len(eyes) > 1:
         return None
     some, (height, width) = thinned(len(sent.row), 1000), sent.image_size
     x = (2 * (sent.row[some] % width) + 1)[:, None] / width - 1
     y = (2 * (sent.row[some] // width) + 1)[:, None] / height - 1
-    eye = frame.points(viewpoints)[0].astype(np.float64)
-    sight = unit(frame.points(sent.points[some]) - eye)
+    sight = unit(frame.points(sent.points[some]) - eyes)
     none = np.zeros_like(sight)
     equations = np.block([[sight, none, -x * sight], [none, sight, -y * sight]])
     P = np.linalg.eigh(equations.T @ equations)[1][:, 0].reshape(3, 3)
     P *= np.sign((sight @ P[2]).sum())
-    return np.column_stack([P, -P @ eye])
+    return np.column_stack([P, -P @ eyes[0]])
 
 
 def _clean_cloud(
@@ -336,7 +335,7 @@ def _clean_cloud(
     middles: Float32,  # (V, 3) the voxels' mean points, canonical frame, metres
     voxels: Voxels,
     frame: CanonicalFrame,
-    viewpoints: Float64 | None,  # (W, 3) cloud frame
+    eyes: Float64 | None,  # (W, 3) the cameras, canonical frame
 ) -> tuple[Cloud | None, Bools]:
     """The voxels without outliers, and a mask (V,) of them; no cloud if too few are left.
 
@@ -348,9 +347,9 @@ def _clean_cloud(
         return None, kept
     points, normals = middles[kept], least_spread(middles, near)[kept]
     seen_from = (points.min(axis=0) + points.max(axis=0)) / 2 + UP
-    if viewpoints is not None:
-        seen_from = frame.points(viewpoints).astype(np.float32)
-        if len(viewpoints) > 1 and sent.view_ids is not None:
+    if eyes is not None:
+        seen_from = eyes.astype(np.float32)
+        if len(eyes) > 1 and sent.view_ids is not None:
             seen_from = seen_from[voxels.commonest(sent.view_ids)[kept]]
     away = np.einsum("nd,nd->n", normals, seen_from - points) < 0
     normals = np.where(away[:, None], -normals, normals)

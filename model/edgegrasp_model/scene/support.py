@@ -262,7 +262,7 @@ def fit_plane(
     seen: Seen,  # N points that may belong to it
     weight: Floats,  # (N,) what each counts
     rng: np.random.Generator,
-    up: Float64 | None = None,  # (3,) unit; None: any tilt will do
+    up: Float64 | None,  # (3,) unit; None: any tilt will do
     max_tilt: float = TILT,  # radians from `up`
 ) -> SupportPlane | None:
     """The plane that holds the most of weighted points, facing the camera (RANSAC).
