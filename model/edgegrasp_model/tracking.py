@@ -79,7 +79,7 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
     places += [place for one in previous.objects for place in np.reshape(one.surface, (-1, 3))]
     if not places:
         return options
-    apart, _ = cKDTree(points[thinned(len(points), 2000)]).query(np.array(places))
+    apart, _ = cKDTree(thinned(points, 2000)).query(np.array(places))
     if (away := float(np.min(apart))) > FOREIGN:
         value = f"grasps {away:.2g} m from the nearest point of the cloud"
         fix = "Send previous in the frame of this cloud, or leave it out."

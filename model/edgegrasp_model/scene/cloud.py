@@ -31,6 +31,7 @@ FINE = 0.00125  # metres between its neighbouring pixels, at most, if they are
 STRAY = 0.5  # percent of the points that may lie beyond the end of a range
 
 Vectors = TypeVar("Vectors", bound=Floats)
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 @dataclass(frozen=True)
@@ -135,9 +136,9 @@ def _is_fine(image: Floats) -> bool:
     return len(apart) > 0 and bool(np.median(apart) <= FINE)
 
 
-def thinned(count: int, most: int = ENOUGH) -> slice:
-    """Rows, spread evenly, of `most` or a few more of a cloud's points."""
-    return slice(None, None, max(count // most, 1))
+def thinned(rows: NDArray[Scalar], most: int = ENOUGH) -> NDArray[Scalar]:
+    """Rows spread evenly over all of an array, `most` of them or a few more."""
+    return rows[:: max(len(rows) // most, 1)]
 
 
 def cells_of(points: Floats, side: float) -> tuple[Int64, Int64]:

@@ -185,7 +185,7 @@ def range_image(
 ) -> RangeImage:
     """Render points as seen from a viewpoint."""
     downward = [way for way in (None if up is None else -up, down) if way is not None]
-    apart = points[thinned(len(points))].astype(np.float64) - viewpoint
+    apart = thinned(points).astype(np.float64) - viewpoint
     sight = unit(apart)
     # Rounded, so that the image is independent of the order of the points.
     turn = _camera_axes(sight.mean(axis=0).round(9), downward)
@@ -205,7 +205,7 @@ def range_image(
     width, height = (int(np.ceil(side / MULTIPLE)) * MULTIPLE for side in (high - low) / pixel_size)
     middle = (low + high) / 2
     corner = middle - pixel_size * np.array([width, height]) / 2
-    some = points[thinned(len(points), DENSE * width * height)]
+    some = thinned(points, DENSE * width * height)
     filled = _fill_holes(_render(some, viewpoint, turn, corner, pixel_size, (height, width)))
     coarse = float(np.median(in_view[:, 2])) * pixel_size / COARSEST
     if (times := min(round(pixel_size / finest), int(np.ceil(coarse)))) > 1:

@@ -208,9 +208,9 @@ def _segmentation(
         assert sent.view_ids is not None
         return segment_views(points, viewpoints, sent.view_ids, up)
     if sent.image_size is not None:
-        some = thinned(len(sent.row), 5000)
-        row = sent.row[some] // sent.image_size[1]
-        down = np.asarray((row - row.mean()) @ unit(points[some] - viewpoints[0]), dtype=np.float64)
+        row = thinned(sent.row, 5000) // sent.image_size[1]
+        sight = unit(thinned(points, 5000) - viewpoints[0])
+        down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
         down = unit(down) if down.any() else None
     return segment(points, viewpoints[0], up, down)
 
@@ -319,10 +319,10 @@ def _projection(sent: CheckedCloud, eyes: Float64 | None, frame: CanonicalFrame)
     """
     if sent.image_size is None or eyes is None or len(eyes) > 1:
         return None
-    some, (height, width) = thinned(len(sent.row), 1000), sent.image_size
-    x = (2 * (sent.row[some] % width) + 1)[:, None] / width - 1
-    y = (2 * (sent.row[some] // width) + 1)[:, None] / height - 1
-    sight = unit(frame.points(sent.points[some]) - eyes)
+    row, (height, width) = thinned(sent.row, 1000), sent.image_size
+    x = (2 * (row % width) + 1)[:, None] / width - 1
+    y = (2 * (row // width) + 1)[:, None] / height - 1
+    sight = unit(frame.points(thinned(sent.points, 1000)) - eyes)
     none = np.zeros_like(sight)
     equations = np.block([[sight, none, -x * sight], [none, sight, -y * sight]])
     P = np.linalg.eigh(equations.T @ equations)[1][:, 0].reshape(3, 3)

@@ -269,7 +269,7 @@ def with_risen(
     held = np.flatnonzero((number >= 0) & (height > margin))
     if len(rows) == 0 or len(held) == 0:
         return number
-    held = held[thinned(len(held))]
+    held = thinned(held)
     places = np.column_stack([plan, height])
     apart, nearest = cKDTree(places[held]).query(places[rows], distance_upper_bound=BESIDE)
     near, number = np.isfinite(apart), number.copy()
@@ -310,7 +310,7 @@ def without_long(number: Int64, points: Float32, max_size: float) -> Int64:
     starts = np.flatnonzero(np.diff(number[order], prepend=-1))
     number = number.copy()
     for rows in np.split(order, starts[1:]):
-        some = points[rows[thinned(len(rows), 500)]].astype(np.float64)
+        some = points[thinned(rows, 500)].astype(np.float64)
         around = some - some.mean(axis=0)
         _, axes = np.linalg.eigh(around.T @ around)
         low, high = np.percentile(around @ axes, (1, 99), axis=0)

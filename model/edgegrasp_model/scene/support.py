@@ -114,7 +114,7 @@ def choose_support(
         # no bin.
         around = np.inf if options.follows_only else BELOW_WORKSPACE * np.abs(request.normal)
         over = np.flatnonzero(inside_workspace(seen.points, options.workspace, around))
-        some = over[thinned(len(over))]
+        some = thinned(over)
         below = float(request.heights(seen.points[some]).min(initial=np.inf))
         if options.max_object_size < below < np.inf:
             warnings.append(
@@ -122,15 +122,15 @@ def choose_support(
                 "its frame, normal, and offset in metres."
             )
         on = np.empty(0, np.int64) if shown is None else np.flatnonzero(shown.support > 0.5)
-        part = seen.points[on[thinned(len(on))]]
+        part = seen.points[thinned(on)]
         # Where a support was cut off, only flat tops may be classified as support.
         whole = len(on) > CUT_OFF * len(seen.points) and _wide(part, request)
         found = measured(Seen(seen.points[some], seen.viewpoint), request, GIVEN_MARGIN, whole)
     else:
         rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
         if isinstance(request, RansacPlane):
-            weight = by_surface(seen.points) * inside
-            plane = fit_plane(seen, weight, rng, up, request.max_tilt)
+            cell, count = cells_of(seen.points, CELL)  # equal areas count alike
+            plane = fit_plane(seen, inside / count[cell], rng, up, request.max_tilt)
             found = None if plane is None else measured(seen, plane, request.distance, True)
             found = None if found is None or found.share < request.min_share else found
         else:
@@ -158,8 +158,8 @@ def _fitted(
 ) -> Support | None:
     """The plane of the points classified as support, weighted toward those near objects."""
     on, held = np.flatnonzero(shown.support > 0.5), np.flatnonzero(objects)
-    part = Seen(seen.points[on[thinned(len(on))]], seen.viewpoint)
-    around = seen.points[held[thinned(len(held), 500)]]
+    part = Seen(seen.points[thinned(on)], seen.viewpoint)
+    around = seen.points[thinned(held, 500)]
     # Metres to the nearest object; infinity beyond NEAR_OBJECTS, or where there is no object.
     apart = np.asarray(cKDTree(around).query(part.points, distance_upper_bound=NEAR_OBJECTS)[0])
     weight = np.where(np.isfinite(apart), 1.0, FAR_WEIGHT)
@@ -221,7 +221,7 @@ def _up_of_cut(cloud: Float32, viewpoint: Float64) -> Float64 | None:
     Of the planes that the cloud touches, on the side that the camera does not see, the one that it
     touches in the most places. None: the camera looks up, or it is a flat cloud.
     """
-    points = cloud[thinned(len(cloud))].astype(np.float64)
+    points = thinned(cloud).astype(np.float64)
     if len(points) < FEWEST:
         return None
     toward = viewpoint - points.mean(axis=0)
@@ -250,12 +250,6 @@ def _least_squares(points: Float64, like: SupportPlane) -> SupportPlane:
     normal = vectors[:, 0] if vectors[:, 0] @ like.normal >= 0 else -vectors[:, 0]
     offset = float(normal @ middle)
     return SupportPlane.model_construct(normal=tuple(normal.tolist()), offset=offset)
-
-
-def by_surface(points: Float32) -> Float64:
-    """Weight of each point (N, 3), so that equal areas count alike."""
-    cell, count = cells_of(points, CELL)
-    return np.asarray(1.0 / count[cell])
 
 
 def fit_plane(
@@ -310,7 +304,7 @@ def measured(seen: Seen, plane: SupportPlane, least: float, whole: bool) -> Supp
 
     `whole`: the cloud was not cut off above the plane.
     """
-    sample = Seen(seen.points[thinned(len(seen.points))], seen.viewpoint)
+    sample = Seen(thinned(seen.points), seen.viewpoint)
     frame = CanonicalFrame.of_scene(sample.points, plane.normal, seen.viewpoint)
     frame.T_canonical_cloud[2, 3] = -plane.offset / np.linalg.norm(plane.normal)
     x, y, height = frame.points(sample.points).T
@@ -401,7 +395,7 @@ def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> floa
         if window.max() >= enough:
             scale = _middle(factors, float(tried[start + int(window.argmax())]), reach)
             if scale is not None:
-                scaled = viewpoint + scale * (points[thinned(len(points))] - viewpoint)
+                scaled = viewpoint + scale * (thinned(points) - viewpoint)
                 if _wide(scaled[np.abs(plane.heights(scaled)) < NEAR], plane):
                     return scale
             start += width - 1
