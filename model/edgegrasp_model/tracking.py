@@ -29,7 +29,7 @@ from edgegrasp_model.options import (
 )
 from edgegrasp_model.ranking import COLLIDING, objects_first, ranked
 from edgegrasp_model.results import OBSTACLE, Following
-from edgegrasp_model.scene.cloud import thinned
+from edgegrasp_model.scene.cloud import pose_of, thinned
 from edgegrasp_model.scene.scene import Scene, numbers_chosen
 from edgegrasp_model.scene.segment import FIXED, UNKNOWN
 from edgegrasp_results import Evaluation, Grasp, Tracking
@@ -294,9 +294,8 @@ def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
         target = rows.T @ across + TANGENT * sides.T @ along[ends].ravel() - stiff @ total
         step = np.linalg.solve(system, target)
         total += step
-        turn, move = Rotation.from_rotvec(step[:3]).as_matrix(), np.eye(4)
-        move[:3, :3], move[:3, 3] = turn, middle + step[3:] - turn @ middle
-        T = move @ T
+        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        T = pose_of(turn, middle + step[3:] - turn @ middle) @ T
     now = before @ T[:3, :3].T + T[:3, 3]
     apart, _ = cloud.tree.query(now, distance_upper_bound=STEPS[-1])
     return T, float(np.isfinite(apart).mean())

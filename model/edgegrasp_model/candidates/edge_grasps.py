@@ -18,7 +18,7 @@ from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
 from edgegrasp_model.kernels import compiled, extents_between, free_way, in_hands
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.results import NoGrasp
-from edgegrasp_model.scene.cloud import UP, Cloud, unit
+from edgegrasp_model.scene.cloud import UP, Cloud, pose_of, unit
 
 MIN_EDGE = 0.003  # metres between approach and contact point
 # Metres that an edge stays below half the opening, a contact inside the fingertips, and a hand
@@ -150,12 +150,8 @@ def edge_grasps(
     z = ahead[pair] / depth[:, None]
     y = normal - np.einsum("ed,ed->e", normal, z)[:, None] * z
     y = y / np.linalg.norm(y, axis=1, keepdims=True)
-    pose = np.zeros((len(z), 4, 4), dtype=np.float32)
-    pose[:, :3, :3] = np.stack([np.cross(y, z), y, z], axis=2)
-    pose[:, :3, 3] = (
-        cloud.points[approach_index] + (depth - gripper.contact_z_at(opening))[:, None] * z
-    )
-    pose[:, 3, 3] = 1.0
+    place = cloud.points[approach_index] + (depth - gripper.contact_z_at(opening))[:, None] * z
+    pose = pose_of(np.stack([np.cross(y, z), y, z], axis=2), place).astype(np.float32)
     return Candidates(pair, approach_index, contact_index, depth, opening, pose)
 
 
@@ -327,11 +323,9 @@ def outline_grasps(
     chosen = nearest[np.unique(contact[row[nearest]], return_index=True)[1]]
     row, extent, width = row[chosen], extent[chosen], width[chosen]
     contact, z = contact[row], z[contact[row]]
-    pose = np.zeros((len(row), 4, 4), dtype=np.float32)
-    pose[:, :3, :3] = frame[contact, 1:].transpose(0, 2, 1)
     middle = points[contact] - extent.mean(axis=1, keepdims=True) * y[contact]
-    pose[:, :3, 3] = middle - gripper.contact_z_at(width)[:, None] * z
-    pose[:, 3, 3] = 1.0
+    place = middle - gripper.contact_z_at(width)[:, None] * z
+    pose = pose_of(frame[contact, 1:].transpose(0, 2, 1), place).astype(np.float32)
     depth = np.maximum(edge[2][row], 0.0)
     hands = Candidates(pair[row], approach[row], contact, depth, width, pose)
     return _inserted(points, hands, support, gripper, margin)

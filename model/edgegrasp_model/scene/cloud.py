@@ -167,6 +167,13 @@ def unit(vectors: Vectors) -> Vectors:
     return cast("Vectors", vectors / np.maximum(length, 1e-9))
 
 
+def pose_of(turn: Floats, place: ArrayLike) -> Float64:
+    """The pose T (..., 4, 4) of a rotation (..., 3, 3) and a translation (..., 3)."""
+    T = np.zeros((*turn.shape[:-2], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = turn, place, 1.0
+    return T
+
+
 def seen_from_origin(points: Float32, up: ArrayLike | None) -> bool:
     """Whether points (N, 3) look as if seen by a camera at the origin along +z.
 
@@ -372,10 +379,8 @@ class CanonicalFrame:
             if length.max(initial=0.0) >= SHORTEST:
                 x = level[length.argmax()] / length.max()
                 break
-        T_canonical_cloud = np.eye(4)
-        T_canonical_cloud[:3, :3] = np.stack([x, np.cross(z, x), z])
-        T_canonical_cloud[:3, 3] = -T_canonical_cloud[:3, :3] @ origin
-        return cls(T_canonical_cloud)
+        turn = np.stack([x, np.cross(z, x), z])
+        return cls(pose_of(turn, -turn @ origin))
 
     def points(self, points: ArrayLike) -> Float64:
         """Points (..., 3) of the cloud's frame in this one."""

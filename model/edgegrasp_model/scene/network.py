@@ -17,7 +17,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.kernels import compiled
-from edgegrasp_model.scene.cloud import LARGE, STRAY, WIDEST_VIEW, thinned, unit
+from edgegrasp_model.scene.cloud import LARGE, STRAY, WIDEST_VIEW, pose_of, thinned, unit
 
 MULTIPLE = 32  # its sides are multiples of
 CLASSES = ("other", "support", "object")
@@ -211,9 +211,7 @@ def range_image(
     if (times := min(round(pixel_size / finest), int(np.ceil(coarse)))) > 1:
         pixel_size /= times
         filled = _enlarged(filled[..., 2], times, corner, pixel_size)
-    T_cloud_camera = np.eye(4)
-    T_cloud_camera[:3, :3], T_cloud_camera[:3, 3] = turn.T, viewpoint
-    return RangeImage(filled, pixel_size, T_cloud_camera, corner)
+    return RangeImage(filled, pixel_size, pose_of(turn.T, viewpoint), corner)
 
 
 def _camera_axes(sight: Float64, downward: list[Float64]) -> Float64:

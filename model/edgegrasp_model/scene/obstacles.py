@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float32, Float64, Floats, Int64
 from edgegrasp_model.options import Box, OrientedBox
-from edgegrasp_model.scene.cloud import CanonicalFrame
+from edgegrasp_model.scene.cloud import CanonicalFrame, pose_of
 
 CHUNK = 20_000  # pairs of boxes at a time
 THINNEST = 1e-6  # metres, half a box of a request at least, so that its axes have a direction
@@ -64,14 +64,11 @@ class SolidBoxes:
 
 def box_pose(box: Box | OrientedBox) -> tuple[Float64, Float64]:
     """Pose T_cloud_box (4, 4) and half extents (3,) of a box."""
-    pose = np.eye(4)
     if isinstance(box, OrientedBox):
-        pose[:3, :3] = Rotation.from_quat(box.quaternion).as_matrix()
-        pose[:3, 3] = box.center
-        return pose, np.array(box.half_extents)
+        turn = Rotation.from_quat(box.quaternion).as_matrix()
+        return pose_of(turn, box.center), np.array(box.half_extents)
     low, high = np.array(box.min), np.array(box.max)
-    pose[:3, 3] = (low + high) / 2
-    return pose, (high - low) / 2
+    return pose_of(np.eye(3), (low + high) / 2), (high - low) / 2
 
 
 def near_pairs(
