@@ -2,6 +2,7 @@
 
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping, Sequence
 from dataclasses import astuple
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import grpc.aio
 import numpy as np
 from google.protobuf.message import DecodeError, Message
 
-from edgegrasp.v1 import grasp_pb2
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_camera.arrays import Array
 from edgegrasp_client import errors
 from edgegrasp_client.connection import Tls, token_metadata
@@ -28,8 +29,6 @@ CHANNEL_OPTIONS = (
     ("grpc.keepalive_time_ms", 30_000),
     ("grpc.keepalive_timeout_ms", 10_000),
 )
-
-SERVICE = "edgegrasp.v1.GraspService"
 
 # grpc.health.v1: an empty request asks about the whole server; field 1 = 1 means SERVING.
 HEALTH_CHECK = "/grpc.health.v1.Health/Check"
@@ -64,19 +63,19 @@ class GrpcTransport:
             credentials = grpc.ssl_channel_credentials(ca, key, certificate)
             self._channel = grpc.aio.secure_channel(address, credentials, CHANNEL_OPTIONS)
         self._metadata = token_metadata(token)
+        self._service: Any = grasp_pb2_grpc.GraspServiceStub(self._channel)
         self._check = self._channel.unary_unary(HEALTH_CHECK, bytes, bytes)
 
     async def ask(self, kind: type[Answer], request: Request, timeout: float) -> Answer:
         """The answer to a request."""
         name = "ScoreGrasps" if request.scores else "DetectGrasps"
-        answer = await self._call(name, b"".join(wire_of(request)), timeout)
-        return read_as(kind, answer)
+        return read_as(kind, await self._call(name, message_of(request), timeout))
 
     async def listed(self, kind: type[Answer], timeout: float) -> list[Answer]:
         """The server's models or robots."""
-        name = f"{kind.__name__}s"
-        answer = await self._call(f"List{name}", b"", timeout)
-        return [read_as(kind, each) for each in getattr(answer, name.lower())]
+        name = f"List{kind.__name__}s"
+        answer = await self._call(name, getattr(grasp_pb2, f"{name}Request")(), timeout)
+        return [read_as(kind, each) for each in getattr(answer, f"{kind.__name__.lower()}s")]
 
     async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
         """Refused: gRPC has no such call."""
@@ -88,18 +87,16 @@ class GrpcTransport:
         """An answer to each of the named requests with their timeouts."""
         failed: list[Exception] = []
 
-        async def messages() -> AsyncIterator[bytes]:
+        async def messages() -> AsyncIterator[grasp_pb2.DetectGraspsStreamRequest]:
             try:
                 async for name, request, seconds in requests:
-                    message = grasp_pb2.DetectGraspsStreamRequest(request_id=name, timeout=seconds)
-                    wire = _field(message, "request", *wire_of(request))
-                    yield b"".join([message.SerializeToString(), *wire])
+                    yield grasp_pb2.DetectGraspsStreamRequest(
+                        request_id=name, request=message_of(request), timeout=seconds
+                    )
             except Exception as error:  # gRPC would only log it
                 failed.append(error)
 
-        read = grasp_pb2.DetectGraspsStreamResponse.FromString
-        method = self._channel.stream_stream(f"/{SERVICE}/DetectGraspsStream", None, read)
-        call: Any = method(messages(), metadata=self._metadata)
+        call = self._service.DetectGraspsStream(messages(), metadata=self._metadata)
         try:
             async for answer in call:
                 if answer.HasField("detection"):
@@ -131,10 +128,9 @@ class GrpcTransport:
         """Close the channel."""
         await self._channel.close(None)
 
-    async def _call(self, name: str, request: bytes, timeout: float) -> Any:
-        """The answer of a method of the service to a serialized request."""
-        response = getattr(grasp_pb2, f"{name}Response")
-        method = self._channel.unary_unary(f"/{SERVICE}/{name}", None, response.FromString)
+    async def _call(self, name: str, request: Message, timeout: float) -> Any:
+        """The answer of a method of the service."""
+        method = getattr(self._service, name)
         try:
             return await method(request, timeout=timeout, metadata=self._metadata)
         except grpc.RpcError as error:
@@ -165,54 +161,28 @@ def _described(message: str, detail: grasp_pb2.ErrorDetail) -> GraspClientError:
 # Requests
 
 
-def wire_of(request: Request) -> list[bytes | memoryview]:
-    """The serialized message of a request, in parts; InvalidRequestError: no message can hold it.
-
-    Protobuf would copy long fields four times. A message whose fields come in two parts is merged.
-    """
-    kind = grasp_pb2.ScoreGraspsRequest if request.scores else grasp_pb2.DetectGraspsRequest
-    message: Any = kind()
-    long: list[bytes | memoryview] = []
-    cloud = request.cloud
-    if cloud is None:
-        for which, image in enumerate(request.depth_images):
-            view, depth = grasp_pb2.DepthImage(), dict(image["depth"])
-            data = _field(view.depth, "data", depth.pop("data"))
-            fill(view, image | {"depth": depth}, f"depth_images.{which}")
-            whole = view.SerializeToString(), *_field(view, "depth", *data)
-            long += _field(message, "depth_images", *whole)
-    elif (points := float32_points(cloud)) is not None:
-        long += _field(message, "points", _little_endian(points))
-    else:
-        message.encoded.format, message.encoded.data = cloud_file(cloud)
+def message_of(request: Request) -> Any:
+    """The message of a request; raises InvalidRequestError for what no message can hold."""
+    fields: dict[str, Any] = {"options": request.options, "depth_images": request.depth_images}
     for name, array in request.arrays.items():
-        if name in ("edges", "hand_poses"):
-            _extend(getattr(message, name), array, name, messages=True)
+        fields[name] = array if name in ("edges", "hand_poses") else _packed(array)
+    if (cloud := request.cloud) is not None:
+        if (points := float32_points(cloud)) is not None:
+            fields["points"] = _packed(points)
         else:
-            long += _field(message, name, _little_endian(array))
-    fill(message.options, request.options, "options")
-    return [message.SerializeToString(), *long]
+            fields["encoded"] = dict(zip(("format", "data"), cloud_file(cloud), strict=True))
+    kind = grasp_pb2.ScoreGraspsRequest if request.scores else grasp_pb2.DetectGraspsRequest
+    message = kind()
+    fill(message, fields)
+    return message
 
 
-def _little_endian(array: Array) -> memoryview:
-    """The bytes of a contiguous array, without a copy where they are that already."""
-    return array.astype(array.dtype.newbyteorder("<"), copy=False).reshape(-1).view(np.uint8).data
+def _packed(array: Array) -> bytes:
+    return array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
 
 
-def _field(message: Message, name: str, *parts: bytes | memoryview) -> list[bytes | memoryview]:
-    """A field of a message as it is on the wire: its bytes or serialized message, in parts."""
-    head = bytearray()
-    number = message.DESCRIPTOR.fields_by_name[name].number
-    for value in (number << 3 | 2, sum(map(len, parts))):
-        while value > 127:
-            head.append(value & 127 | 128)
-            value >>= 7
-        head.append(value)
-    return [bytes(head), *parts]
-
-
-def fill(message: Message, value: object, path: str) -> None:
-    """Fill a message from a plain value in the form it has in JSON.
+def fill(message: Message, value: object, path: str = "") -> None:
+    """Fill a message, which is the field `path` of a request, from a value as in JSON.
 
     Raises:
         InvalidRequestError: The message cannot hold the value. The server checks everything else.
@@ -223,37 +193,28 @@ def fill(message: Message, value: object, path: str) -> None:
     message.SetInParent()
     for name, part in value.items():
         field = message.DESCRIPTOR.fields_by_name.get(name)
-        here = f"{path}.{name}"
+        here = f"{path}.{name}".removeprefix(".")
         if field is None:
             raise invalid(here, "an unknown field", f"Give {_known(message)} only.")
-        if field.is_repeated:
-            _extend(getattr(message, name), part, here, field.message_type is not None)
-        elif field.message_type is not None:
-            fill(getattr(message, name), part, here)
-        else:
+        if isinstance(part, np.ndarray):
+            part = part.tolist()
+        if field.message_type is None:
             try:
-                setattr(message, name, part)
+                if not field.is_repeated:
+                    setattr(message, name, part)
+                elif name.startswith(("T_", "surface")) and all(isinstance(r, list) for r in part):
+                    getattr(message, name).extend(chain(*part))  # in JSON also row by row
+                else:
+                    getattr(message, name).extend(part)
             except (TypeError, ValueError) as error:
                 raise invalid(here, repr(part)[:80], f"{error}.") from None
-
-
-def _extend(container: Any, values: object, path: str, messages: bool) -> None:
-    if isinstance(values, np.ndarray):
-        values = values.tolist()
-    if not isinstance(values, Sequence) or isinstance(values, str):
-        raise invalid(path, repr(values)[:80], "Give a list.")
-    if messages:
-        for row, value in enumerate(values):
-            fill(container.add(), value, f"{path}.{row}")
-        return
-    by_rows = path.rpartition(".")[2].startswith(("T_", "surface"))  # as answers in JSON have them
-    if by_rows and all(isinstance(row, list) for row in values):
-        values = [number for row in values for number in row]
-    try:
-        container.extend(values)
-    except (TypeError, ValueError) as error:
-        fix = f"Give one flat list, or an array of bool. {error}."
-        raise invalid(path, repr(values)[:80], fix) from None
+        elif not field.is_repeated:
+            fill(getattr(message, name), part, here)
+        elif isinstance(part, Sequence) and not isinstance(part, str):
+            for row, each in enumerate(part):
+                fill(getattr(message, name).add(), each, f"{here}.{row}")
+        else:
+            raise invalid(here, repr(part)[:80], "Give a list.")
 
 
 def _known(message: Message) -> str:
@@ -274,26 +235,21 @@ def _target(message: Any, value: Any, path: str) -> tuple[Any, Any]:
             if viewpoint is not None and not listed:
                 fields["viewpoint"] = [viewpoint]
             return message, fields
-        case "HandPose":
-            return message, {names[0]: value}
-        case "Edge" | "HandBox" | "Pixel" | "Vector" | "Quaternion" as kind:
+        case "Edge" | "HandBox" | "Pixel" | "Vector" | "Quaternion":
             if not isinstance(value, Sequence) or len(value) != len(names):
-                parts = "corners" if kind == "HandBox" else "numbers"
-                raise invalid(path, repr(value)[:80], f"Give {parts}: {', '.join(names)}.")
+                raise invalid(path, repr(value)[:80], f"Give a list: {', '.join(names)}.")
             return message, dict(zip(names, value, strict=True))
-        case "GripperChoice":
-            named = isinstance(value, str)
-            return (message, {"name": value}) if named else (message.geometry, value)
         case "Shape" | "Obstacle":
             kind = fields.pop("kind", None)
             if kind not in names:
-                found = kind if isinstance(value, Mapping) else value
                 fix = f"Set its kind to one of {', '.join(names)}."
-                raise invalid(path, repr(found)[:80], fix)
+                raise invalid(path, repr(value if kind is None else kind)[:80], fix)
             return getattr(message, kind), fields
+        case "Support" | "Suppression" if value is None:
+            return message, {"disabled": True}
+        case "Support" if value == "none":
+            return message, {"disabled": True}
         case "Support":
-            if value is None or value == "none":
-                return message, {"disabled": True}
             kind = value if isinstance(value, str) else fields.pop("kind", "plane")
             if kind in ("auto", "ransac"):
                 return getattr(message, kind), fields
@@ -301,8 +257,10 @@ def _target(message: Any, value: Any, path: str) -> tuple[Any, Any]:
                 fix = "Set its kind to one of auto, plane, ransac, none."
                 raise invalid(path, repr(kind)[:80], fix)
             return message, fields if isinstance(value, Mapping) else value
-        case "Suppression" if value is None:
-            return message, {"disabled": True}
-        case "Collision" if isinstance(value, str):
-            return message, {"mode": value}
+        case "HandPose":
+            return message, {names[0]: value}
+        case "Collision" | "GripperChoice" if isinstance(value, str):
+            return message, {names[0]: value}
+        case "GripperChoice":
+            return message.geometry, value
     return message, value

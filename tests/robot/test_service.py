@@ -15,7 +15,7 @@ from tests.robot.arms import BOXES, TURNED, scene_of
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client import GraspClient
-from edgegrasp_client.over_grpc import wire_of
+from edgegrasp_client.over_grpc import message_of
 from edgegrasp_client.requests import Request
 from edgegrasp_client.results import read_as
 from edgegrasp_model.results import Pace
@@ -61,7 +61,7 @@ def ask(robot, transport, settings=SETTINGS, **changes):
     asked = {"name": "fr3", "T_base_cloud": TURNED, "joints": robot.home} | changes
     request = Request(catalogue.cloud, {"robot": asked})
     if transport == "grpc":
-        body = b"".join(wire_of(request))
+        body = message_of(request).SerializeToString()
         return answer(Job("DetectGrasps", "grpc", body, 60.0), catalogue, settings), catalogue
     text = {"points": catalogue.cloud.tolist(), "options": dict(request.options)}
     job = Job("DetectGrasps", "http", json.dumps(text).encode(), 60.0, "application/json")
