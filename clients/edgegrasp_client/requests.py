@@ -54,14 +54,14 @@ class DepthImage(TypedDict):
 
 Cloud = Array | str | PathLike[str] | PointCloud2
 BESIDE = ("normals", "colors", "segment_ids", "view_ids")
-# Of each array: kinds of dtype, last sides of the shape, and both in words.
-ARRAYS: dict[str, tuple[str, tuple[int, ...], str]] = {
-    "normals": ("iuf", (3,), "an array of numbers, three for each row of the cloud"),
-    "colors": ("iuf", (3,), "an array of numbers, three for each row of the cloud"),
-    "segment_ids": ("iu", (), "an array of integers within 32 bits, one for each row of the cloud"),
-    "view_ids": ("iu", (), "an array of integers within 32 bits, one for each row of the cloud"),
-    "edges": ("iu", (2,), "an array (M, 2) of rows of the cloud"),
-    "hand_poses": ("f", (4, 4), "an array (M, 4, 4) of T_cloud_hand"),
+# Of each array: the dtype that is sent, and the shape of a row.
+ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "normals": ("float32", (3,)),
+    "colors": ("float32", (3,)),
+    "segment_ids": ("int32", ()),
+    "view_ids": ("int32", ()),
+    "edges": ("int32", (2,)),
+    "hand_poses": ("float64", (4, 4)),
 }
 
 
@@ -108,7 +108,6 @@ class Request:
         self.depth_images = [
             depth_image_fields(image, row) for row, image in enumerate(images or ())
         ]
-        # (N, 3) float32 or (N,) int32; edges (M, 2) and hand poses (M, 4, 4) as they were given.
         self.arrays = {
             name: _sent(name, array) for name, array in beside.items() if array is not None
         }
@@ -247,11 +246,9 @@ def cloud_file(cloud: Cloud) -> tuple[str, bytes]:
 
 def npy_bytes(array: Array) -> bytes:
     """An array as an .npy file; raises ValueError for one of objects."""
-    head, array = io.BytesIO(), np.asarray(array, order="C")
-    if array.dtype.hasobject:
-        raise ValueError("an array of objects")
-    np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(array))
-    return b"".join([head.getvalue(), array.reshape(-1).view(np.uint8).data])
+    file = io.BytesIO()
+    np.save(file, array, allow_pickle=False)
+    return file.getvalue()
 
 
 def _points_and_normals(message: PointCloud2) -> tuple[Array, Array | None]:
@@ -337,17 +334,13 @@ def _plain(value: Any) -> Any:
 
 def _sent(name: str, array: object) -> Array:
     """An array of the request as it is sent; raises InvalidRequestError where it is none."""
-    kinds, sides, wanted = ARRAYS[name]
+    kind, row = ARRAYS[name]
+    fix = f"Give an array of {kind} numbers, of shape ({', '.join(['N', *map(str, row)])})."
     if not isinstance(array, np.ndarray):
-        raise invalid(name, f"a {type(array).__name__}", f"Give {wanted}.")
-    to_score = name in ("edges", "hand_poses")
-    fits = array.shape[1 if to_score else array.ndim - len(sides) :] == sides
-    if not fits or array.dtype.kind not in kinds:
-        raise invalid(name, f"shape {array.shape}, dtype {array.dtype}", f"Give {wanted}.")
-    if to_score:
-        return array
-    if sides:
-        return np.ascontiguousarray(array.reshape(-1, 3), dtype=np.float32)
-    if array.size and (array.max() >= 2**31 or array.min() < -(2**31)):
-        raise invalid(name, f"values from {array.min()} to {array.max()}", f"Give {wanted}.")
-    return np.ascontiguousarray(array.reshape(-1), dtype=np.int32)
+        raise invalid(name, f"a {type(array).__name__}", fix)
+    rows = array.ndim - len(row)  # 2 where the cloud is organised
+    if rows < 1 or array.shape[rows:] != row or not np.can_cast(array.dtype, kind, "same_kind"):
+        raise invalid(name, f"shape {array.shape}, dtype {array.dtype}", fix)
+    if array.size and kind == "int32" and (array.max() >= 2**31 or array.min() < -(2**31)):
+        raise invalid(name, f"values from {array.min()} to {array.max()}", fix)
+    return np.ascontiguousarray(array.reshape(-1, *row), dtype=kind)
