@@ -55,23 +55,6 @@ class Connection(BaseModel, use_attribute_docstrings=True):
         )
 
 
-class PlannerFlags(Connection):
-    """The flags that choose a planner of the benchmark."""
-
-    timeout: float = 300.0
-    """Seconds to wait for a server"""
-    planner: str = "server"
-    """server, in-process, name of an installed planner, or module:callable"""
-    server: str | None = None
-    """host:port (gRPC) or http://host:port; without it, one is started"""
-    weights: tuple[Path, ...] = ()
-    """Weights besides those that ship"""
-    model: str = ""
-    """Weights to use: a name or a .safetensors file; empty: the default"""
-    robot: str | None = None
-    """Arm that executes the grasps with its own hand, in MuJoCo: name or .toml file"""
-
-
 class Server(Connection):
     """The flags of the server that a command is a client of."""
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from edgegrasp_cli.detect import OwnDetector
-from edgegrasp_cli.flags import PlannerFlags
 from edgegrasp_client import GraspClientError, Model, ServerUnavailableError, StartCollisionError
 from edgegrasp_client.connection import local_server
+from edgegrasp_lab.benchmark import PlannerFlags
 from edgegrasp_model.errors import StartCollision
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.protocol import PlanningRules
