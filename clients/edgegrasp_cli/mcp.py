@@ -209,11 +209,11 @@ class _Tools:
         image: tuple[Any, ...] = (),  # in place of a cloud: file, intrinsics, mask, scale, pose
     ) -> dict[str, Any]:
         """The arguments of `GraspClient.detect`; a tool's own ones come before its options."""
-        from edgegrasp_client import on_mask
+        from edgegrasp_client.requests import on_mask, plain_options
 
         if "top_k" in (options or {}):
             raise ValueError("options.top_k: got num_grasps beside it. Give num_grasps alone.")
-        asked = {**(options or {}), "top_k": num_grasps}
+        asked = plain_options(options or {}) | {"top_k": num_grasps}
         if viewpoint:
             asked["viewpoint"] = viewpoint
         if robot:
