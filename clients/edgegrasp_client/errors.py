@@ -98,7 +98,7 @@ def error_of_kind(
 
 def unreachable(address: str, why: str) -> ServerUnavailableError:
     """The exception for a call whose connection was not made or broke."""
-    hint = "Check the address, and that `edgegrasp serve` runs there."
+    hint = "Check the address, whether it needs TLS, and that `edgegrasp serve` runs there."
     return ServerUnavailableError(f"No connection to {address} ({why}). {hint}")
 
 
