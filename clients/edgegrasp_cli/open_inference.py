@@ -5,6 +5,7 @@ passes them on. The server's workers decode them.
 """
 
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -127,18 +128,19 @@ class Models:
     def infer(
         self,
         name: str,
+        version: str,
         inputs: Tensors,
         parameters: Mapping[str, Any],
-        timeout: float | None,
-        wanted: Sequence[str] = (),
-    ) -> tuple[dict[str, Any], list[Array]]:
+        wanted: Sequence[str],
+        timeout: float = math.inf,
+    ) -> dict[str, Any]:
         """Grasps of `points`, or of `depth` with `intrinsics`; parameters are options.
 
-        `timeout` among them is in microseconds; `wanted` are names of outputs, empty: all.
-
-        Returns:
-            The answer, with name, datatype and shape of each output; and the outputs.
+        `timeout` among them is in microseconds; `wanted` are names of outputs, empty: all. The
+        answer is as the protocol has it, with an array as the `data` of each output.
         """
+        if version:
+            self.check(name, version)
         asked = {key: option_of_text(value) for key, value in parameters.items()}
         options: Any = {key: value for key, value in asked.items() if key not in NOT_OPTIONS}
         if name != self._default:
@@ -155,22 +157,20 @@ class Models:
         if unknown := sorted(set(wanted) - set(OUTPUTS)):
             raise invalid("outputs", unknown[0], f"Ask for {', '.join(OUTPUTS)}.")
         plain_options(options)  # no other argument of the client
-        seconds = self._timeout if timeout is None else min(timeout, self._timeout)
+        seconds = min(timeout, self._timeout)
         micro = asked.get("timeout")
         if isinstance(micro, int | float) and micro > 0:
             seconds = min(seconds, micro / 1e6)
         found = self._client.detect(**cloud, **options, timeout=seconds)
-        outputs: list[dict[str, Any]] = []
-        arrays: list[Array] = []
+        outputs = []
         for each in dict.fromkeys(wanted or OUTPUTS):
             kind, shape = OUTPUTS[each]
             values = [getattr(grasp, each) for grasp in found.grasps]
             array = tensor(each, kind, shape, [-1 if value is None else value for value in values])
-            outputs.append({"name": each, "datatype": kind, "shape": array.shape})
-            arrays.append(array)
+            outputs.append({"name": each, "datatype": kind, "shape": array.shape, "data": array})
         said = {"model": found.model, "warnings": " ".join(found.warnings)}
-        answer = {"model_name": name, "model_version": VERSION, "outputs": outputs}
-        return answer | {"parameters": said}, arrays
+        answer = {"model_name": name, "model_version": VERSION}
+        return answer | {"outputs": outputs, "parameters": said}
 
 
 def tensor(name: str, datatype: str, shape: Any, data: Any) -> Array:
@@ -243,12 +243,10 @@ def _grpc_infer(models: Models, request: Any, call: Any) -> dict[str, Any]:
     kinds = {key: one.WhichOneof("parameter_choice") for key, one in request.parameters.items()}
     given = {key: kind and getattr(request.parameters[key], kind) for key, kind in kinds.items()}
     wanted = [each.name for each in request.outputs]
-    if request.model_version:
-        models.check(request.model_name, request.model_version)
-    seconds = call.time_remaining()
-    answer, arrays = models.infer(request.model_name, tensors, given, seconds, wanted)
+    model, seconds = (request.model_name, request.model_version), call.time_remaining()
+    answer = models.infer(*model, tensors, given, wanted, math.inf if seconds is None else seconds)
     said = {key: {"string_param": text} for key, text in answer["parameters"].items()}
-    contents = [array.tobytes() for array in arrays]
+    contents = [output.pop("data").tobytes() for output in answer["outputs"]]
     return {**answer, "id": request.id, "parameters": said, "raw_output_contents": contents}
 
 
@@ -272,10 +270,8 @@ def http_app(models: Models) -> Starlette:
             if len(body) > MAX_BODY_BYTES:
                 raise errors.PayloadTooLargeError(f"The body is over {MAX_BODY_BYTES:,} bytes.")
         header = request.headers.get("inference-header-content-length")
-        name = request.path_params["name"]
-        if "version" in request.path_params:
-            await run_in_threadpool(partial(models.check, **request.path_params))
-        return JSONResponse(await run_in_threadpool(_http_infer, models, name, body, header))
+        work = partial(_http_infer, models, body=body, header=header, **request.path_params)
+        return JSONResponse(await run_in_threadpool(work))
 
     def refused(request: Request, error: Exception) -> Response:
         assert isinstance(error, errors.GraspClientError)
@@ -300,7 +296,9 @@ def http_app(models: Models) -> Starlette:
     return Starlette(routes=routes, exception_handlers={errors.GraspClientError: refused})
 
 
-def _http_infer(models: Models, name: str, body: bytearray, header: str | None) -> dict[str, Any]:
+def _http_infer(
+    models: Models, name: str, body: bytearray, header: str | None, version: str = ""
+) -> dict[str, Any]:
     """The answer to the body of an inference; raises GraspClientErrors."""
     try:
         head = len(body) if header is None else min(int(header), len(body))
@@ -325,7 +323,7 @@ def _http_infer(models: Models, name: str, body: bytearray, header: str | None) 
         raise
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise invalid("body", repr(error), "Give the JSON of an inference request.") from None
-    answer, arrays = models.infer(name, tensors, parameters, None, wanted)
-    for output, array in zip(answer["outputs"], arrays, strict=True):
-        output["data"] = array.ravel().tolist()
+    answer = models.infer(name, version, tensors, parameters, wanted)
+    for output in answer["outputs"]:
+        output["data"] = output["data"].ravel().tolist()
     return answer | {"id": request.get("id", "")}
