@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -321,7 +322,7 @@ def planning(client, cloud) -> Asked:
     motion = ArmTrajectory(["a", "b"], 0.75 * np.arange(7), rows, -rows, 1, 3, 5)
     arm = ArmPlan(True, rows[1], rows[3], motion)
     asked = Asked(replace(found, grasps=[replace(found.grasps[0], arm=arm)]))
-    asked.robots = lambda: [ARM]
+    asked.robots = Mock(return_value=[ARM])
     return asked
 
 
@@ -351,6 +352,9 @@ def test_a_known_arm_is_where_it_is_before_a_scene(planning, cloud) -> None:
     scene, options = Scene(joints={"a": 0.1, "b": 0.2}), {"robot": "arm"}
     detect(planning, scene, options=options, object_cloud=make_cloud(cloud))
     assert planning.given["robot"]["joints"] == [0.1, 0.2]
+    planning.robots.reset_mock()  # they are known until there is an error
+    detect(planning, scene, options=options, object_cloud=make_cloud(cloud))
+    planning.robots.assert_not_called()
     unknown, lacking = ("other", {}), ("arm", {"a": 0.1})
     for (name, joints), said in ((unknown, "robots are arm"), (lacking, "no position of 'b'")):
         with pytest.raises(ValueError, match=said):

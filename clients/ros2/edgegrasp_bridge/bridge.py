@@ -6,8 +6,9 @@ frame, except for `moveit_msgs/Grasp`, which has the end effector's parent link.
 """
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,10 +17,10 @@ from edgegrasp_camera.arrays import Array, Float64
 from edgegrasp_camera.clouds import read_point_cloud2
 from edgegrasp_camera.depth import intrinsics_of, metres, unproject
 from edgegrasp_camera.picture import fork
-from edgegrasp_client import GraspClient, GraspTracker, conversions, object_in_scene, on_mask
+from edgegrasp_client import GraspClient, GraspClientError, GraspTracker, Robot, conversions
 from edgegrasp_client.conversions import Message, pose_fields, xyz_fields
 from edgegrasp_client.options import DetectOptions
-from edgegrasp_client.requests import option_of_text
+from edgegrasp_client.requests import object_in_scene, on_mask, option_of_text
 from edgegrasp_results import Detection
 
 Lookup = Callable[[str, str, Any], Float64]
@@ -209,13 +210,17 @@ def detect(
     elif cloud is None:
         asked["depth_images"] = [
             {
-                "depth": depth_array(depth),
+                "depth": image_array(depth, DEPTHS),
                 "intrinsics": camera_matrix(camera),
                 "T_cloud_camera": lookup(frame_id, depth.header.frame_id, depth.header.stamp),
             }
             for depth, camera in ((scene.depth, scene.camera), *scene.others)
         ]
-    found = client.detect(cloud, **asked)
+    try:
+        found = client.detect(cloud, **asked)
+    except GraspClientError:  # perhaps its robots are others now
+        _robots.cache_clear()
+        raise
     if tracker is not None:
         tracker.take(found)
     target, grasps = settings.target_frame or frame_id, []
@@ -316,18 +321,11 @@ def failed_result(object_id: str, why: Exception) -> Message:
     return {"results": [{"object_id": object_id, "success": False, "message": message}]}
 
 
-def depth_array(image: Any) -> Array:
-    """The depths (H, W) of a sensor_msgs/Image, uint16 mm or float32 m; else a ValueError."""
-    if image.encoding not in DEPTHS:
-        raise ValueError(f"encoding: got {image.encoding!r} for depths. Send {', '.join(DEPTHS)}.")
-    return image_array(image)
-
-
-def image_array(image: Any) -> Array:
-    """The values (H, W) or (H, W, C) of a sensor_msgs/Image; raises ValueError for its encoding."""
-    if image.encoding not in ENCODINGS:
-        known = ", ".join(ENCODINGS)
-        raise ValueError(f"encoding: got {image.encoding!r}. Send one of: {known}.")
+def image_array(image: Any, known: Collection[str] = ENCODINGS) -> Array:
+    """The values (H, W) or (H, W, C) of a sensor_msgs/Image; ValueError for an unknown encoding."""
+    if image.encoding not in known:
+        value = f"{image.encoding!r} for this image"
+        raise ValueError(f"encoding: got {value}. Send one of {', '.join(known)}.")
     kind, channels = ENCODINGS[image.encoding]
     dtype = np.dtype(f"{'>' if image.is_bigendian else '<'}{kind}")
     rows = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
@@ -360,15 +358,20 @@ def matrix_of(transform: Any) -> Float64:
     return T
 
 
+@lru_cache(1)  # a camera's images are many
+def _robots(client: GraspClient) -> dict[str, Robot]:
+    return {robot.name: robot for robot in client.robots()}
+
+
 def _robot(
     client: GraspClient, asked: str | Mapping[str, Any], scene: Scene, lookup: Lookup
 ) -> dict[str, Any]:
     """The option `robot`, of which a name is enough, with the arm's joints and pose."""
     given = {"name": asked} if isinstance(asked, str) else asked
-    listed = {robot.name: robot for robot in client.robots()}
-    robot = listed.get(str(given.get("name")))
-    if robot is None:
-        name, known = given.get("name"), ", ".join(listed) or "none: set its setting `robots`"
+    name, listed = given.get("name"), _robots(client)
+    if (robot := listed.get(str(name))) is None:
+        _robots.cache_clear()
+        known = ", ".join(listed) or "none: set its setting `robots`"
         raise ValueError(f"options.robot: got {name!r}. The server's robots are {known}.")
     joints = [scene.joints.get(name) for name in robot.joint_names]
     if None in joints and "joints" not in given:
@@ -395,7 +398,8 @@ def _points(scene: Scene) -> Any:
     """Points (N, 3) or (H, W, 3) of the scene's cloud, or else of its depth image; own frame."""
     if scene.cloud is not None:
         return read_point_cloud2(scene.cloud).points
-    return unproject(metres(depth_array(scene.depth)), intrinsics_of(camera_matrix(scene.camera)))
+    camera = intrinsics_of(camera_matrix(scene.camera))
+    return unproject(metres(image_array(scene.depth, DEPTHS)), camera)
 
 
 def _seconds(stamp: Any) -> float:
