@@ -106,11 +106,9 @@ class View:
         around = np.arange(-spread, spread + 1)
         column = np.add.outer(column, np.tile(around, len(around)))
         row = np.add.outer(row, np.repeat(around, len(around)))
-        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        image = np.full(self.shape, -1)
-        of_point = np.broadcast_to(seen[:, None], row.shape)
-        image[row[inside], column[inside]] = of_point[inside]
-        return image
+        image = np.full((rows + 1, columns + 1), -1)  # with a border, which takes what is outside
+        image[np.clip(row, -1, rows), np.clip(column, -1, columns)] = seen[:, None]
+        return image[:-1, :-1]
 
 
 class Picture:
@@ -230,9 +228,9 @@ class Picture:
         """Distance of the cloud at pixels (..., 2); NaN where there is no point."""
         column, row = np.moveaxis(np.rint(pixels).astype(int), -1, 0)
         rows, columns = self.view.shape
-        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        at = np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
-        return np.where(inside, self._depth[at], np.nan)
+        bordered = np.pad(self._depth, (0, 1), constant_values=np.nan)
+        found: Float64 = bordered[np.clip(row, -1, rows), np.clip(column, -1, columns)]
+        return found
 
     def save(self, path: Path | BinaryIO) -> None:
         """Write it: a `.png` or `.jpg` file, whose folder must exist, or a PNG to a stream."""
