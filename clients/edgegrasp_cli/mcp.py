@@ -88,24 +88,18 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
     from mcp.server.mcpserver import MCPServer
 
     tools = _Tools(client, folder)
-    functions = (
-        tools.generate_grasps_from_point_cloud,
-        tools.generate_grasps_from_depth,
-        tools.visualize_grasps,
-        tools.edgegrasp_health_check,
-        tools.edgegrasp_server_info,
-    )
+    names = [name for name in vars(_Tools) if not name.startswith("_")]
     return MCPServer(
         "edgegrasp",
         instructions=INSTRUCTIONS,
         version=importlib.metadata.version("edgegrasp"),
         log_level="WARNING",
-        tools=[_tool(function, folder) for function in functions],
+        tools=[_tool(getattr(tools, name), folder) for name in names],
     )
 
 
 class _Tools:
-    """The tools that an agent calls; it reads their docstrings and arguments."""
+    """The tools that an agent calls, each a method; it reads their docstrings and arguments."""
 
     def __init__(self, client: "GraspClient", folder: Path) -> None:
         self._client, self._folder = client, folder
