@@ -137,11 +137,12 @@ class Inbox:
             return Scene(joints=self._joints)
         source, mask = sources[-1], self._mask if mask_age > 0 else None
         if mask is not None:
-            age = _seconds(source.header.stamp) - _seconds(mask.header.stamp)
+            newest, its = source.header.stamp, mask.header.stamp
+            age = newest.sec - its.sec + 1e-9 * (newest.nanosec - its.nanosec)
             if age > mask_age:
                 why = f"The mask is {age:.3g} s older than the newest image"
                 raise ValueError(f"{why}. Send masks, or set mask_age: {mask_age:g} s.")
-            same = [each for each in sources if each.header.stamp == mask.header.stamp]
+            same = [each for each in sources if each.header.stamp == its]
             if not same:
                 raise ValueError("No image has the stamp of the mask. Copy the image's header.")
             source = same[-1]
@@ -400,7 +401,3 @@ def _points(scene: Scene) -> Any:
         return read_point_cloud2(scene.cloud).points
     camera = intrinsics_of(camera_matrix(scene.camera))
     return unproject(metres(image_array(scene.depth, DEPTHS)), camera)
-
-
-def _seconds(stamp: Any) -> float:
-    return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
