@@ -58,10 +58,8 @@ class Grasps:
         method = METHODS.get(request.url.path, "")
         if method in ("Live", "Ready"):
             return JSONResponse({"status": method.lower()})
-        if method == "ListModels":
-            return JSONResponse({"models": self._catalogue.describe()})
-        if method == "ListRobots":
-            return JSONResponse({"robots": self._robots()})
+        if method in ("ListModels", "ListRobots"):
+            return JSONResponse(self._listed(method))
         if method not in get_args(Method) or request.method != "POST":
             return Response(status_code=404)
         content_type = request.headers.get("content-type", "")
@@ -80,22 +78,18 @@ class Grasps:
 
     DetectGrasps, ScoreGrasps = _rpc("DetectGrasps"), _rpc("ScoreGrasps")
 
-    async def ListModels(  # noqa: N802  # as the RPC
-        self, request: grasp_pb2.ListModelsRequest
-    ) -> grasp_pb2.ListModelsResponse:
+    async def ListModels(self, request: Any) -> Any:  # noqa: N802  # as the RPC
         """Answer over gRPC."""
-        models = [grasp_pb2.Model(**facts) for facts in self._catalogue.describe()]
-        return grasp_pb2.ListModelsResponse(models=models)
+        return grasp_pb2.ListModelsResponse(**self._listed("ListModels"))
 
-    async def ListRobots(  # noqa: N802  # as the RPC
-        self, request: grasp_pb2.ListRobotsRequest
-    ) -> grasp_pb2.ListRobotsResponse:
+    async def ListRobots(self, request: Any) -> Any:  # noqa: N802  # as the RPC
         """Answer over gRPC."""
-        robots = [grasp_pb2.Robot(**facts) for facts in self._robots()]
-        return grasp_pb2.ListRobotsResponse(robots=robots)
+        return grasp_pb2.ListRobotsResponse(**self._listed("ListRobots"))
 
-    def _robots(self) -> list[dict[str, Any]]:
-        return [robot.describe() for robot in load_robots(self._settings).values()]
+    def _listed(self, method: str) -> dict[str, Any]:
+        if method == "ListModels":
+            return {"models": self._catalogue.describe()}
+        return {"robots": [robot.describe() for robot in load_robots(self._settings).values()]}
 
     async def _answer(self, job: Job) -> Answer:
         return await asyncio.to_thread(answer, job, self._catalogue, self._settings)
