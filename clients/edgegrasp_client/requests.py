@@ -278,15 +278,13 @@ def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
         raise invalid(f"{path}.T_cloud_camera", repr(given)[:80], "Give a 4 x 4 matrix.")
     depth = _depth_fields(image["depth"], f"{path}.depth")
     try:
-        camera = intrinsics_of(image["intrinsics"])._asdict()
-        intrinsics = {name: float(number) for name, number in camera.items()}
-    except (TypeError, ValueError):
+        intrinsics = intrinsics_of(image["intrinsics"])._asdict()
+    except ValueError:
         fix = "Give fx, fy, cx, cy in pixels, or the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."
         raise invalid(f"{path}.intrinsics", repr(image["intrinsics"])[:80], fix) from None
-    fields = {"depth": depth, "intrinsics": intrinsics}
-    fields["T_cloud_camera"] = pose.astype(float).tolist()
-    scale = _plain(image.get("depth_scale"))
-    return fields if scale is None else fields | {"depth_scale": scale}
+    fields = {"depth": depth, "intrinsics": intrinsics, "T_cloud_camera": pose.astype(float)}
+    plain: dict[str, Any] = _plain({**fields, "depth_scale": image.get("depth_scale")})
+    return plain
 
 
 def _depth_fields(depth: object, path: str) -> dict[str, Any]:
