@@ -117,13 +117,12 @@ class Models:
     def metadata(self, name: str, version: str = "") -> dict[str, Any]:
         """The inputs and outputs of a model, as the protocol describes them."""
         self.check(name, version)
-        described: dict[str, Any] = {"name": name, "versions": [VERSION], "platform": PLATFORM}
-        for side, table in (("inputs", INPUTS), ("outputs", OUTPUTS)):
-            described[side] = [
-                {"name": each, "datatype": kind, "shape": shape}
-                for each, (kind, shape) in table.items()
-            ]
-        return described
+        inputs, outputs = (
+            [{"name": each, "datatype": kind, "shape": shape} for each, (kind, shape) in table]
+            for table in (INPUTS.items(), OUTPUTS.items())
+        )
+        about = {"name": name, "versions": [VERSION], "platform": PLATFORM}
+        return {**about, "inputs": inputs, "outputs": outputs}
 
     def infer(
         self,
@@ -177,9 +176,8 @@ def tensor(name: str, datatype: str, shape: Any, data: Any) -> Array:
     """A tensor of bytes, little-endian, or of nested or flat lists; raises InvalidRequestError."""
     try:
         dtype = DTYPES[datatype]
-        raw = isinstance(data, bytes)
-        flat = np.frombuffer(data, dtype) if raw else np.asarray(data, dtype)
-        return flat.reshape([int(size) for size in shape])
+        read = np.frombuffer if isinstance(data, bytes) else np.asarray
+        return read(data, dtype).reshape([int(size) for size in shape])
     except (KeyError, OverflowError, TypeError, ValueError) as error:
         why = f"a datatype {datatype}" if isinstance(error, KeyError) else str(error)
         fix = f"Give {', '.join(DTYPES)}, as many values as the shape has."
@@ -319,8 +317,6 @@ def _http_infer(
             tensors[each["name"]] = tensor(each["name"], each["datatype"], each["shape"], data)
         parameters = dict((request.get("parameters") or {}).items())
         wanted = [str(each["name"]) for each in request.get("outputs") or ()]
-    except errors.InvalidRequestError:
-        raise
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise invalid("body", repr(error), "Give the JSON of an inference request.") from None
     answer = models.infer(name, version, tensors, parameters, wanted)
