@@ -164,11 +164,6 @@ class Picture:
         grey = 70 + 165 * lit(depth, abs(self.view.fx), self.view.fy)
         return np.repeat(grey[..., None], 3, axis=2)
 
-    def lines(self, points: ArrayLike, color: str, width: float, style: str = "-") -> None:
-        """Draw a line through points (K, 3), cloud frame."""
-        pixels, _ = self.view.project(points)
-        self._axes.plot(*pixels.T, style, color=color, linewidth=width)
-
     def outline(self, mask: Bools) -> None:
         """Draw the border of a mask (H, W) in white."""
         if mask.any():
@@ -176,15 +171,16 @@ class Picture:
 
     def regions(self, options: Mapping[str, Any]) -> None:
         """Draw the workspace and the boxes and balls of the regions of a request's options."""
-        boxes = [{"kind": "box", **options["workspace"]}] if options.get("workspace") else []
-        drawn: list[Any] = [(shape, "-") for shape in boxes]
+        workspace = options.get("workspace")
+        drawn: list[Any] = [({"kind": "box", **workspace}, "-")] if workspace else []
         for name in ("approach_region", "contact_region"):
             region = options.get(name) or {}
             drawn += [(shape, "-") for shape in region.get("include", ())]
             drawn += [(shape, ":") for shape in region.get("exclude", ())]
         for shape, style in drawn:
             for line in _lines_of(shape):
-                self.lines(line, REGION, 1.6, style)
+                pixels, _ = self.view.project(line)
+                self._axes.plot(*pixels.T, style, color=REGION, linewidth=1.6)
 
     def grasps(self, grasps: Sequence[Any], palm_and_tip: tuple[float, float] = PANDA) -> None:
         """Draw a fork for every grasp, the best last, and the scale of their scores.
