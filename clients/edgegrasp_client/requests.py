@@ -101,9 +101,13 @@ class Request:
         if to_score and (to_score["edges"] is None) == (to_score["hand_poses"] is None):
             value = "nothing" if to_score["edges"] is None else "edges beside hand_poses"
             raise invalid("edges", value, "Give edges or hand_poses.")
-        if isinstance(cloud, PointCloud2):
-            cloud, normals = _points_and_normals(cloud)
-            beside["normals"] = normals if beside["normals"] is None else beside["normals"]
+        if isinstance(cloud, PointCloud2):  # points and normals are all that a grasp depends on
+            try:
+                read: Any = read_point_cloud2(cloud)
+            except InvalidRequest as error:
+                raise invalid(error.field, error.value, error.fix) from None
+            cloud = read.points
+            beside["normals"] = read.normals if beside["normals"] is None else beside["normals"]
         self.cloud = cloud
         self.depth_images = [
             depth_image_fields(image, row) for row, image in enumerate(images or ())
@@ -249,15 +253,6 @@ def npy_bytes(array: Array) -> bytes:
     file = io.BytesIO()
     np.save(file, array, allow_pickle=False)
     return file.getvalue()
-
-
-def _points_and_normals(message: PointCloud2) -> tuple[Array, Array | None]:
-    """What a grasp depends on; raises InvalidRequestError for a message that contradicts itself."""
-    try:
-        found: Any = read_point_cloud2(message)
-    except InvalidRequest as error:
-        raise invalid(error.field, error.value, error.fix) from None
-    return found.points, found.normals
 
 
 def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
