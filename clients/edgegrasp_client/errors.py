@@ -81,18 +81,23 @@ _BY_KIND: dict[str, type[GraspClientError]] = {
     "cancelled": ServerUnavailableError,
     "request-timeout": DeadlineError,
     "deadline-exceeded": DeadlineError,
+    # Status codes of gRPC, from something else such as a proxy.
+    "invalid-argument": InvalidRequestError,
+    "resource-exhausted": PayloadTooLargeError,
+    "internal": ServerUnavailableError,
+    "unknown": ServerFailedError,
 }
 
 
 def error_of_kind(
-    kind: str, message: str, field: str, value: str, fix: str, retry_after: float | None
+    kind: str, message: str, *where: str, retry_after: float | None = None
 ) -> GraspClientError:
-    """The exception for an error reported by the server."""
+    """The exception for an error reported by the server; `where`: field, value and fix."""
     error = _BY_KIND.get(kind, ProtocolError)
     if issubclass(error, OverloadedError) and retry_after is not None:
         return error(message, retry_after)
     if issubclass(error, InvalidRequestError):
-        return error(message, field, value, fix)
+        return error(message, *where)
     return error(message)
 
 

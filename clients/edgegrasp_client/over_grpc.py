@@ -36,17 +36,6 @@ SERVING = b"\x08\x01"
 
 ERROR_METADATA = "edgegrasp-error-bin"
 
-_BY_CODE: dict[grpc.StatusCode, type[GraspClientError]] = {
-    grpc.StatusCode.DEADLINE_EXCEEDED: errors.DeadlineError,
-    grpc.StatusCode.INVALID_ARGUMENT: errors.InvalidRequestError,
-    grpc.StatusCode.RESOURCE_EXHAUSTED: errors.PayloadTooLargeError,
-    grpc.StatusCode.UNAUTHENTICATED: errors.AccessDeniedError,
-    grpc.StatusCode.PERMISSION_DENIED: errors.AccessDeniedError,
-    grpc.StatusCode.CANCELLED: errors.ServerUnavailableError,
-    grpc.StatusCode.INTERNAL: errors.ServerUnavailableError,  # of a proxy; ours send more detail
-    grpc.StatusCode.UNKNOWN: errors.ServerFailedError,
-}
-
 
 class GrpcTransport:
     """Calls over one channel; raises GraspClientErrors."""
@@ -149,13 +138,14 @@ def _error_of(error: Any, address: str) -> GraspClientError:
     except (DecodeError, KeyError):
         if code == grpc.StatusCode.UNAVAILABLE:
             return errors.unreachable(address, message)
-        return _BY_CODE.get(code, errors.ProtocolError)(f"{code.name}: {message}")
+        kind = code.name.lower().replace("_", "-")
+        return error_of_kind(kind, f"{code.name}: {message}")
     return _described(message, detail)
 
 
 def _described(message: str, detail: grasp_pb2.ErrorDetail) -> GraspClientError:
-    retry_after = field_of(detail, "retry_after")
-    return error_of_kind(detail.kind, message, detail.field, detail.value, detail.fix, retry_after)
+    where, after = (detail.field, detail.value, detail.fix), field_of(detail, "retry_after")
+    return error_of_kind(detail.kind, message, *where, retry_after=after)
 
 
 # Requests

@@ -165,10 +165,9 @@ def _described(problem: Mapping[str, Any], response: httpx.Response) -> GraspCli
     kind = str(problem.get("type", ""))
     if not kind.startswith(KIND_PREFIX):
         return _foreign(response)
-    names = ("detail", "field", "value", "fix")
-    message, field, value, fix = (str(problem.get(name, "")) for name in names)
-    retry_after = problem.get("retry_after")
-    return error_of_kind(kind.removeprefix(KIND_PREFIX), message, field, value, fix, retry_after)
+    said = (str(problem.get(name, "")) for name in ("detail", "field", "value", "fix"))
+    after = problem.get("retry_after")
+    return error_of_kind(kind.removeprefix(KIND_PREFIX), *said, retry_after=after)
 
 
 def _foreign(response: httpx.Response) -> GraspClientError:
