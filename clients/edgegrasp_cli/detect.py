@@ -260,19 +260,17 @@ def _depth_images(file: Path | None, asked: DetectFlags) -> "list[DepthImage] | 
         return None
     if not intrinsics:
         raise ValueError(f"--intrinsics: got nothing. Give fx,fy,cx,cy of {depths[0]}, in pixels.")
-    if len(intrinsics) == 1:
-        intrinsics = intrinsics * len(depths)
+    intrinsics = intrinsics * len(depths) if len(intrinsics) == 1 else intrinsics
+    each = f"one for each of {len(depths)} images."
     if len(intrinsics) != len(depths):
-        each = f"Give one for all, or one for each of {len(depths)} images."
-        raise ValueError(f"--intrinsics: got {len(intrinsics)}. {each}")
+        raise ValueError(f"--intrinsics: got {len(intrinsics)}. Give one for all, or {each}")
     if len(poses) != len(depths) and (poses or len(depths) > 1):
-        raise ValueError(f"--pose: got {len(poses)}. Give one for each of {len(depths)} images.")
-    images: list[DepthImage] = []
-    for depth, camera, pose in zip_longest(depths, intrinsics, poses):
-        image: Any = {"depth": depth, "intrinsics": value_of_text("intrinsics", camera)}
-        image |= {} if pose is None else {"T_cloud_camera": value_of_text("pose", pose)}
-        image |= {} if asked.depth_scale is None else {"depth_scale": asked.depth_scale}
-        images.append(image)
+        raise ValueError(f"--pose: got {len(poses)}. Give {each}")
+    images: list[Any] = [{"depth": depth, "depth_scale": asked.depth_scale} for depth in depths]
+    for image, camera, pose in zip_longest(images, intrinsics, poses):
+        image["intrinsics"] = value_of_text("intrinsics", camera)
+        if pose is not None:
+            image["T_cloud_camera"] = value_of_text("pose", pose)
     return images
 
 
