@@ -58,12 +58,14 @@ def benchmark_real(
         _ask(client, loaded[0], fields)  # loading and compiling take time
         for scene in track(loaded, "scenes", console=Console(stderr=True)):
             start = time.perf_counter()
-            found, refused = _ask(client, scene, fields)
+            _ask(client, scene, fields)
             milliseconds = 1000 * (time.perf_counter() - start)
+            # Not timed: a server takes up to twice as long to send labels.
+            found, refused = _ask(client, scene, {**fields, "debug": True})
             grasps = [] if found is None else found.grasps
             seen = None if found is None else found.support
             plane = None if seen is None else (np.asarray(seen.normal, np.float64), seen.offset)
-            labels = _labels(client, scene, fields, found)
+            labels = _labels(scene, found)
             answer = np.maximum(labels + 1, 0)
             figures = judge(scene, grasps, plane, answer, gripper, milliseconds, refused)
             done[scene.name] = figures
@@ -84,16 +86,11 @@ def _ask(client: Any, scene: RealScene, fields: Mapping[str, Any]) -> tuple[Any 
         return None, str(error)
 
 
-def _labels(client: Any, scene: RealScene, fields: Mapping[str, Any], found: Any | None) -> Int64:
-    """The detector's label of each point (R,), as in `DebugInfo`, from an untimed request.
-
-    Everything is unlabelled if the detector refuses or finds no object.
-    """
-    if found is not None and found.objects:
-        found, _ = _ask(client, scene, {**fields, "debug": True})
-        if found is not None and found.debug is not None:
-            return np.asarray(found.debug.labels, dtype=np.int64)
-    return np.full(len(scene.points), UNLABELLED)
+def _labels(scene: RealScene, found: Any | None) -> Int64:
+    """The detector's label of each point (R,); none without an object."""
+    if found is None or not found.objects or found.debug is None:
+        return np.full(len(scene.points), UNLABELLED)
+    return np.asarray(found.debug.labels, dtype=np.int64)
 
 
 def _write(
