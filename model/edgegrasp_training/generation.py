@@ -123,7 +123,9 @@ def generate(
     if weights is not None and not weights.is_file():  # not only once a scene is cleared by them
         raise ValueError(f"weights: got {weights}, which is no file. Name a .safetensors file")
     options = options.model_copy(update=found | {"weights": weights})
-    if other := different(folder.glob("*.npz"), "engine") - {options.engine}:
+    # One view of each kind and seed: the other scenes of a seed are made by the same engine.
+    some = {path.name.rsplit("-", 1)[0]: path for path in folder.glob("*.npz")}
+    if other := different(some.values(), "engine") - {options.engine}:
         raise ValueError(
             f"{folder} holds labels of {', '.join(other)}, not of {options.engine}; "
             "choose another folder"
