@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from rich.progress import Progress, track
 from typer import Argument, Option
 
@@ -135,14 +136,16 @@ def generate_scenes(
 
     Example: edgegrasp generate-scenes data/scenes --objects OBJECTS --files 110
     """
-    from edgegrasp_training.scene_images import generate
+    from edgegrasp_training.scene_images import FILE, generate
 
     meshes = sorted(objects.glob("*/train/*_visual.obj"))
     if not meshes:
         raise ValueError(f"objects: got {objects}. Give a folder with */train/*_visual.obj.")
-    part = partial(generate, output, meshes, files, seed, parts=workers)
+    part = partial(generate, output, meshes, seed)
+    missing = [number for number in range(files) if not (output / FILE.format(number)).exists()]
+    # Each worker makes neighbours, which draw from the same objects.
     with interruptible("generate-scenes", resumes=True), ProcessPoolExecutor(workers) as pool:
-        list(pool.map(part, range(workers)))  # raises what a part does
+        list(pool.map(part, np.array_split(missing, workers)))  # raises what a part does
     print(f"{len(list(output.glob('scenes-????.npz')))} files in {output}.")
 
 

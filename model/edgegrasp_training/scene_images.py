@@ -41,6 +41,7 @@ from edgegrasp_training.shapes import NUM_DRAWN, drawn_shape
 WIDTH, HEIGHT = 480, 352  # pixels
 DEPTH_UNIT = 0.0002  # metres of a stored depth; 16 bits reach 13 m
 VIEWS_PER_SCENE = 4
+FILE = "scenes-{:04d}.npz"
 SCENES_PER_FILE = 50
 FILES_PER_POOL = 20  # that draw from the same objects
 NUM_POOL, NUM_ARMS = 900, 60
@@ -70,20 +71,15 @@ class SceneImage(NamedTuple):
 
 
 def generate(
-    folder: Path,  # gets `scenes-NNNN.npz`
+    folder: Path,  # gets a FILE for each number
     objects: Sequence[Path],  # OBJ files of training objects
-    files: int,  # of SCENES_PER_FILE scenes, with VIEWS_PER_SCENE images each
     seed: int,
-    part: int,  # which share of the files this process writes, from 0
-    parts: int,  # how many shares there are
+    numbers: Sequence[int],  # ascending: neighbours draw from the same objects
 ) -> None:
-    """Write the numbered files of images that do not exist yet."""
+    """Write files of SCENES_PER_FILE scenes, with VIEWS_PER_SCENE images each."""
     folder.mkdir(parents=True, exist_ok=True)
     drawn = -1
-    for number in range(part, files, parts):
-        path = folder / f"scenes-{number:04d}.npz"
-        if path.exists():
-            continue
+    for number in numbers:
         if drawn != number // FILES_PER_POOL:
             drawn = number // FILES_PER_POOL
             rng = np.random.default_rng([seed, drawn, 7])
@@ -92,6 +88,7 @@ def generate(
         images: list[SceneImage] = []
         while len(images) < SCENES_PER_FILE * VIEWS_PER_SCENE:
             images += make_images(draw_scene(rng, pool, arms))
+        path = folder / FILE.format(number)
         partial = path.with_suffix(".partial.npz")
         arrays = SceneImage(*map(np.stack, zip(*images, strict=True)))
         np.savez(partial, allow_pickle=False, **arrays._asdict())

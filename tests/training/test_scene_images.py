@@ -56,7 +56,7 @@ def test_a_file_is_made_and_learned_from(tmp_path: Path, monkeypatch: pytest.Mon
         monkeypatch.setattr(scene_training, name, value)
     mesh = tmp_path / "block.obj"
     mesh.write_text(block_obj(0.05, 0.04, 0.06))
-    generate(tmp_path / "data", [mesh], files=2, seed=1, part=0, parts=1)
+    generate(tmp_path / "data", [mesh], seed=1, numbers=range(2))
     assert len(list((tmp_path / "data").glob("scenes-????.npz"))) == 2
     train(tmp_path / "data", tmp_path / "run", seconds=0.2)
     assert (tmp_path / "run" / "scene.safetensors").is_file()
