@@ -29,7 +29,7 @@ from edgegrasp_model.options import (
 )
 from edgegrasp_model.ranking import COLLIDING, objects_first, ranked
 from edgegrasp_model.results import OBSTACLE, Following
-from edgegrasp_model.scene.cloud import pose_of, thinned
+from edgegrasp_model.scene.cloud import pose_of, thinned, unit
 from edgegrasp_model.scene.scene import Scene, numbers_chosen
 from edgegrasp_model.scene.segment import FIXED, UNKNOWN
 from edgegrasp_results import Evaluation, Grasp, Tracking
@@ -39,6 +39,7 @@ ALIVE = 0.25  # score from which a followed grasp may stay the first
 SLACK = 0.006  # metres by which the hand of a followed grasp may overlap the cloud
 AROUND = 0.03  # metres around followed objects in which they are searched
 FOREIGN = 0.5  # metres from the cloud beyond which `previous` must be in another frame
+ASIDE, IN_REACH = 0.1, 2.0  # radians beside the camera's view and metres from it: out of view
 # Registration: in each step, points farther from the cloud than this are left out, metres.
 STEPS = (*(0.03,) * 4, *(0.015,) * 4, *(0.008,) * 4)
 SPACING = 0.004  # metres to the nearest point along the surface within which the surface continues
@@ -79,7 +80,12 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
     places += [place for one in previous.objects for place in np.reshape(one.surface, (-1, 3))]
     if not places:
         return options
-    apart, _ = cKDTree(thinned(points, 2000)).query(np.array(places))
+    some = thinned(points, 2000)
+    apart = np.asarray(cKDTree(some).query(np.array(places))[0])
+    if options.viewpoint is not None:  # what is out of view may be anywhere near the camera
+        eye = np.reshape(options.viewpoint, (-1, 3)).mean(axis=0)
+        aside, _ = cKDTree(unit(some - eye)).query(unit(places - eye))
+        apart[(aside > ASIDE) & (np.linalg.norm(places - eye, axis=1) < IN_REACH)] = 0.0
     if (away := float(np.min(apart))) > FOREIGN:
         value = f"grasps {away:.2g} m from the nearest point of the cloud"
         fix = "Send previous in the frame of this cloud, or leave it out."

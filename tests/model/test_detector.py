@@ -56,6 +56,28 @@ def test_the_seed_decides_not_the_order_of_the_points_or_an_empty_previous() -> 
         np.testing.assert_allclose(a.T_cloud_hand, b.T_cloud_hand, atol=1e-4)
 
 
+@pytest.mark.parametrize("search", [True, False])
+def test_what_left_the_view_is_lost_and_what_is_of_another_frame_is_refused(search: bool) -> None:
+    first = detect(previous={})
+    hand, surface = first.grasps[0].T_cloud_hand, first.objects[0].surface
+
+    def again(scale: float = 1.0, shift: object = 0.0, **fields: object) -> Detection:
+        pose = hand.astype(np.float64)
+        pose[:3, 3] = scale * pose[:3, 3] + shift
+        known = {"number": 0, "surface": (scale * surface + shift).ravel().tolist()}
+        grasps = [{"id": 7, "T_cloud_hand": pose.ravel().tolist(), "object": 0}]
+        asked = {"gripper": "panda", "grasps": grasps, "objects": [known], "search": search}
+        return detect(previous=asked, **fields)
+
+    assert again().tracking.first == "kept"
+    for away in ((0.9, 0.0, 0.0), (0.0, -1.2, 0.3)):  # the camera moves with all that it sees
+        moved = {"cloud": CLOUD + np.float32(away), "viewpoint": np.add((0.3, 0.0, 0.5), away)}
+        assert again(**moved).tracking.first == "lost"
+    for wrong in ({"shift": (-0.5, 0.0, -0.9)}, {"shift": 2.0}, {"scale": 1000.0}):
+        with refusal("options.previous", "nearest point of the cloud"):
+            again(**wrong)
+
+
 def test_no_loop_is_compiled_again_for_the_read_only_cloud_of_a_message() -> None:
     cloud = CLOUD.astype(np.float32)
     found = detect(cloud, support="auto")
