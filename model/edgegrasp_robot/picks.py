@@ -294,11 +294,10 @@ class _Arm:
         # The detector has already checked the hand's approach and retreat.
         length = rules.retreat_length or rules.approach_length
         way = self._T_base_cloud[:3, :3].T @ direction * length
-        held = held or held_by(pick.grasp, self._scene, self._robot.gripper)
-        if not can_leave(held, self._scene, way, rules):
-            return []
         poses, straight = _straight(T_base_hand, direction, 0.0, length), self._robot.straight
-        return self._reach(poses, pick.line[-1:], straight, straight)[0]
+        line, _ = self._reach(poses, pick.line[-1:], straight, straight)
+        held = held or held_by(pick.grasp, self._scene, self._robot.gripper)
+        return line if line and can_leave(held, self._scene, way, rules) else []
 
     def _free_path(self, scene: core.Scene, start: Float64, end: Float64) -> list[Float64]:
         """Joints between which linear joint motions are collision-free; none: there are none."""
