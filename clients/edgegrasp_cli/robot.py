@@ -35,8 +35,9 @@ def add(
     edgegrasp robot add my.urdf --base base_link --flange tool0 --output my.toml
     """
     importlib.import_module("edgegrasp_robot")  # fails before there is a file
-    if output.suffix != ".toml" or output.exists():
-        raise ValueError(f"--output: got {str(output)!r}. Name a new file, .toml.")
+    if output.suffix != ".toml" or output.exists() or not output.parent.is_dir():
+        fix = "Name a new file, .toml, in a folder that exists."
+        raise ValueError(f"--output: got {str(output)!r}. {fix}")
     fields: dict[str, Any] = {
         "urdf": str(urdf.absolute()),
         "srdf": str(Path(srdf).absolute()) if srdf else "",

@@ -127,7 +127,11 @@ class Model:
 
     def scene(self, arm: RobotFile | Robot) -> core.Scene:
         """A scene with the robot alone."""
-        scene = core.Scene(GROUP, core.loadUrdfSceneDescriptionFromXml(self.urdf, []))
+        try:
+            read = core.loadUrdfSceneDescriptionFromXml(self.urdf, [])
+        except ValueError as error:
+            raise InvalidRobot(f"urdf: {error} Name one that check_urdf accepts.") from None
+        scene = core.Scene(GROUP, read)
         scene.addGroupFromChain(GROUP, arm.base_frame, arm.flange_frame)
         scene.allowAdjacentLinkCollisions()
         scene.setCollisions(self.allowed, False)
@@ -276,7 +280,8 @@ def _tree(field: str, file: Path) -> Element:
         text = file.read_text("utf-8")
         root = ElementTree.fromstring(text)
     except (ValueError, ElementTree.ParseError) as error:
-        raise InvalidRobot(f"{field}: {file.name} is not XML: {error}") from None
+        fix = "Correct it, or name another file."
+        raise InvalidRobot(f"{field}: {file.name} is not XML: {error}. {fix}") from None
     if "xacro:" not in text:
         return root
     try:

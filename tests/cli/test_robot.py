@@ -51,6 +51,7 @@ def test_a_picture_of_a_robot(run, tmp_path: Path) -> None:
         (("benchmark", "--robot", "fr3", "--engine", "drake"), "engine is 'drake'"),
         (("robot", "add", UR5, "--base", "b", *LINKS[2:], "--output", "x.toml"), "base_link"),
         (("robot", "add", UR5, *LINKS, "--output", "x.json"), "--output"),
+        (("robot", "add", UR5, *LINKS, "--output", "no/x.toml"), "in a folder that exists"),
         (("detect", "x.npy", "--robot", "fr3"), "--joints: got nothing"),
         (("detect", "x.npy", "--trajectory", "out.json"), "--trajectory: got no robot"),
     ],

@@ -92,6 +92,7 @@ def test_meshes_lie_beside_their_urdf_and_one_that_is_wrong_says_how(tmp_path, m
         ('<mesh filename="tip.obj"/>', '<box size="-1 1 1"/>', "a <collision> of tip is wrong"),
         ("<link", "<<link", "urdf: r.urdf is not XML"),
         (URDF, "<robot/>", r"mine\.toml: urdf: has no <link>"),
+        ("robot", "sdf", r"mine\.toml: urdf: .* Name one that check_urdf accepts"),
         ("<link", '<xacro:lost xmlns:xacro="http://www.ros.org/wiki/xacro"/><link', "Run xacro"),
     ):
         (tmp_path / "arm" / "r.urdf").write_text(URDF.replace(known, now))
