@@ -158,7 +158,8 @@ def _flag_type(annotation: Any) -> tuple[Any, str | None]:
     parts = [part for part in get_args(annotation) if part is not type(None)]
     choice = next((one for one in (annotation, *parts) if get_origin(one) is Literal), None)
     if choice is not None:
-        return str, "|".join(get_args(choice))
+        other = ["JSON"] if choice in parts and len(parts) > 1 else []
+        return str, "|".join([*get_args(choice), *other])
     if get_origin(annotation) is tuple and parts[-1] is ... and parts[0] in PLAIN:
         return list[parts[0]], None  # type: ignore[valid-type]
     only = parts[0] if len(parts) == 1 else annotation
