@@ -5,7 +5,7 @@ from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator
+from pydantic import AfterValidator, PositiveFloat
 
 from edgegrasp_sim.engine import Intrinsics
 from edgegrasp_sim.poses import Matrix
@@ -49,14 +49,16 @@ def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
     return ends
 
 
-Range = Annotated[tuple[float, float], AfterValidator(_ascending)]  # checked in a protocol's file
+# Checked in a protocol's file.
+Range = Annotated[tuple[float, float], AfterValidator(_ascending)]
+Sizes = Annotated[tuple[PositiveFloat, PositiveFloat], AfterValidator(_ascending)]
 
 
 @dataclass(frozen=True, slots=True)
 class ViewRange:
     """Where a camera may stand: ranges of spherical coordinates around `target`."""
 
-    radius: Range  # metres
+    radius: Sizes  # metres
     polar_degrees: Range  # from world z
     azimuth_degrees: Range  # from world x
     target: tuple[float, float, float]  # the point looked at, world frame, metres

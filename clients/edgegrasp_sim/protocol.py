@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, PositiveInt, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, NonNegativeFloat, PositiveInt, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from edgegrasp_sim.camera import Range, TableView, ViewRange
+from edgegrasp_sim.camera import Sizes, TableView, ViewRange
 from edgegrasp_sim.objects import SceneKind
-from edgegrasp_sim.sensor import SENSORS, DepthNoise, DepthSensor, random_sensor
+from edgegrasp_sim.sensor import SENSORS, DepthNoise, DepthSensor, Share, random_sensor
 from edgegrasp_sim.surroundings import OPEN_THICKNESS
 
 FOLDER = Path(__file__).parent / "protocols"
@@ -27,16 +27,16 @@ class SceneRules:
 
     # How many objects to try to place, in turn from round to round.
     num_objects: Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
-    packed_scale: Range  # range of the factor on the objects' size in packed scenes and on tables
-    pile_scale: Range  # range of that factor in piles and bins
-    table_thickness: float = OPEN_THICKNESS  # of packed and pile scenes, metres
+    packed_scale: Sizes  # range of the factor on the objects' size in packed scenes and on tables
+    pile_scale: Sizes  # range of that factor in piles and bins
+    table_thickness: NonNegativeFloat = OPEN_THICKNESS  # of packed and pile scenes, metres
 
 
 @dataclass(frozen=True, config=STRICT)
 class RoundRules:
     """What counts as held, and conditions that end a round."""
 
-    min_opening: float  # metres between the fingers; a hand that is open by less holds nothing
+    min_opening: NonNegativeFloat  # metres between fingers; open by less, a hand holds nothing
     max_consecutive_failures: PositiveInt  # failed grasps in a row that end a round
     max_no_grasp: PositiveInt  # views without any grasp that end a round
 
@@ -53,7 +53,7 @@ class NoiseRules(DepthNoise):
     """Noise of the depth image, see `DepthNoise`, and of the points made from it."""
 
     # Standard deviation of each coordinate of each point, metres.
-    point_std: Annotated[float, Field(ge=0.0)] = 0.0
+    point_std: NonNegativeFloat = 0.0
     # Kind of camera whose faults the images have besides; `random`: another before every grasp.
     sensor: Literal["", "random", "structured-light", "stereo", "time-of-flight"] = ""
 
@@ -71,11 +71,11 @@ class PlanningRules:
     # `around`: the cloud holds everything that the camera sees, and plane and workspace are given;
     # `auto`: the same, and only the camera's position is given.
     table: TableView
-    num_approach_points: int  # approach points sampled
-    num_candidates: int  # candidates scored at most
-    min_score: float  # no grasp is made that scores less
+    num_approach_points: PositiveInt  # approach points sampled
+    num_candidates: PositiveInt  # candidates scored at most
+    min_score: Share  # no grasp is made that scores less
     # Greatest relative error of depths, which a planner corrects by the known table.
-    max_depth_error: float = 0.0
+    max_depth_error: Share = 0.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -83,9 +83,9 @@ class Protocol:
     """A named and versioned way to run the benchmark."""
 
     name: str  # of the protocol
-    version: int  # raised whenever a constant changes
+    version: PositiveInt  # raised whenever a constant changes
     source: str  # where its constants come from
-    rounds: int  # how many rounds for each seed make a full run
+    rounds: PositiveInt  # how many rounds for each seed make a full run
     seeds: tuple[int, ...]  # of a full run
     scene: SceneRules  # what stands on the table
     round: RoundRules  # what ends a round

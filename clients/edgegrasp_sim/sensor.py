@@ -8,8 +8,10 @@ of a time-of-flight camera that fly between an edge and what is behind it (Sarbo
 """
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveInt
 from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter, zoom
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64
@@ -19,17 +21,18 @@ EDGE = 0.015  # metres between neighbouring pixels from which on they show diffe
 SAME_SURFACE = 0.004  # metres by which a pixel may lie behind what hides it
 WARP_PIXELS = 96  # between the independent values of the warp
 PATCH_PIXELS = 12  # between those of what is missing
+Share = Annotated[float, Field(ge=0.0, le=1.0)]  # checked in a protocol's file
 
 
 @dataclass(frozen=True, slots=True)
 class DepthNoise:
     """Noise of depth images: a random factor on each, and smooth Gaussian noise on some."""
 
-    gamma_shape: float = 0.0  # shape of the gamma distribution of the factor; 0: no factor
-    gamma_scale: float = 0.0  # its scale
-    correlated_std: float = 0.0  # standard deviation of the smooth noise, metres
-    correlated_pixels: int = 4  # pixels between its independent values, interpolated in between
-    correlated_share: float = 0.0  # share of the images that have it
+    gamma_shape: NonNegativeFloat = 0.0  # of the gamma distribution of the factor; 0: no factor
+    gamma_scale: NonNegativeFloat = 0.0  # its scale
+    correlated_std: NonNegativeFloat = 0.0  # standard deviation of the smooth noise, metres
+    correlated_pixels: PositiveInt = 4  # pixels between its independent values, interpolated
+    correlated_share: Share = 0.0  # share of the images that have it
 
     def apply(self, depth: Float64, rng: np.random.Generator) -> Float64:
         """A noisy copy of a depth image: (height, width) metres."""
