@@ -65,7 +65,9 @@ def benchmark_real(
             grasps = [] if found is None else found.grasps
             seen = None if found is None else found.support
             plane = None if seen is None else (np.asarray(seen.normal, np.float64), seen.offset)
-            labels = _labels(scene, found)
+            labels = np.full(len(scene.points), UNLABELLED)
+            if found is not None and found.objects:
+                labels = np.asarray(found.debug.labels, np.int64)
             answer = np.maximum(labels + 1, 0)
             figures = judge(scene, grasps, plane, answer, gripper, milliseconds, refused)
             done[scene.name] = figures
@@ -84,13 +86,6 @@ def _ask(client: Any, scene: RealScene, fields: Mapping[str, Any]) -> tuple[Any 
         return client.detect(**scene.request, **fields), ""
     except (InvalidRequest, InvalidRequestError) as error:
         return None, str(error)
-
-
-def _labels(scene: RealScene, found: Any | None) -> Int64:
-    """The detector's label of each point (R,); none without an object."""
-    if found is None or not found.objects or found.debug is None:
-        return np.full(len(scene.points), UNLABELLED)
-    return np.asarray(found.debug.labels, dtype=np.int64)
 
 
 def _write(

@@ -42,7 +42,7 @@ from edgegrasp_sim.workers import run_tasks
 from edgegrasp_training.options import GenerationOptions
 from edgegrasp_training.shapes import household_objects, varied_objects
 from edgegrasp_training.views import TABLE as TABLE_PLANE
-from edgegrasp_training.views import LabelledView, different
+from edgegrasp_training.views import LabelledView, load_view
 
 SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM, HAND_STREAM = range(6)
 HOUSEHOLD_STREAM = 6
@@ -117,15 +117,15 @@ def generate(
 ) -> Iterator[tuple[int, int, int]]:
     """Generate the missing scenes; yields each one's index, grasps tried, and grasps that held."""
     folder.mkdir(parents=True, exist_ok=True)
-    found = {"engine": choose_engine(options.engine)}
     # Other machines find files at whole paths too.
     weights, objects = (path and path.resolve() for path in (options.weights, objects))
     if weights is not None and not weights.is_file():  # not only once a scene is cleared by them
         raise ValueError(f"weights: got {weights}, which is no file. Name a .safetensors file")
-    options = options.model_copy(update=found | {"weights": weights})
+    changes = {"engine": choose_engine(options.engine), "weights": weights}
+    options = options.model_copy(update=changes)
     # One view of each kind and seed: the other scenes of a seed are made by the same engine.
     some = {path.name.rsplit("-", 1)[0]: path for path in folder.glob("*.npz")}
-    if other := different(some.values(), "engine") - {options.engine}:
+    if other := {load_view(path).engine for path in some.values()} - {options.engine}:
         raise ValueError(
             f"{folder} holds labels of {', '.join(other)}, not of {options.engine}; "
             "choose another folder"

@@ -41,7 +41,7 @@ from edgegrasp_training.recipes import (
     set_statistics,
     start_from,
 )
-from edgegrasp_training.views import different, load_view
+from edgegrasp_training.views import load_view
 
 VIEWS_IN_MEMORY = 8000
 WEIGHT_DECAY = 1e-4
@@ -164,7 +164,7 @@ class Trainer:
         training = provenance | {
             "training_views": len(self.train_paths),
             "training_labels": sum(len(self._tried(p, True).label) for p in self.train_paths),
-            "training_hands": len(different(self.train_paths, "gripper")),
+            "training_hands": len({load_view(path).gripper for path in self.train_paths}),
             "validation_views": len(self.validation_paths),
             "validation_labels": len(evaluation.label),
             "steps": self.step,

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
 from zipfile import BadZipFile
 
 import numpy as np
@@ -125,15 +124,6 @@ def load_view(path: Path) -> LabelledView:
             )
     except (KeyError, EOFError, BadZipFile) as error:
         raise ValueError(f"data: {path} is not a view ({error}). Remove it") from None
-
-
-def different(paths: Iterable[Path], name: Literal["engine", "gripper"]) -> set[str]:
-    """The engines that simulated some views, or the hands that tried grasps in them."""
-    found = set()
-    for path in paths:
-        with np.load(path, allow_pickle=False) as arrays:
-            found.add(str(arrays.get(name, getattr(LabelledView, name))))
-    return found
 
 
 def find_views(folders: list[Path]) -> list[Path]:
