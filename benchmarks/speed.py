@@ -229,7 +229,7 @@ def table(results: dict[str, Any]) -> str:
         f"candidates, one view. "
         f"The server is ready after {server['ready_seconds']:.1f} s and takes "
         f"{server['rest_mb']:.0f} MB at rest, {server['used_mb']:.0f} MB after ten "
-        f"requests. The time of a label or a round includes its scene, images and choice of grasps."
+        f"requests. Times of labels and rounds include scenes and images."
     )
     return "\n".join([*lines, "", *views.table(head, rows), "", text])
 
