@@ -209,14 +209,7 @@ def detect(
         cloud, asked["segment_ids"] = object_in_scene(wanted, _points(scene))
         asked.setdefault("viewpoint", [0.0, 0.0, 0.0])
     elif cloud is None:
-        asked["depth_images"] = [
-            {
-                "depth": image_array(depth, DEPTHS),
-                "intrinsics": camera_matrix(camera),
-                "T_cloud_camera": lookup(frame_id, depth.header.frame_id, depth.header.stamp),
-            }
-            for depth, camera in ((scene.depth, scene.camera), *scene.others)
-        ]
+        asked["depth_images"] = _depth_images(scene, lookup)
     try:
         found = client.detect(cloud, **asked)
     except GraspClientError:  # perhaps its robots are others now
@@ -380,6 +373,20 @@ def _robot(
         raise ValueError(f"joint_states: no position of {missing!r} has arrived.")
     T_base_cloud = lookup(robot.base_frame, scene.header.frame_id, scene.header.stamp)
     return {"joints": joints, "T_base_cloud": T_base_cloud.ravel().tolist(), **given}
+
+
+def _depth_images(scene: Scene, lookup: Lookup) -> list[dict[str, Any]]:
+    """The images of a scene with their cameras, whose poses are in the frame of its header."""
+    return [
+        {
+            "depth": image_array(depth, DEPTHS),
+            "intrinsics": camera_matrix(camera),
+            "T_cloud_camera": lookup(
+                scene.header.frame_id, depth.header.frame_id, depth.header.stamp
+            ),
+        }
+        for depth, camera in ((scene.depth, scene.camera), *scene.others)
+    ]
 
 
 def _from_frames(scene: Scene, settings: Settings, lookup: Lookup) -> dict[str, Any]:
