@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgegrasp_camera.arrays import Array, Bools, Float32, Floats, Int64
+from edgegrasp_camera.arrays import Array, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import HandView, hand_views
 from edgegrasp_model.candidates.edge_grasps import (
     MIN_EDGE,
@@ -79,8 +79,8 @@ def from_edges(
     point = scene.point_of_row[edges]
     reason: list[NoGrasp | None] = [NoGrasp.NO_POINT] * len(edges)
     there = np.flatnonzero((point >= 0).all(axis=1))
-    pairs, faults = (point[there, 0], point[there, 1]), dict[NoGrasp, Bools]()
-    candidates = edge_grasps(scene.cloud, *pairs, gripper, crop_radius, faults)
+    approach, contact = point[there].T
+    candidates, faults = edge_grasps(scene.cloud, approach, contact, gripper, crop_radius)
     for place, row in enumerate(there.tolist()):
         reason[row] = next((fault for fault, found in faults.items() if found[place]), None)
     if scene.support is not None:

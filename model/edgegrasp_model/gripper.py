@@ -22,18 +22,18 @@ SEEN_LENGTH = 0.0465  # metres of finger length from the tips: as long as the Pa
 
 @dataclasses.dataclass(frozen=True)
 class Gripper:
-    """Geometry of a gripper in its hand frame, as in GripperGeometry, and what follows from it."""
+    """Geometry of a gripper in its hand frame: z toward the object, y the closing direction."""
 
     name: str
-    max_opening: float  # metres, like all lengths
-    tip_z: float
-    contact_z: float
-    tcp_z: float
-    palm_z: float
-    pad_half_width: float
+    max_opening: float  # metres between the open fingers' inner faces
+    tip_z: float  # fingertips of the open gripper, metres along z
+    contact_z: float  # where an edge grasp puts its contact point, metres along z
+    tcp_z: float  # origin of the TCP frame, metres along z
+    palm_z: float  # palm surface between the fingers, metres along z
+    pad_half_width: float  # half width along x of the finger's contact pad, metres
     hand: HandPart
-    finger: HandPart
-    swing: Linkage | None
+    finger: HandPart  # one finger of the open gripper, its inner face at y = 0
+    swing: Linkage | None  # None: the fingers close in a straight line
 
     @cached_property
     def seen_palm_z(self) -> float:

@@ -160,7 +160,7 @@ class Teacher:
             outline_grasps(cloud.points, crop, balls, every, seen, support, view.hand)
             for seen in sides
         ]
-        both = Candidates.concatenate([edge_grasps(cloud, *pairs, view.hand), *across])
+        both = Candidates.concatenate([edge_grasps(cloud, *pairs, view.hand)[0], *across])
         if support is not None:
             both, clear = retract(both, support, view.hand)
             both = both.take(np.flatnonzero(clear))
@@ -279,7 +279,7 @@ def _candidates(view: LabelledView, cloud: Cloud, rows: Int64) -> Candidates:
     """The tried candidates; `pair` counts in `rows`."""
     approach_index, contact_index = view.approach_index[rows], view.contact_index[rows]
     if view.T_world_hand is None:
-        return edge_grasps(cloud, approach_index, contact_index, view.hand)
+        return edge_grasps(cloud, approach_index, contact_index, view.hand)[0]
     pose = view.T_world_hand[rows]
     edge = view.points[contact_index] - view.points[approach_index]  # (E, 3)
     depth = np.maximum(np.einsum("ed,ed->e", edge, pose[:, :3, 2]), 0.0)

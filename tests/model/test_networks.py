@@ -156,7 +156,7 @@ def look(seed: int) -> HandBatch:
     rng = np.random.default_rng(seed)
     points = (rng.uniform(-0.5, 0.5, (150, 3)) * (0.06, 0.05, 0.07)).astype(np.float32)
     cloud = Cloud(points, points / np.linalg.norm(points, axis=1, keepdims=True))
-    candidates = edge_grasps(cloud, *rng.integers(150, size=(2, 60)), PANDA)
+    candidates, _ = edge_grasps(cloud, *rng.integers(150, size=(2, 60)), PANDA)
     up, camera = np.float32([0.0, 0.0, 1.0]), np.float32([[0.3, 0.2, 0.5]])
     support = SupportPlane(normal=(0.0, 0.0, 1.0), offset=-0.05)
     at_side, number = np.zeros(150, dtype=bool), np.zeros(150, dtype=np.int64)

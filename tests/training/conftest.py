@@ -31,7 +31,7 @@ def made_up_view(seed: int) -> LabelledView:
     cloud = Cloud(points.astype(np.float32), normals.astype(np.float32))
     approach = np.repeat(rng.choice(300, 6, replace=False), 30)
     contact = rng.integers(300, size=len(approach))
-    made = edge_grasps(cloud, approach, contact, load_gripper())
+    made, _ = edge_grasps(cloud, approach, contact, load_gripper())
     label = np.full(len(approach), -1, np.int8)
     label[made.pair] = made.approach[:, 2] > 0.4
     camera = np.array([0.15, 0.15, 0.8], np.float32)

@@ -123,9 +123,8 @@ def edge_grasps(
     contact_index: Int64,  # (M,) rows of the cloud
     gripper: Gripper,
     reach: float = np.inf,  # metres from the approach point to the contact, at most
-    faults: dict[NoGrasp, Bools] | None = None,  # gets which pairs (M,) define none, by reason
-) -> Candidates:
-    """The pairs of approach and contact points that define an edge grasp which fits the gripper.
+) -> tuple[Candidates, dict[NoGrasp, Bools]]:
+    """The pairs that define an edge grasp which fits the gripper, and faults (M,) of the others.
 
     r = p_c - p_a; its part r_perp orthogonal to n_c points from the hand to the object (paper
     section III-A): z = r_perp / d, y = n_c, x = y x z. The contact lies at the gripper's contact_z
@@ -136,15 +135,13 @@ def edge_grasps(
     along = np.einsum("md,md->m", edge, normal)
     ahead = edge - along[:, None] * normal  # (M, 3) r_perp
     length, depth = np.linalg.norm(edge, axis=1), np.linalg.norm(ahead, axis=1)
-    found = {
+    faults = {
         NoGrasp.TOO_SHORT: length <= MIN_EDGE,
         NoGrasp.TOO_LONG: length >= min(gripper.max_opening / 2 - MARGIN, reach),
         NoGrasp.NO_DIRECTION: depth <= MIN_DEPTH,
         NoGrasp.TOO_DEEP: depth >= gripper.contact_z - gripper.palm_z,
     }
-    if faults is not None:
-        faults |= found
-    pair = np.flatnonzero(~np.any(list(found.values()), axis=0))
+    pair = np.flatnonzero(~np.any(list(faults.values()), axis=0))
     approach_index, contact_index = approach_index[pair], contact_index[pair]
     normal, depth, opening = normal[pair], depth[pair], 2 * np.abs(along[pair])
     z = ahead[pair] / depth[:, None]
@@ -152,7 +149,7 @@ def edge_grasps(
     y = y / np.linalg.norm(y, axis=1, keepdims=True)
     place = cloud.points[approach_index] + (depth - gripper.contact_z_at(opening))[:, None] * z
     pose = pose_of(np.stack([np.cross(y, z), y, z], axis=2), place).astype(np.float32)
-    return Candidates(pair, approach_index, contact_index, depth, opening, pose)
+    return Candidates(pair, approach_index, contact_index, depth, opening, pose), faults
 
 
 def retract(

@@ -165,7 +165,7 @@ class Sampler:
         pair = np.flatnonzero(scene.contact_allowed[crop.ball_rows])
         self.counts["in_contact_region"] += len(pair)
         pairs = approach_index[crop.ball_of_point[pair]], crop.ball_rows[pair]
-        candidates = edge_grasps(scene.cloud, *pairs, gripper)
+        candidates, _ = edge_grasps(scene.cloud, *pairs, gripper)
         candidates = replace(candidates, pair=pair[candidates.pair])
         if self.sees_hands:
             centred = centred_grasps(points, crop, candidates, gripper)
