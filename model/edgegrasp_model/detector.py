@@ -18,7 +18,7 @@ from edgegrasp_camera.arrays import Array, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import Sample, Sampler
-from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, UnknownModel
+from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import Given, check_edges, check_hand_poses, from_edges, from_hand_poses
 from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
 from edgegrasp_model.networks.balls import BallBatch
@@ -269,7 +269,7 @@ class GraspDetector:
         options: DetectOptions | None = None,
         *,
         edges: object | None = None,  # (M, 2) rows of the cloud as sent: approach and contact point
-        hand_poses: object | None = None,  # (M, 4, 4) T_cloud_hand; used without edges
+        hand_poses: object | None = None,  # (M, 4, 4) T_cloud_hand; one of the two is given
         max_voxels: int = MAX_VOXELS,  # most that the cloud may have
     ) -> Scoring:
         """Score the caller's edges or hand poses, in order (the paper's grasp evaluation function).
@@ -278,6 +278,8 @@ class GraspDetector:
         of an edge that would cut into the support is retracted where that helps; given poses stay
         as they are.
         """
+        if edges is not None and hand_poses is not None:
+            raise InvalidRequest("hand_poses", "poses beside edges", "Send one of the two.")
         options = options or DetectOptions()
         unused = dict.fromkeys(("approach_region", "contact_region", "num_approach_points"))
         options = options.model_copy(update=unused)

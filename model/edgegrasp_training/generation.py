@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from edgegrasp_camera.arrays import Float32, Floats, Int64
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import Sample, Sampler
-from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector, Prepared
+from edgegrasp_model.detector import GraspDetector, Prepared
 from edgegrasp_model.gripper import gripper_fields
 from edgegrasp_model.options import (
     AutoPlane,
@@ -40,6 +40,7 @@ from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
 from edgegrasp_sim.workers import run_tasks
 from edgegrasp_training.options import GenerationOptions
+from edgegrasp_training.recipes import build_network, recipe
 from edgegrasp_training.shapes import household_objects, varied_objects
 from edgegrasp_training.views import TABLE as TABLE_PLANE
 from edgegrasp_training.views import LabelledView, load_view
@@ -103,9 +104,7 @@ REACH = 0.6, 1.0  # outward part of that link in the open hand, in halves of the
 STEEPEST = 0.75  # most of it, in radii
 
 Query = tuple[Observation, DetectOptions]  # a view of a scene, and a request for grasps in it
-# What prepares a view without a guide; its network is not asked.
-DEFAULT_WEIGHTS = WEIGHTS_FOLDER / "edgegrasp-plus.safetensors"
-detector = lru_cache(maxsize=2)(GraspDetector.load)  # loads weights once in a process
+detector = lru_cache(maxsize=1)(GraspDetector.load)  # loads weights once in a process
 
 
 def generate(
@@ -371,26 +370,29 @@ def choose_grasps(
     observation, request = query
     if len(observation.cloud) < (request.num_approach_points or 1):
         return None
-    prepared = (guide or detector(DEFAULT_WEIGHTS)).prepare(observation.cloud, request)
+    prepared = (guide or untrained()).prepare(observation.cloud, request)
     scene = prepared.scene
     if scene is None or not scene.approach_allowed.any():
         return None
+    given = request, prepared.gripper, prepared.crop_radius, prepared.counts
+    sample = guide.evaluate(prepared) if guide else Sampler(scene, *given, sees_hands=True).all()
+    if sample is None or len(sample.candidates) == 0:
+        return None
     if guide is None:
-        given = request, prepared.gripper, prepared.crop_radius, prepared.counts
-        sample = Sampler(scene, *given, sees_hands=True).all()
-        if len(sample.candidates) == 0:
-            return None
         rows, best = _any(sample, options.grasps_per_view, rng), None
     else:
-        scored = guide.evaluate(prepared)
-        if scored is None or len(scored.logits) == 0:
-            return None
-        sample = scored
-        rating = judged_together(scored.logits, sample, scene, prepared.gripper)
+        rating = judged_together(sample.logits, sample, scene, prepared.gripper)
         number = scene.object_of_point[sample.candidates.contact_index]
-        rows = _likely(number, scored.logits, rating, options.grasps_per_view, rng)
+        rows = _likely(number, sample.logits, rating, options.grasps_per_view, rng)
         best = int(np.searchsorted(rows, rating.argmax()))
     return prepared, scene, sample.candidates.take(rows), best
+
+
+@lru_cache(maxsize=1)
+def untrained() -> GraspDetector:
+    """The detector that prepares views without a guide; its network is not asked."""
+    metadata = recipe("edgegrasp-plus")
+    return GraspDetector(build_network(metadata.network), metadata)
 
 
 def _any(sample: Sample, total: int, rng: np.random.Generator) -> Int64:

@@ -191,11 +191,10 @@ def fit_confidence(network: SceneNet, images: Sequence[SceneImage]) -> list[floa
     for row, image in enumerate(images):
         known = image.up.astype(np.float64) if row % 2 else None
         pixels, _ = look(network, image_points(image), known, 1.0 / float(image.camera[0]))
-        number = group(pixels)
-        held = number >= 0
-        size = np.maximum(np.bincount(number[held]), 1)
-        on_object = held & (image.label[::2, ::2] >= OBJECT)
-        means.append(np.bincount(number[held], pixels.classes[2][held]) / size)
+        number, mean = group(pixels)
+        size = np.bincount(number[number >= 0])
+        on_object = (number >= 0) & (image.label[::2, ::2] >= OBJECT)
+        means.append(mean)
         right.append(np.bincount(number[on_object], minlength=len(size)) >= 0.5 * size)
     sign, mean = np.where(np.concatenate(right), 1.0, -1.0), np.concatenate(means)
 

@@ -60,7 +60,8 @@ def collides(
         lowest = np.minimum(lowest, height + lift * (UP @ normal))
         hit |= np.asarray(lowest < request.margin - SLACK)
     if scene.obstacles is not None:
-        for shapes, way in ((swept, 0.0), (boxes, lift)) if lift > 0 else ((swept, 0.0),):
+        moves = [(swept, 0.0)] if lift == 0.0 else [(swept, 0.0), (boxes, lift)]
+        for shapes, way in moves:
             solid = SolidBoxes.of_hands(T_cloud_hand, shapes)
             for near, theirs in near_pairs(solid, scene.obstacles, way):
                 overlap = separation(solid.take(near), theirs, way * UP.astype(np.float64)) < 0

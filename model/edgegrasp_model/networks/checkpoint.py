@@ -58,6 +58,8 @@ def load_checkpoint(path: Path) -> tuple[nn.Module, CheckpointMetadata]:
         metadata = CheckpointMetadata(**values)
         if metadata.tensors_digest not in ("", _digest(tensors)):
             raise ValueError("the weights are not those it was written with")
+        if not all(tensor.isfinite().all() for tensor in tensors.values()):
+            raise ValueError("the weights hold NaN or infinity")
         with torch.device("meta"):
             network = NETWORKS[metadata.network.architecture](metadata.network)
         network.load_state_dict(tensors, assign=True)

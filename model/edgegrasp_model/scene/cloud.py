@@ -19,6 +19,7 @@ MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more 
 OUTLIER_NEIGHBORS = 8
 OUTLIER_DEVIATIONS = 2.5
 NORMAL_NEIGHBORS = 20
+JACOBI_SWEEPS = 6  # rounds of Jacobi's method for a symmetric 3 x 3 matrix; more change nothing
 DIAGONAL = 1e-12  # off-diagonal sum, as a share of the trace, at which Jacobi's method stops
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 CUBE = 8  # voxels along the edge of a cube; points are stored cube by cube
@@ -114,12 +115,13 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
         value = f"{len(points)} points for num_approach_points = {num_approach_points}"
         fix = "Send more points or lower options.num_approach_points."
         raise InvalidRequest("cloud", value, fix)
+    if sent.colors is not None:
+        _beside("colors", sent.colors, size, row[:0])  # checked, though no grasp depends on them
     arrays = {
         name: _beside(name, array, size, row)
-        for name in ("colors", "normals", "segment_ids", "view_ids")
+        for name in ("normals", "segment_ids", "view_ids")
         if (array := getattr(sent, name)) is not None
     }
-    arrays.pop("colors", None)
     points = np.require(points, np.float32, ("C", "W"))  # loops are not compiled for read-only ones
     return CheckedCloud(
         points, row, size, **arrays, image_size=image_size, step=step, warnings=said
@@ -205,7 +207,7 @@ def _beside(field: str, array: object, size: int, row: Int64) -> Array:
                 raise InvalidRequest(field, f"the number {end}", "Send 32-bit numbers.")
         return ids.astype(np.int64)
     values = np.ascontiguousarray(array.reshape(-1, width)[row], dtype=np.float32)
-    if field == "normals" and not np.isfinite(values).all():
+    if not np.isfinite(values).all():
         bad = int(row[np.argmin(np.isfinite(values).all(axis=1))])
         raise InvalidRequest(field, f"NaN or infinity in row {bad}", "Send finite numbers.")
     return values
@@ -320,11 +322,12 @@ def least_spread(points: Float32, rows: Int64) -> Float32:
                 spread[i, j] = 0.0
                 for k in range(count):
                     spread[i, j] += around[k, i] * around[k, j]
-        off = np.inf
-        while off > DIAGONAL * (spread[0, 0] + spread[1, 1] + spread[2, 2]):
+        for _ in range(JACOBI_SWEEPS):
             for turn in range(3):
                 _rotate_away(spread, axes, turn % 2, 1 if turn == 0 else 2)
             off = abs(spread[0, 1]) + abs(spread[0, 2]) + abs(spread[1, 2])
+            if off <= DIAGONAL * (spread[0, 0] + spread[1, 1] + spread[2, 2]):
+                break
         least = 0
         for d in range(1, 3):
             least = d if spread[d, d] < spread[least, least] else least

@@ -234,9 +234,8 @@ def _recognised(
             number = with_clusters(number, plan, likely | cut_off, first)
             new = np.flatnonzero(number >= first)
             which = number[new] - first
-            certain = confidences(which, shown.object[above[new]])
-            if cut_off:
-                certain[:] = CUT_OUT
+            mean = np.bincount(which, shown.object[above[new]]) / np.bincount(which)
+            certain = np.full(len(mean), CUT_OUT) if cut_off else confidences(mean)
             confidence |= enumerate(certain.tolist(), first)
             number[new[certain[which] <= LIKELY]] = FIXED
     return number, confidence

@@ -34,9 +34,8 @@ SMALLEST = 45  # pixels of an object, in the network's output
 SMALLEST_AREA = 5e-4  # square metres of it, as seen
 VIEW_CELL = 0.01  # metres, in which the views of one object lie in the same place
 VIEW_SHARE = 0.25  # of the smaller one's cells that two views of one object share
-# Metres from an object within which missed points may belong to it; from a point to its pixel, as
-# much more for each metre of depth.
-BESIDE = 0.012
+BESIDE = 0.012  # metres from an object within which missed points may belong to it
+REACH = 0.012  # metres from a point to its pixel, and as much more for each metre of depth
 STANDS_OUT = 0.004  # least metres that such points rise above the support's margin
 FEWEST_CELLS, FEWEST_EACH = 5, 4  # cells of a cluster, each BESIDE wide; points per cell
 LIKELY = 0.5  # confidence from which an instance is an object, not background
@@ -76,15 +75,8 @@ def shipped() -> tuple[SceneNet, Float64]:
         return network, np.array(json.loads(file.metadata()["confidence"]))
 
 
-def confidences(number: Int64, probability: Float32) -> Float64:
-    """The confidence (O,) of instances, by the mean probability of an object over each one's parts.
-
-    `number` (...) is the instance of each part, from 0, negative: none; `probability` (...) its
-    probability of an object.
-    """
-    held = number >= 0
-    total = np.bincount(number[held], probability[held])
-    mean = total / np.maximum(np.bincount(number[held]), 1)
+def confidences(mean: Float64) -> Float64:
+    """The confidence (O,) of instances by the mean probability (O,) of an object over each one."""
     constant, factor = shipped()[1]
     return np.asarray(1.0 / (1.0 + np.exp(-(constant + factor * mean))))
 
@@ -100,8 +92,8 @@ def segment(
     turn, (network, _) = image.T_cloud_camera[:3, :3], shipped()
     up_in_view = None if up is None else up @ turn
     pixels, seen_up = look(network, image.points, up_in_view, image.footprint)
-    of_pixel = group(pixels)
-    confidence = confidences(of_pixel, pixels.classes[2])
+    of_pixel, mean = group(pixels)
+    confidence = confidences(mean)
     likely = confidence > LIKELY
     new = np.append(np.where(likely, np.cumsum(likely) - 1, FIXED), [UNKNOWN, FIXED])
     of_pixel = new[of_pixel]
@@ -169,14 +161,17 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def group(pixels: Pixels) -> Int64:
-    """The object (H, W) of each pixel, from 0; FIXED: background; UNKNOWN: undecided."""
+def group(pixels: Pixels) -> tuple[Int64, Float64]:
+    """The object (H, W) of each pixel, from 0; FIXED: background; UNKNOWN: undecided.
+
+    And the mean probability (O,) of an object over the pixels of each.
+    """
     points, classes, votes, links, footprint = pixels
     seen = ~np.isnan(points[..., 2])
     held = seen & (classes.argmax(axis=0) == 2)
     number = np.where(held, UNKNOWN, FIXED)
     if not held.any():
-        return number
+        return number, np.empty(0)
     index, pairs, strength = np.arange(held.size).reshape(held.shape), [], []
     right, lower = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])  # neighbours
     for link, (first, second) in zip(links, (right, lower), strict=True):
@@ -193,7 +188,8 @@ def group(pixels: Pixels) -> Int64:
     area = np.bincount(part, (points[..., 2].reshape(-1)[rows] * footprint) ** 2)
     large = (count >= SMALLEST) & (area >= SMALLEST_AREA)
     number.reshape(-1)[rows] = np.where(large, np.cumsum(large) - 1, UNKNOWN)[part]
-    return number
+    held = number >= 0
+    return number, np.bincount(number[held], classes[2][held]) / np.bincount(number[held])
 
 
 @compiled()
@@ -336,7 +332,7 @@ def _look_up(
     rows, columns, _ = seen.shape
     T, per_pixel = T_camera_cloud.astype(np.float32), np.float32(1.0 / pixel_size)
     left, top = np.float32(corner[0]) * per_pixel, np.float32(corner[1]) * per_pixel
-    reach = np.float32(BESIDE)
+    reach = np.float32(REACH)
     for n in range(len(points)):
         a, b, c = points[n, 0], points[n, 1], points[n, 2]
         z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]

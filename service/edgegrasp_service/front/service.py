@@ -39,6 +39,7 @@ from edgegrasp_service.worker.process import MOST_DEATHS, Answer, Job, WorkerPoo
 
 logger = logging.getLogger(__name__)
 
+MOST_HARMFUL = 1000  # requests remembered that killed workers
 HARMFUL_SECONDS = 600.0  # seconds for which a request that killed workers is refused
 LATEST = 15  # latest service times, whose median is the pace; one slow request does not change it
 SEND_SECONDS = 1.0  # seconds for the errors of abandoned requests to be sent
@@ -194,9 +195,11 @@ class GraspService:
         """Count the workers that a request has killed; forget them once it is answered."""
         digest = await asyncio.to_thread(_digest, job)
         if answer.facts.deaths:
-            _, before = self._deaths.get(digest, (0.0, 0))
+            _, before = self._deaths.pop(digest, (0.0, 0))
             until = time.monotonic() + HARMFUL_SECONDS
             self._deaths[digest] = until, before + answer.facts.deaths
+            if len(self._deaths) > MOST_HARMFUL:
+                del self._deaths[next(iter(self._deaths))]
         elif answer.error is None:
             self._deaths.pop(digest, None)
 
