@@ -207,16 +207,6 @@ def object_in_scene(
 # The forms of the wire
 
 
-def float32_points(cloud: Cloud) -> Float32 | None:
-    """The cloud as (N, 3) float32 if it is an array of N points, else None."""
-    if not isinstance(cloud, np.ndarray) or cloud.shape[1:] != (3,):
-        return None
-    if cloud.dtype not in (np.float32, np.float64):
-        return None
-    with np.errstate(over="ignore"):  # the server refuses infinity
-        return np.ascontiguousarray(cloud, dtype=np.float32)
-
-
 def cloud_file(cloud: Cloud) -> tuple[str, bytes]:
     """The cloud as a file, its format first, which is one of FILE_FORMATS.
 
@@ -227,9 +217,11 @@ def cloud_file(cloud: Cloud) -> tuple[str, bytes]:
             format.
     """
     if isinstance(cloud, np.ndarray):
-        points = float32_points(cloud)
+        if cloud.dtype in (np.float32, np.float64) and cloud.shape[1:] == (3,):
+            with np.errstate(over="ignore"):  # the server refuses infinity
+                cloud = np.ascontiguousarray(cloud, np.float32)
         try:
-            return "npy", npy_bytes(cloud if points is None else points)
+            return "npy", npy_bytes(cloud)
         except ValueError:
             fix = "Send float32 or float64 metres."
             raise invalid("cloud", f"dtype {cloud.dtype}", fix) from None
@@ -336,4 +328,4 @@ def _sent(name: str, array: object) -> Array:
         raise invalid(name, f"shape {array.shape}, dtype {array.dtype}", fix)
     if array.size and kind == "int32" and (array.max() >= 2**31 or array.min() < -(2**31)):
         raise invalid(name, f"values from {array.min()} to {array.max()}", fix)
-    return np.ascontiguousarray(array.reshape(-1, *row), dtype=kind)
+    return np.ascontiguousarray(array.reshape(-1, *row), np.dtype(kind).newbyteorder("<"))
