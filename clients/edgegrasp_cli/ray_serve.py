@@ -25,20 +25,25 @@ from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer, load_catalogue, load_robots
 from edgegrasp_service.worker.process import Answer, Facts, Job, Method
 
+LISTS = ("ListModels", "ListRobots")
 
-def _rpc(method: Method) -> Callable[..., Awaitable[Any]]:
+
+def _rpc(method: str) -> Callable[..., Awaitable[Any]]:
     """A method of Grasps that answers over gRPC."""
 
     async def rpc(self: Any, request: Any, grpc_context: RayServegRPCContext) -> Any:
-        seconds = self._settings.max_request_seconds
-        found = await self._answer(Job(method, "grpc", request.SerializeToString(), seconds))
+        response = getattr(grasp_pb2, f"{method}Response")
+        if method in LISTS:
+            return response(**self._listed(method))
+        seconds, body = self._settings.max_request_seconds, request.SerializeToString()
+        found = await self._answer(Job(cast(Method, method), "grpc", body, seconds))
         if (problem := found.error) is not None:
             grpc_context.set_code(StatusCode[problem.code])
             grpc_context.set_details(problem.detail)
             detail = error_detail(problem).SerializeToString()
             trailing = [(ERROR_METADATA, detail)]
             grpc_context.set_trailing_metadata(trailing)  # type: ignore[arg-type]
-        return getattr(grasp_pb2, f"{method}Response").FromString(found.body)
+        return response.FromString(found.body)
 
     return rpc
 
@@ -58,7 +63,7 @@ class Grasps:
         method = METHODS.get(request.url.path, "")
         if method in ("Live", "Ready"):
             return JSONResponse({"status": method.lower()})
-        if method in ("ListModels", "ListRobots"):
+        if method in LISTS:
             return JSONResponse(self._listed(method))
         if method not in get_args(Method) or request.method != "POST":
             return Response(status_code=404)
@@ -66,25 +71,17 @@ class Grasps:
         body, query = await request.body(), request.url.query
         try:
             seconds = min(requested_timeout(request.headers), self._settings.max_request_seconds)
-        except EdgeGraspError as error:
-            found = Answer(b"", Facts(), report(error))
-        else:
             job = Job(cast(Method, method), "http", body, seconds, content_type, query)
             found = await self._answer(job)
+        except EdgeGraspError as error:
+            found = Answer(b"", Facts(), report(error))
         if found.error is None:
             return Response(found.body, media_type="application/json")
         document = problem_document(found.error)
         return Response(document, found.error.status, media_type="application/problem+json")
 
     DetectGrasps, ScoreGrasps = _rpc("DetectGrasps"), _rpc("ScoreGrasps")
-
-    async def ListModels(self, request: Any) -> Any:  # noqa: N802  # as the RPC
-        """Answer over gRPC."""
-        return grasp_pb2.ListModelsResponse(**self._listed("ListModels"))
-
-    async def ListRobots(self, request: Any) -> Any:  # noqa: N802  # as the RPC
-        """Answer over gRPC."""
-        return grasp_pb2.ListRobotsResponse(**self._listed("ListRobots"))
+    ListModels, ListRobots = map(_rpc, LISTS)
 
     def _listed(self, method: str) -> dict[str, Any]:
         if method == "ListModels":
