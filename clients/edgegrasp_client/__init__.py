@@ -9,6 +9,7 @@ best = detection.grasps[0]
 
 from edgegrasp_camera.clouds import PointCloud2 as PointCloud2
 from edgegrasp_camera.clouds import PointField as PointField
+from edgegrasp_camera.depth import Intrinsics as Intrinsics
 from edgegrasp_client.client import AsyncGraspClient as AsyncGraspClient
 from edgegrasp_client.client import GraspClient as GraspClient
 from edgegrasp_client.connection import Tls as Tls
@@ -26,7 +27,6 @@ from edgegrasp_client.errors import UnknownModelError as UnknownModelError
 from edgegrasp_client.errors import WorkerLostError as WorkerLostError
 from edgegrasp_client.options import *  # noqa: F403  # the names of its `__all__`
 from edgegrasp_client.requests import DepthImage as DepthImage
-from edgegrasp_client.requests import Intrinsics as Intrinsics
 from edgegrasp_client.requests import RequestFields as RequestFields
 from edgegrasp_client.requests import StreamRequest as StreamRequest
 from edgegrasp_client.requests import object_in_scene as object_in_scene

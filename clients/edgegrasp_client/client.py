@@ -83,9 +83,8 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
     ) -> None:
         self._timeout = seconds_of(timeout)
         self._retry, self._closed, self._answered = retry, False, False
-        kind: type[GrpcTransport | RestTransport]
         kind = RestTransport if is_rest(address) else GrpcTransport
-        self._transport = kind(address, token, tls)
+        self._transport: RestTransport | GrpcTransport = kind(address, token, tls)
 
     async def detect(
         self,

@@ -19,7 +19,7 @@ from typing_extensions import NotRequired, TypedDict, Unpack
 from edgegrasp_camera import InvalidRequest
 from edgegrasp_camera.arrays import Array, Float32
 from edgegrasp_camera.clouds import PointCloud2, read_point_cloud2
-from edgegrasp_camera.depth import ENCODINGS, intrinsics_of
+from edgegrasp_camera.depth import ENCODINGS, Intrinsics, intrinsics_of
 from edgegrasp_camera.files import FILE_FORMATS
 from edgegrasp_client.connection import seconds_of
 from edgegrasp_client.errors import invalid
@@ -29,23 +29,15 @@ SAME_POINT = 0.005  # metres: the side of a cell in which the scene repeats the 
 DEPTH_ENCODINGS = {np.dtype(kind).name: name for name, kind in ENCODINGS.items()}  # by dtype
 
 
-class Intrinsics(TypedDict):
-    """A pinhole camera without distortion, pixels. The centre of the top left pixel is (0, 0)."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-
 class DepthImage(TypedDict):
     """An image of a depth camera. Camera frame: x right, y down, z forward."""
 
     # (H, W), 0 or NaN where there is no reading: metres as float32 or float64, millimetres as
     # uint16. Or the path of a file that holds it: .npy, or .png of 16 bits.
     depth: Array | str | PathLike[str]
-    # Or fx, fy, cx, cy; or the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
-    intrinsics: Intrinsics | Sequence[float] | Array
+    # In pixels, the centre of the top left pixel is (0, 0): fx, fy, cx, cy in this order or by
+    # name; or the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
+    intrinsics: Intrinsics | Mapping[str, float] | Sequence[float] | Array
     # (4, 4) camera to cloud, metres; left out: the cloud's frame is the camera's.
     T_cloud_camera: NotRequired[Array | Sequence[Sequence[float]]]
     # Metres that one unit of the depth is worth; None: 0.001 for integers, 1 for floats.
@@ -118,11 +110,7 @@ class Request:
 
 
 class StreamRequest(Request):
-    """One request of a stream; `cloud` and `fields` as of `GraspClient.detect`.
-
-    Raises:
-        InvalidRequestError: No cloud or more than one; or an array or option is wrong.
-    """
+    """One request of a stream; `cloud` and `fields` as of `GraspClient.detect`."""
 
     def __init__(
         self,
@@ -269,9 +257,8 @@ def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
     except ValueError:
         fix = "Give fx, fy, cx, cy in pixels, or the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."
         raise invalid(f"{path}.intrinsics", repr(image["intrinsics"])[:80], fix) from None
-    fields = {"depth": depth, "intrinsics": intrinsics, "T_cloud_camera": pose.astype(float)}
-    plain: dict[str, Any] = _plain({**fields, "depth_scale": image.get("depth_scale")})
-    return plain
+    camera = {"intrinsics": intrinsics, "T_cloud_camera": pose.astype(float)}
+    return dict(_plain({"depth": depth, **camera, "depth_scale": image.get("depth_scale")}))
 
 
 def _depth_fields(depth: object, path: str) -> dict[str, Any]:
