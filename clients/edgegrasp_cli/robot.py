@@ -51,7 +51,7 @@ def add(
     try:
         check(output)
     except EdgeGraspError as error:
-        if getattr(error, "field", "") not in TO_EDIT:
+        if getattr(error.__cause__, "field", "") not in TO_EDIT:
             output.unlink()  # it needs other arguments, not an edit
         raise
     finally:

@@ -20,7 +20,7 @@ from roboplan.simple_ik import SimpleIk, SimpleIkOptions
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float64
-from edgegrasp_model.errors import EdgeGraspError, brief, parse
+from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, brief, parse
 from edgegrasp_model.gripper import Gripper, gripper_fields, gripper_from_fields
 from edgegrasp_model.options import Finite, GripperGeometry, Quaternion, Strict, Vector
 
@@ -39,7 +39,7 @@ Joints = Annotated[tuple[Finite, ...], Field(max_length=16)]
 
 
 class InvalidRobot(EdgeGraspError):  # noqa: N818
-    """A robot file cannot be used: the field that is wrong, if it is one, and the fix."""
+    """A robot file cannot be used; its cause names the field, if one is wrong."""
 
 
 class HandPose(Strict):
@@ -177,7 +177,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
         given = getattr(file, field)
         if given and len(given) != len(joints):
             fix = f"The arm has {len(joints)} joints: {', '.join(joint_names)}."
-            raise InvalidRobot(f"{field}: got {len(given)} numbers. {fix}")
+            raise InvalidRequest(field, f"{len(given)} numbers", fix)
     gripper_file = path.parent / file.gripper
     named = gripper_file if gripper_file.is_file() else file.gripper
     hand = GripperGeometry.model_validate(gripper_fields(named))
@@ -210,7 +210,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     home = np.array(file.home) if file.home else np.clip(0.0, lower, upper)
     if ((home < lower) | (home > upper)).any():
         fix = f"Give joints between {lower.tolist()} and {upper.tolist()}."
-        raise InvalidRobot(f"home: got {home.tolist()}. {fix}")
+        raise InvalidRequest("home", f"{home.tolist()}", fix)
     robot = Robot(
         path.stem, gripper, hand, file.base_frame, file.flange_frame,
         scenes[0].forwardKinematics(home, HAND, file.flange_frame), joint_names, home, lower, upper,
@@ -219,8 +219,8 @@ def _load(path: Path, file: RobotFile) -> Robot:
     )  # fmt: skip
     if scenes[0].hasCollisions(home):
         pair = touching(scenes[0], model, home)
-        fix = "Name other joints, or the pair in the SRDF's disable_collisions"
-        raise InvalidRobot(f"home: {pair} touch there. {fix}.")
+        fix = "Name other joints, or the pair in the SRDF's disable_collisions."
+        raise InvalidRequest("home", f"joints where {pair} touch", fix)
     return robot
 
 
@@ -402,7 +402,7 @@ def _set_limits(root: Element, joints: Sequence[Element], file: RobotFile) -> No
         most = [float(limit.get(name, "0")) for limit in limits]
         if min(most, default=1.0) <= 0.0:  # some exporters of URDFs write 0
             fix = "Give what each joint can do, above 0."
-            raise InvalidRobot(f"max_{name}: got {most}. {fix}")
+            raise InvalidRequest(f"max_{name}", f"{most}", fix)
 
 
 def _numbers(values: ArrayLike) -> str:

@@ -22,6 +22,11 @@ def test_a_robot_file_of_a_urdf_loads(run, refused, tmp_path: Path) -> None:
     for unknown in ("tool9", "tool: home: 9"):  # the file goes again, whatever the name
         said = refused("robot", "add", UR5, *LINKS[:3], unknown, "--output", file)
         assert f"got '{unknown}'" in said
+    still, kept = tmp_path / "still.urdf", tmp_path / "kept.toml"
+    still.write_text(UR5.read_text().replace('velocity="3.15"', 'velocity="0"'))
+    said = refused("robot", "add", still, *LINKS, "--output", kept)
+    assert "max_velocity: got" in said
+    assert kept.exists()  # to be edited
     shown = run("robot", "add", UR5, *LINKS, "--gripper", "robotiq-2f-85", "--output", file)
     assert "hand at home: 0.817 0.191" in shown
     assert load_robot(file).joint_names == load_robot("ur5").joint_names
