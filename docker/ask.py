@@ -7,18 +7,13 @@ import json
 import statistics
 import sys
 import time
+from pathlib import Path
 
-import numpy as np
+import edgegrasp_service
+from edgegrasp_client import DepthImage, GraspClient
 
-from edgegrasp_client import GraspClient
-
-random = np.random.default_rng(0)
-table = random.uniform((0.0, 0.0, 0.0), (0.3, 0.3, 0.001), (10_000, 3))
-boxes = [
-    corner + random.uniform(0.0, 1.0, (2000, 3)) * (0.03, 0.05, 0.06)
-    for corner in random.uniform((0.03, 0.03, 0.0), (0.2, 0.2, 0.001), (5, 3))
-]
-cloud = np.concatenate([table, *boxes]).astype(np.float32)
+SAMPLE = Path(edgegrasp_service.__file__).parent / "playground" / "samples" / "depth.png"
+image: DepthImage = {"depth": SAMPLE, "intrinsics": (540, 540, 320, 239)}
 
 found = {}
 for address in sys.argv[1:3]:
@@ -27,7 +22,7 @@ for address in sys.argv[1:3]:
         seconds = []
         for _ in range(int((sys.argv[3:] or ["12"])[0])):
             start = time.perf_counter()
-            grasps = client.detect(cloud, viewpoint=(0.15, 0.15, 0.7), num_candidates=500).grasps
+            grasps = client.detect(depth_images=[image]).grasps
             seconds.append(time.perf_counter() - start)
             assert grasps, "no grasps"
     name = "rest" if address.startswith("http") else "grpc"
