@@ -4,7 +4,6 @@ A picture is drawn through a pinhole camera: the one that took the cloud, over i
 one, or else one at the same position.
 """
 
-import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,7 +34,6 @@ LAMP = (-0.3, -0.6, -0.74)  # direction from a surface to the light, camera fram
 MAP = "viridis"  # colours of scores from 0 to 1
 OUTLINE = "#10151d"
 REGION = "#4cc9f0"
-EDGES = [(a, b) for a in range(8) for b in range(8) if a < b and bin(a ^ b).count("1") == 1]
 
 
 @dataclass(frozen=True)
@@ -322,8 +320,8 @@ def _lines_of(shape: Mapping[str, Any]) -> Iterator[Float64]:
             low, high = np.asarray(shape["min"]), np.asarray(shape["max"])
             shape = {"center": (low + high) / 2, "half_extents": (high - low) / 2}
         *axis, w = np.asarray(shape.get("quaternion", (0.0, 0.0, 0.0, 1.0)))  # xyzw
-        corners = list(itertools.product((-1.0, 1.0), repeat=3)) * np.asarray(shape["half_extents"])
+        corners = np.moveaxis(2.0 * np.indices((2, 2, 2)) - 1.0, 0, 3) * shape["half_extents"]
         across = 2 * np.cross(axis, corners)
-        corners = shape["center"] + corners + w * across + np.cross(axis, across)
-        for first, second in EDGES:
-            yield corners[[first, second]]
+        corners = shape["center"] + corners + w * across + np.cross(axis, across)  # (2, 2, 2, 3)
+        for along in range(3):
+            yield from np.moveaxis(corners, along, 2).reshape(4, 2, 3)

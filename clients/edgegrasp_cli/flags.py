@@ -40,19 +40,15 @@ class Connection(BaseModel, use_attribute_docstrings=True):
         """A client of a server; raises GraspClientError."""
         from edgegrasp_client import GraspClient, Tls
 
-        files = (self.tls_ca, self.tls_certificate, self.tls_key)
+        files = self.tls_ca, self.tls_certificate, self.tls_key
+        tls = Tls(*files) if self.tls or any(files) else None
         token = os.environ.get(TOKEN_VARIABLE) or None
         try:
             if self.token_file is not None:
                 token = self.token_file.read_text().strip()
         except (OSError, UnicodeDecodeError) as error:
             raise ValueError(f"token file {self.token_file}: {error}") from error
-        return GraspClient(
-            address,
-            timeout=self.timeout,
-            token=token,
-            tls=Tls(*files) if self.tls or any(files) else None,
-        )
+        return GraspClient(address, timeout=self.timeout, token=token, tls=tls)
 
 
 class Server(Connection):
