@@ -384,22 +384,19 @@ def _told(
     """The detection with the picks as its grasps, and counts of their outcomes."""
     tiers = [pick.tier for pick in picks]
     grasps = [replace(pick.grasp, arm=None if pick.tier == 2 else pick.plan) for pick in picks]
-    moving, within = tiers.count(0), tiers.count(0) + tiers.count(1)
     warnings = list(detection.warnings)
     if detection.grasps and not outcomes["reachable"]:
         warnings.append(NO_REACH)
-    if asked.plan == "motion" and moving < within:
-        warnings.append(
-            f"{within - moving} grasps within reach have no trajectory: no collision-free one was "
-            "found in time."
-        )
+    if asked.plan == "motion" and 1 in tiers:
+        why = "no collision-free one was found in time."
+        warnings.append(f"{tiers.count(1)} grasps within reach have no trajectory: {why}")
     if 2 in tiers:
         warnings.append("time ran out before the arm was planned for every grasp.")
     names = "on_arm", "hand_collision", "out_of_reach", "arm_collision", "no_place", "reachable"
     counts = {name: n for name, n in detection.counts.items() if name != "returned"}
     counts |= {name: outcomes[name] for name in names if asked.place or name != "no_place"}
     if asked.plan == "motion":
-        counts["with_trajectory"] = moving
+        counts["with_trajectory"] = tiers.count(0)
     counts["returned"] = len(grasps)
     best = {grasp.object: grasp.score for grasp in sorted(grasps, key=lambda one: one.score)}
     total, tracking = detection.seconds.get("total", 0.0) + seconds, detection.tracking

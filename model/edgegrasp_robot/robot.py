@@ -279,13 +279,12 @@ def _tree(field: str, file: Path) -> Element:
     try:
         text = file.read_text("utf-8")
         root = ElementTree.fromstring(text)
+        if "xacro:" not in text:
+            return root
+        return ElementTree.fromstring(xacro.process_file(str(file)).toxml())
     except (ValueError, ElementTree.ParseError) as error:
         fix = "Correct it, or name another file."
         raise InvalidRobot(f"{field}: {file.name} is not XML: {error}. {fix}") from None
-    if "xacro:" not in text:
-        return root
-    try:
-        return ElementTree.fromstring(xacro.process_file(str(file)).toxml())
     except (RuntimeError, xacro.XacroException) as error:
         fix = "Run xacro yourself, with the arguments that it needs, and name what it writes."
         raise InvalidRobot(f"{field}: {error}. {fix}") from None
