@@ -134,10 +134,11 @@ class Picture:
         cloud = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         self.row_of_pixel = view.rows_of_pixels(cloud)
         seen = self.row_of_pixel >= 0
-        self._depth = np.where(seen, view.project(cloud)[1][self.row_of_pixel], np.nan)
+        depth = np.where(seen, view.project(cloud)[1][self.row_of_pixel], np.nan)
+        self._depth = np.pad(depth, (0, 1), constant_values=np.nan)  # the border is outside
         if image is None:
             row = self.row_of_pixel
-            drawn: Any = self._shaded() if colors is None else colors.reshape(-1, 3)[row]
+            drawn: Any = self._shaded(depth) if colors is None else colors.reshape(-1, 3)[row]
             image = np.where(seen[..., None], drawn, 255).astype(np.uint8)
         rows, columns = view.shape
         height = WIDTH * rows / columns
@@ -150,10 +151,9 @@ class Picture:
         self._point = 72 * WIDTH / columns  # points that a pixel is wide
         self._figure.text(0.015, self._foot / 2, title, fontsize=10, va="center")
 
-    def _shaded(self) -> Float64:
+    def _shaded(self, depth: Float64) -> Float64:
         """(H, W, 3) the cloud in greys."""
         rows, columns = self.view.shape
-        depth = self._depth
         for _ in range(SMOOTHED):  # over the noise of the camera
             around = np.pad(depth, 1, mode="edge")
             parts = [around[y : y + rows, x : x + columns] for y, x in np.ndindex(3, 3)]
@@ -211,20 +211,15 @@ class Picture:
         """Draw a fork, (4, 2, 3), faintly where the cloud hides it."""
         along = np.linspace(pieces[:, 0], pieces[:, 1], 17, axis=1)  # (4, 17, 3)
         pixels, depth = self.view.project(along)
-        hidden = depth > self._depth_at(pixels) + BEHIND
+        column, row = np.moveaxis(np.rint(pixels).astype(int), -1, 0)
+        rows, columns = self.view.shape
+        seen = self._depth[np.clip(row, -1, rows), np.clip(column, -1, columns)]  # (4, 17)
+        hidden = depth > seen + BEHIND
         bar = float(np.clip(BAR * self.view.fy / np.median(depth) * self._point, *BARS))
         for width, shade in ((bar + 1.6, OUTLINE), (bar, color)):
             for solid, alpha, cap in ((True, 1.0, "round"), (False, 0.25, "butt")):
                 x, y = np.where((hidden ^ solid)[..., None], pixels, np.nan).T
                 self._axes.plot(x, y, color=shade, linewidth=width, alpha=alpha, solid_capstyle=cap)
-
-    def _depth_at(self, pixels: Float64) -> Float64:
-        """Distance of the cloud at pixels (..., 2); NaN where there is no point."""
-        column, row = np.moveaxis(np.rint(pixels).astype(int), -1, 0)
-        rows, columns = self.view.shape
-        bordered = np.pad(self._depth, (0, 1), constant_values=np.nan)
-        found: Float64 = bordered[np.clip(row, -1, rows), np.clip(column, -1, columns)]
-        return found
 
     def save(self, path: Path | BinaryIO) -> None:
         """Write it: a `.png` or `.jpg` file, whose folder must exist, or a PNG to a stream."""
