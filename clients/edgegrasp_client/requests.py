@@ -204,18 +204,16 @@ def cloud_file(cloud: Cloud) -> tuple[str, bytes]:
         InvalidRequestError: It is neither an array of numbers nor a readable file of a known
             format.
     """
-    if isinstance(cloud, np.ndarray):
+    if isinstance(cloud, np.ndarray) and not cloud.dtype.hasobject:
         if cloud.dtype in (np.float32, np.float64) and cloud.shape[1:] == (3,):
             with np.errstate(over="ignore"):  # the server refuses infinity
                 cloud = np.ascontiguousarray(cloud, np.float32)
-        try:
-            return "npy", npy_bytes(cloud)
-        except ValueError:
-            fix = "Send float32 or float64 metres."
-            raise invalid("cloud", f"dtype {cloud.dtype}", fix) from None
+        return "npy", npy_bytes(cloud)
     if not isinstance(cloud, str | PathLike):
-        fix = "Give an (N, 3) array in metres, a file's path, or a PointCloud2."
-        raise invalid("cloud", f"a {type(cloud).__name__}", fix)
+        kind = f"a {type(cloud).__name__}"
+        value = f"dtype {cloud.dtype}" if isinstance(cloud, np.ndarray) else kind
+        fix = "Give an (N, 3) array of floats in metres, a file's path, or a PointCloud2."
+        raise invalid("cloud", value, fix)
     path = Path(cloud)
     file_format = path.suffix[1:].lower()
     if file_format not in FILE_FORMATS:
