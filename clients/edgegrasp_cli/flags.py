@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from edgegrasp_client import GraspClient
 
 Flags: TypeAlias = list[inspect.Parameter]
+KEYWORD = inspect.Parameter.KEYWORD_ONLY
 PLAIN = (bool, int, float, str, Path)  # types that a flag takes directly
 TOKEN_VARIABLE = "EDGEGRASP_CLIENT_TOKEN"
 
@@ -67,11 +68,8 @@ def takes_flags(**groups: Flags) -> Callable[[Callable[..., None]], Callable[...
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         parameters = inspect.signature(command).parameters.values()
-        models = {
-            each.name: each.annotation
-            for each in parameters
-            if isinstance(each.annotation, type) and issubclass(each.annotation, BaseModel)
-        }
+        annotations = {each.name: each.annotation for each in parameters}
+        models = {name: kind for name, kind in annotations.items() if hasattr(kind, "model_fields")}
         added = {name: model_flags(model) for name, model in models.items()} | groups
 
         @functools.wraps(command)
@@ -82,11 +80,7 @@ def takes_flags(**groups: Flags) -> Callable[[Callable[..., None]], Callable[...
                 given[group] = _checked(models[group], asked) if group in models else asked
             command(**given)
 
-        own = [
-            parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-            for parameter in parameters
-            if parameter.name not in added
-        ]
+        own = [each.replace(kind=KEYWORD) for each in parameters if each.name not in added]
         run.__signature__ = inspect.Signature([*own, *chain(*added.values())])  # type: ignore[attr-defined]
         run.__annotations__ = {"return": None}  # typer reads only the signature
         return run
@@ -114,8 +108,7 @@ def model_flags(
             rich_help_panel=panel,
         )
         annotation: Any = Annotated[flag_type | None, option]
-        keyword = inspect.Parameter.KEYWORD_ONLY
-        flags.append(inspect.Parameter(name, keyword, default=None, annotation=annotation))
+        flags.append(inspect.Parameter(name, KEYWORD, default=None, annotation=annotation))
     return flags
 
 
