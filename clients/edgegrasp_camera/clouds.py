@@ -136,14 +136,10 @@ def _record(cloud: PointCloud2) -> np.dtype[Any]:
         if not size or field.offset + size > cloud.point_step:
             value = f"{field.name} of type {field.datatype} at byte {field.offset}"
             raise InvalidRequest("point_cloud2.fields", value, fix)
+    formats = [order + POINT_TYPES[field.datatype] for field in found]
+    names, offsets = [field.name for field in found], [field.offset for field in found]
+    size = cloud.point_step
     try:
-        return np.dtype(
-            {
-                "names": [field.name for field in found],
-                "formats": [order + POINT_TYPES[field.datatype] for field in found],
-                "offsets": [field.offset for field in found],
-                "itemsize": cloud.point_step,
-            }
-        )
+        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
     except ValueError as error:  # a name that is there twice
         raise InvalidRequest("point_cloud2.fields", str(error), fix) from None

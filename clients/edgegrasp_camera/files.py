@@ -281,10 +281,8 @@ def _read_ply(data: bytes, max_points: int) -> CloudInput:
     fields = [line[1:] for line in properties if line[:1] == ["property"]]
     if any(len(field) != 2 or field[0] not in PLY_TYPES for field in fields):
         raise ValueError("a vertex property that is not a single number")
-    record = _record(
-        ((PLY_FIELDS.get(name, ""), PLY_TYPES[kind], 1) for kind, name in fields),
-        PLY_ORDERS[encoding],
-    )
+    layout = [(PLY_FIELDS.get(name, ""), PLY_TYPES[kind], 1) for kind, name in fields]
+    record = _record(layout, PLY_ORDERS[encoding])
     count, body = int(lines[elements[0]][2]), data[end.end() :]
     return cloud_of_records(_read_records(body, record, count, max_points, encoding))
 

@@ -289,14 +289,12 @@ def fork(
     of the palm's surface and of the fingertips.
     """
     half, (palm, tip) = width / 2, palm_and_tip
-    in_hand = np.array(
-        [
-            [(0.0, 0.0, palm - STEM_LENGTH), (0.0, 0.0, palm)],
-            [(0.0, -half, palm), (0.0, half, palm)],
-            [(0.0, -half, palm), (0.0, -half, tip)],
-            [(0.0, half, palm), (0.0, half, tip)],
-        ]
-    )
+    in_hand = [
+        [(0.0, 0.0, palm - STEM_LENGTH), (0.0, 0.0, palm)],
+        [(0.0, -half, palm), (0.0, half, palm)],
+        [(0.0, -half, palm), (0.0, -half, tip)],
+        [(0.0, half, palm), (0.0, half, tip)],
+    ]
     transform = np.asarray(T_cloud_hand, dtype=np.float64)
     in_cloud: Float64 = in_hand @ transform[:3, :3].T + transform[:3, 3]
     return in_cloud

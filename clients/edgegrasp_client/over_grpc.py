@@ -74,13 +74,12 @@ class GrpcTransport:
     ) -> AsyncGenerator[StreamAnswer, None]:
         """An answer to each of the named requests with their timeouts."""
         failed: list[Exception] = []
+        sent = grasp_pb2.DetectGraspsStreamRequest
 
         async def messages() -> AsyncIterator[grasp_pb2.DetectGraspsStreamRequest]:
             try:
                 async for name, request, seconds in requests:
-                    yield grasp_pb2.DetectGraspsStreamRequest(
-                        request_id=name, request=message_of(request), timeout=seconds
-                    )
+                    yield sent(request_id=name, request=message_of(request), timeout=seconds)
             except Exception as error:  # gRPC would only log it
                 failed.append(error)
 

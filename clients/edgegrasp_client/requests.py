@@ -101,12 +101,8 @@ class Request:
             cloud = read.points
             beside["normals"] = read.normals if beside["normals"] is None else beside["normals"]
         self.cloud = cloud
-        self.depth_images = [
-            depth_image_fields(image, row) for row, image in enumerate(images or ())
-        ]
-        self.arrays = {
-            name: _sent(name, array) for name, array in beside.items() if array is not None
-        }
+        self.depth_images = [depth_image_fields(one, row) for row, one in enumerate(images or ())]
+        self.arrays = {name: _sent(name, one) for name, one in beside.items() if one is not None}
 
 
 class StreamRequest(Request):

@@ -377,16 +377,12 @@ def _robot(
 
 def _depth_images(scene: Scene, lookup: Lookup) -> list[dict[str, Any]]:
     """The images of a scene with their cameras, whose poses are in the frame of its header."""
-    return [
-        {
-            "depth": image_array(depth, DEPTHS),
-            "intrinsics": camera_matrix(camera),
-            "T_cloud_camera": lookup(
-                scene.header.frame_id, depth.header.frame_id, depth.header.stamp
-            ),
-        }
-        for depth, camera in ((scene.depth, scene.camera), *scene.others)
-    ]
+    images: list[dict[str, Any]] = []
+    for depth, camera in ((scene.depth, scene.camera), *scene.others):
+        image = {"depth": image_array(depth, DEPTHS), "intrinsics": camera_matrix(camera)}
+        pose = lookup(scene.header.frame_id, depth.header.frame_id, depth.header.stamp)
+        images.append(image | {"T_cloud_camera": pose})
+    return images
 
 
 def _from_frames(scene: Scene, settings: Settings, lookup: Lookup) -> dict[str, Any]:
