@@ -25,6 +25,7 @@ from edgegrasp_model.gripper import Gripper, gripper_fields, gripper_from_fields
 from edgegrasp_model.options import Finite, GripperGeometry, Quaternion, Strict, Vector
 
 Element = ElementTree.Element
+Kinematics = dict[str, list[Any]]
 
 ROBOT_FOLDER = Path(__file__).parent / "robots"
 GROUP, HAND = "arm", "edgegrasp_hand"  # names in the planner's model
@@ -80,7 +81,7 @@ class Robot:
     upper: Float64  # (J,)
     max_velocity: Float64  # (J,)
     max_acceleration: Float64  # (J,)
-    kinematics: dict[str, list[Any]]  # the same as numbers: as `edgegrasp.v1.Robot` has it
+    kinematics: Kinematics  # the same as numbers: as `edgegrasp.v1.Robot` has it
     model: "Model"
     scene: core.Scene  # for the free motion
     straight: core.Scene  # for straight ways, on which the hand may touch what it grasps
@@ -200,9 +201,8 @@ def _load(path: Path, file: RobotFile) -> Robot:
     for name, link in zip(links, shaped, strict=True):
         shapes = link.findall("collision")
         if len(scenes[0].getCollisionGeometryIDs(name)) < len(shapes):  # the parser goes on without
-            raise InvalidRobot(
-                f"urdf: a <collision> of {name} is wrong. Correct its size or scale."
-            )
+            fix = "Correct its size or scale."
+            raise InvalidRobot(f"urdf: a <collision> of {name} is wrong. {fix}")
         for shape in shapes:
             link.remove(shape)
     bare = replace(model, urdf=as_text(root), allowed=[]).scene(file)
@@ -224,9 +224,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     return robot
 
 
-def _kinematics(
-    joints: Sequence[Element], scene: core.Scene, base_frame: str
-) -> dict[str, list[Any]]:
+def _kinematics(joints: Sequence[Element], scene: core.Scene, base_frame: str) -> Kinematics:
     """Frames between joints, joint axes and which joints slide."""
     links = [*(_link(joint, "child") for joint in joints), HAND]
     poses = [scene.forwardKinematics(np.zeros(len(joints)), link, base_frame) for link in links]
