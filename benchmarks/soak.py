@@ -28,22 +28,20 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import grpc
 import httpx
 import numpy as np
 import psutil
 from benchmarks import serve_dummy
 from benchmarks.measuring import RESULTS, memory, served, write_results
-from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from edgegrasp_camera.arrays import Float32
 from edgegrasp_client import (
     AsyncGraspClient,
     Detection,
+    GraspClient,
     GraspClientError,
     InvalidRequestError,
     StreamRequest,
@@ -53,10 +51,9 @@ from edgegrasp_client.connection import Addresses
 ANSWERED = "answered"
 REFUSED = "refused"
 CANCELLED = "cancelled"
-CROSSED = "another cloud's answer"
 EXPECTED = {"good": {ANSWERED}, "malformed": {REFUSED}, "cancelled": {CANCELLED, ANSWERED}}
 FAULTS: tuple[dict[str, Any], ...] = ({"seed": -1}, {"model": "none"}, {"viewpoint": [1e300, 0, 0]})
-SECONDS = 30.0  # until a request counts as lost
+SECONDS = 30.0  # of a request
 START_SECONDS = 1.0  # for processes to start
 STOP_SECONDS = 30.0  # for the server to stop
 PROBE_SECONDS = 0.1  # between two questions for health
@@ -100,7 +97,7 @@ def run(server: Addresses, clients: int, seconds: float, seed: int) -> dict[str,
         list(pool.map(time.sleep, [START_SECONDS] * len(works)))  # until all have started
         where = server.http_url, server.grpc_address, stop
         beside = [pool.submit(work, *where) for work in works]
-        figures = asyncio.run(Soak(server, seed).run(clients, seconds))
+        figures = asyncio.run(run_clients(server, clients, seconds, seed))
         stop.set()
         refused, *attacks = (work.result() for work in beside)
     return figures | {"health_refused": refused, "attacks": attacks}
@@ -140,56 +137,51 @@ def plans(seed: int, end: float) -> Iterator[Plan]:
         yield Plan(number, str(kind), size, float(random.uniform(0.0, 0.01)), seed)
 
 
-class Soak:
-    """Sends plans from several clients at a time, and records their outcomes."""
+async def run_clients(server: Addresses, clients: int, seconds: float, seed: int) -> dict[str, Any]:
+    """Send plans for `seconds` from several clients at a time; returns the figures."""
+    todo = plans(seed, time.monotonic() + seconds)
+    outcomes, wrong, memory_mb = Counter[str](), list[dict[str, Any]](), list[float]()
 
-    def __init__(self, server: Addresses, seed: int) -> None:
-        self._server, self._seed = server, seed
-        self._outcomes: Counter[str] = Counter()
-        self._wrong: list[dict[str, Any]] = []
-        self._memory: list[float] = []
-        self._given = 0
-
-    async def run(self, clients: int, seconds: float) -> dict[str, Any]:
-        """Send requests for `seconds`; returns the figures."""
-        self._todo = plans(self._seed, time.monotonic() + seconds)
-        ways = itertools.cycle(("grpc", "stream", "rest"))
-        sampling = asyncio.create_task(self._sample(seconds / MEMORY_SAMPLES))
-        await asyncio.gather(*(self._send(way) for way in islice(ways, clients)))
-        sampling.cancel()
-        return {
-            "requests": self._given,
-            "lost": self._given - self._outcomes.total(),
-            "wrong": self._wrong[:20],
-            "outcomes": dict(sorted(self._outcomes.items())),
-            "memory_mb": self._memory,
-        }
-
-    async def _sample(self, seconds: float) -> None:
-        while True:
-            self._memory.append(round(await asyncio.to_thread(memory, self._server.pid), 1))
-            await asyncio.sleep(seconds)
-
-    async def _send(self, way: str) -> None:
+    async def send(way: str) -> None:
         """Send plans one by one."""
-        address = self._server.http_url if way == "rest" else self._server.grpc_address
+        address = server.http_url if way == "rest" else server.grpc_address
         async with AsyncGraspClient(address, timeout=SECONDS, retry=False) as client:
-            for plan in self._todo:
-                self._given += 1
-                try:
-                    async with asyncio.timeout(plan.wait if plan.kind == "cancelled" else None):
-                        answer = await ask(client, way, plan)
-                    mine = answer.counts["crc32"] == zlib.crc32(plan.points().tobytes())
-                    came = ANSWERED if mine else CROSSED
-                except TimeoutError:
-                    came = CANCELLED
-                except InvalidRequestError:
-                    came = REFUSED
-                except GraspClientError as error:
-                    came = type(error).__name__
-                self._outcomes[f"{way} {plan.kind}: {came}"] += 1
+            for plan in todo:
+                came = await outcome(client, way, plan)
+                outcomes[f"{way} {plan.kind}: {came}"] += 1
                 if came not in EXPECTED[plan.kind]:
-                    self._wrong.append({**asdict(plan), "transport": way, "outcome": came})
+                    wrong.append({**asdict(plan), "transport": way, "outcome": came})
+
+    async def sample() -> None:
+        while True:
+            memory_mb.append(round(await asyncio.to_thread(memory, server.pid), 1))
+            await asyncio.sleep(seconds / MEMORY_SAMPLES)
+
+    sampling = asyncio.create_task(sample())
+    ways = itertools.cycle(("grpc", "stream", "rest"))
+    await asyncio.gather(*map(send, itertools.islice(ways, clients)))
+    sampling.cancel()
+    return {
+        "requests": outcomes.total(),
+        "wrong": wrong[:20],
+        "outcomes": dict(sorted(outcomes.items())),
+        "memory_mb": memory_mb,
+    }
+
+
+async def outcome(client: AsyncGraspClient, way: str, plan: Plan) -> str:
+    """What becomes of a plan."""
+    try:
+        async with asyncio.timeout(plan.wait if plan.kind == "cancelled" else None):
+            answer = await ask(client, way, plan)
+        mine = answer.counts["crc32"] == zlib.crc32(plan.points().tobytes())
+        return ANSWERED if mine else "another cloud's answer"
+    except TimeoutError:
+        return CANCELLED
+    except InvalidRequestError:
+        return REFUSED
+    except GraspClientError as error:
+        return type(error).__name__
 
 
 async def ask(client: AsyncGraspClient, way: str, plan: Plan) -> Detection:
@@ -293,28 +285,10 @@ def probe(url: str, address: str, stop: Any) -> dict[str, int]:
     """Ask for health over both transports, each time on a new connection; returns refusals."""
     refused: Counter[str] = Counter()
     while not stop.wait(PROBE_SECONDS):
-        for ask, where in ((ask_http, url), (ask_grpc, address)):
-            try:
-                ask(where)
-            except (httpx.HTTPError, ValueError, grpc.RpcError) as error:
-                refused[f"{where}: {error}"[:200]] += 1
-    return dict(refused)
-
-
-def ask_http(url: str) -> None:
-    """Probe liveness as Kubernetes does; raises httpx.HTTPError unless it succeeds."""
-    live = f"{url}/health/live"
-    httpx.get(live, timeout=HEALTH_TIMEOUT, trust_env=False).raise_for_status()
-
-
-def ask_grpc(address: str) -> None:
-    """One gRPC health check; raises grpc.RpcError or ValueError unless it reports SERVING."""
-    alone = (("grpc.use_local_subchannel_pool", 1),)
-    with grpc.insecure_channel(address, alone) as channel:
-        request = health_pb2.HealthCheckRequest()
-        answer = health_pb2_grpc.HealthStub(channel).Check(request, timeout=HEALTH_TIMEOUT)
-    if answer.status != health_pb2.HealthCheckResponse.SERVING:
-        raise ValueError(answer.status)
+        for where in (url, address):
+            with GraspClient(where) as client:
+                refused[where] += not client.ready(timeout=HEALTH_TIMEOUT)
+    return dict(+refused)
 
 
 def faults(results: dict[str, Any], grows: bool) -> list[str]:
@@ -323,7 +297,6 @@ def faults(results: dict[str, Any], grows: bool) -> list[str]:
     *_, before, after = np.array_split(results["memory_mb"], 4)
     found = {
         "requests with a wrong outcome": results["wrong"],
-        "requests without an outcome": results["lost"],
         "health was refused": results["health_refused"],
         "a poison was not refused": not all(
             one.endswith((": 400", ": 413", ": 429")) for one in poisoned
