@@ -332,7 +332,7 @@ def label(
     if found is None:
         nothing, rows = np.empty((0, 3), dtype=np.float32), np.empty(0, dtype=np.int64)
         camera, success = observation.camera_position, rows.astype(np.int8)
-        return LabelledView(nothing, nothing, camera, rows, rows, None, success), None
+        return LabelledView(nothing, nothing, camera, rows, rows, success), None
     prepared, scene, candidates, best = found
     T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]

@@ -2,10 +2,10 @@
 
 import json
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -21,10 +21,12 @@ from edgegrasp_model.scene.scene import near_workspace_side
 
 UNTRIED = -1  # label of a candidate that was not tried
 TOGETHER = 0.009  # metres between points of one object: twice the edge of a voxel
-REQUIRED = ("points", "normals", "camera_position", "approach_index", "contact_index", "success")
-OPTIONAL = ("T_world_hand", "firm", "support", "at_side", "object_of_point")
-TYPES = {"normals": np.float32, "approach_index": np.int64, "contact_index": np.int64}
 STORED_TYPES = {"normals": np.float16, "approach_index": np.uint16, "contact_index": np.uint16}
+# What the arrays of a file are read as.
+TYPES: dict[str, Callable[[Any], Any]] = {
+    **{"normals": np.float32, "approach_index": np.int64, "contact_index": np.int64},
+    **{"engine": str, "gripper": str, "objects": tuple, "object_digests": tuple},
+}
 # The table and the limits of the simulated scenes, for views whose file does not have them.
 TABLE = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.05)
 WORKSPACE = Workspace(min=(0.02, 0.02, 0.055), max=(0.28, 0.28, 0.3))
@@ -40,25 +42,21 @@ class LabelledView:
     camera_position: Float32  # (3,)
     approach_index: Int64  # (E,) rows of `points`
     contact_index: Int64  # (E,) rows of `points`
-    T_world_hand: Float32 | None  # (E, 4, 4) hands tried; None: edge grasps as in the paper
     success: NDArray[np.int8]  # (E,) 1 held after the lift, 0 not, UNTRIED
+    engine: str = "pybullet"  # that simulated the labels
+    gripper: str = ""  # fields of the hand that tried them, JSON; empty: the Panda's own hand
+    T_world_hand: Float32 | None = None  # (E, 4, 4) hands tried; None: edge grasps as in the paper
     firm: NDArray[np.int8] | None = None  # (E,) 1 held after shaking too, 0 not, UNTRIED
     support: Float32 | None = None  # (4,) unit normal and offset; zeros: unknown; None: TABLE
     at_side: Bools | None = None  # (N,) cut off there; None: as WORKSPACE cuts it
     object_of_point: NDArray[np.int16] | None = None  # (N,) -1: on no object; None: not known
-    engine: str = "pybullet"  # that simulated the labels
-    gripper: str = ""  # fields of the hand that tried them, JSON; empty: the Panda's own hand
     objects: tuple[str, ...] = ()  # names of the objects in the scene, where they are known
     object_digests: tuple[str, ...] = ()  # SHA-256 of their files, in the same order
 
     def save(self, path: Path) -> None:
         """Write the view; a reader sees the whole file or none."""
-        names = (*REQUIRED, "engine", "gripper", *OPTIONAL)
-        kept = {name: value for name in names if (value := getattr(self, name)) is not None}
+        kept = {name: value for name, value in vars(self).items() if value is not None}
         arrays = {name: np.asarray(value, STORED_TYPES.get(name)) for name, value in kept.items()}
-        if self.objects:
-            arrays["objects"] = np.array(self.objects)
-            arrays["object_digests"] = np.array(self.object_digests)
         partial = path.with_suffix(".partial")
         with partial.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
@@ -67,7 +65,8 @@ class LabelledView:
     @property
     def hand(self) -> Gripper:
         """The hand that executed the grasps."""
-        return _hand(self.gripper)
+        fields = self.gripper
+        return gripper_from_fields(json.loads(fields)) if fields else load_gripper()
 
     @property
     def support_plane(self) -> SupportPlane | None:
@@ -105,24 +104,15 @@ class LabelledView:
         return np.flatnonzero(self.success != UNTRIED)
 
 
-@lru_cache(maxsize=64)
-def _hand(fields: str) -> Gripper:
-    return gripper_from_fields(json.loads(fields)) if fields else load_gripper()
-
-
 def load_view(path: Path) -> LabelledView:
     """Read a view; raises ValueError for another file."""
+    fields = LabelledView.__dataclass_fields__
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            return LabelledView(
-                **{name: np.asarray(arrays[name], TYPES.get(name)) for name in REQUIRED},
-                **{name: arrays.get(name) for name in OPTIONAL},
-                engine=str(arrays.get("engine", LabelledView.engine)),
-                gripper=str(arrays.get("gripper", "")),
-                objects=tuple(map(str, arrays.get("objects", ()))),
-                object_digests=tuple(map(str, arrays.get("object_digests", ()))),
-            )
-    except (KeyError, EOFError, BadZipFile) as error:
+            stored = {name: arrays[name] for name in arrays if name in fields}
+        typed = {name: TYPES.get(name, np.asarray)(value) for name, value in stored.items()}
+        return LabelledView(**typed)
+    except (TypeError, EOFError, BadZipFile) as error:
         raise ValueError(f"data: {path} is not a view ({error}). Remove it") from None
 
 

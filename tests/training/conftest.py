@@ -35,7 +35,7 @@ def made_up_view(seed: int) -> LabelledView:
     label = np.full(len(approach), -1, np.int8)
     label[made.pair] = made.approach[:, 2] > 0.4
     camera = np.array([0.15, 0.15, 0.8], np.float32)
-    return LabelledView(cloud.points, cloud.normals, camera, approach, contact, None, label)
+    return LabelledView(cloud.points, cloud.normals, camera, approach, contact, label)
 
 
 @pytest.fixture(scope="session")
