@@ -67,14 +67,10 @@ class TriedGrasps:
         return np.unique(self.candidates.approach_index)
 
 
-@dataclass(frozen=True)
-class SoftLabels:
-    """Candidates of a view with a teacher's scores; compact, to keep many views in memory."""
+class SoftLabels(NamedTuple):
+    """Candidates of a view with a teacher's scores; 16 bits each, to keep many views in memory."""
 
-    approach_index: NDArray[np.uint16]  # (E,) rows of the cloud
-    contact_index: NDArray[np.uint16]  # (E,) rows of the cloud
-    approach: NDArray[np.float16]  # (E, 3) unit, outward
-    depth: NDArray[np.float16]  # (E,) metres
+    candidates: Candidates  # E of them
     chance: NDArray[np.float16]  # (E,) probability that it holds, by the teacher
 
 
@@ -141,13 +137,11 @@ class Teacher:
             hands = hand_batch(view, candidates, view.camera_position[None], max_points)
             with torch.inference_mode():
                 chance = torch.sigmoid(self.network(hands) / self.metadata.temperature).numpy()
-        return SoftLabels(
-            candidates.approach_index.astype(np.uint16),
-            candidates.contact_index.astype(np.uint16),
-            candidates.approach.astype(np.float16),
-            candidates.depth.astype(np.float16),
-            chance.astype(np.float16),
+        short = (
+            array.astype(np.uint16 if array.dtype.kind == "i" else np.float16)
+            for array in vars(candidates).values()
         )
+        return SoftLabels(Candidates(*short), chance.astype(np.float16))
 
     def _candidates(self, view: LabelledView, balls: Int64, rng: np.random.Generator) -> Candidates:
         """At most GRASPS_PER_BALL candidates in each ball (A,), made as the detector makes them."""
@@ -175,38 +169,21 @@ def pack_balls(
     grasps: TriedGrasps, balls: Int64, config: NetworkConfig, soft_labels: SoftLabels | None = None
 ) -> Packed:
     """Pack candidates in balls, rows (A,) of a view; detector's axes, multiples of LENGTH_UNIT."""
-    rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, balls))
-    tried = grasps.candidates.take(rows)
-    approach_index, contact_index = tried.approach_index, tried.contact_index
-    approach, depth, label = tried.approach, tried.depth, grasps.label[rows]
-    weight = np.ones(len(rows), dtype=np.float32)
+    candidates, label = grasps.candidates, grasps.label
+    weight = np.ones(len(label), dtype=np.float32)
     if soft_labels is not None:
-        taught = np.flatnonzero(np.isin(soft_labels.approach_index, balls))
-        approach_index = np.append(approach_index, soft_labels.approach_index[taught])
-        contact_index = np.append(contact_index, soft_labels.contact_index[taught])
-        approach = np.concatenate([approach, soft_labels.approach[taught]], dtype=np.float32)
-        depth = np.append(depth, soft_labels.depth[taught])
-        label = np.append(label, soft_labels.chance[taught])
-        weight = np.append(TRIED_WEIGHT * weight, np.ones(len(taught), dtype=np.float32))
-    crop = crop_balls(grasps.cloud.points, balls, config.crop_radius)
-    size = len(grasps.cloud.points)
-    keys = crop.ball_of_point * size + crop.ball_rows  # ascending
-    wanted = np.searchsorted(balls, approach_index) * size + contact_index
-    contact = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    inside = keys[contact] == wanted
-    batch = BallBatch.from_cloud(
-        grasps.cloud.points,
-        grasps.cloud.normals,
-        balls,
-        crop,
-        contact[inside],
-        approach[inside],
-        depth[inside],
-        config.k,
-    )
+        candidates = Candidates.concatenate([candidates, soft_labels.candidates])
+        weight = np.append(TRIED_WEIGHT * weight, np.ones_like(soft_labels.chance))
+        label = np.append(label, soft_labels.chance)
+    points = grasps.cloud.points.astype(np.float64)
+    edge = points[candidates.contact_index] - points[candidates.approach_index]
+    inside = np.square(edge).sum(axis=1) <= config.crop_radius**2
+    kept = inside & np.isin(candidates.approach_index, balls)
+    some = candidates.take(kept)
+    batch = BallBatch.of_candidates(grasps.cloud, some, config.crop_radius, config.k)
     batch = replace(batch, points=batch.points / LENGTH_UNIT, depth=batch.depth / LENGTH_UNIT)
-    label, weight = label[inside].astype(np.float32), weight[inside]
-    return Packed(turned(batch, grasps.turn), torch.from_numpy(label), torch.from_numpy(weight))
+    targets = torch.from_numpy(label[kept]), torch.from_numpy(weight[kept])
+    return Packed(turned(batch, grasps.turn), *targets)
 
 
 def joined(batches: Sequence[BallBatch | HandBatch]) -> BallBatch | HandBatch:

@@ -251,7 +251,7 @@ class Trainer:
         network, balls, taught = self.metadata.network, grasps.balls(), None
         if self.teacher is not None:
             taught = self._soft_labels(path)
-            balls = np.union1d(balls, taught.approach_index).astype(np.int64)
+            balls = np.union1d(balls, taught.candidates.approach_index).astype(np.int64)
         if len(balls) == 0:
             return None
         balls = np.sort(rng.choice(balls, min(count or len(balls), len(balls)), replace=False))

@@ -139,11 +139,11 @@ def teacher(make_trainer, tmp_path_factory: pytest.TempPathFactory) -> Teacher:
 def test_a_teacher_scores_candidates_above_the_table(views, teacher) -> None:
     view = made_up_view(0)
     labels = teacher.soft_labels(views[0])
-    balls, count = np.unique(labels.approach_index, return_counts=True)
+    balls, count = np.unique(labels.candidates.approach_index, return_counts=True)
     assert 6 < len(balls) <= 24
     assert set(np.unique(view.approach_index)) <= set(balls.tolist())
     assert 0 < count.max() <= GRASPS_PER_BALL
-    toward, chance = labels.approach[:, 2].astype(float), labels.chance.astype(float)
+    toward, chance = labels.candidates.approach[:, 2].astype(float), labels.chance.astype(float)
     assert chance[toward > 0.6].mean() > 1.5 * chance[toward < 0.2].mean()
 
 
