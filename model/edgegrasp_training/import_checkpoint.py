@@ -19,13 +19,9 @@ from edgegrasp_training.recipes import RECIPES, build_network
 
 # Of the authors' evaluation, metres.
 VOXEL_SIZE, CROP_RADIUS, GRIPPER = 0.0045, 0.05, "panda"
-# The prefix of each file here, then their parts by our names.
-_FILES = {
-    "local": "local_emd_model",
-    "global": "global_emd_model",
-    "classifier": "classifier_model",
-    "std": "std",
-}
+# The first word of a file's name is the prefix of its parts below.
+_FILES = "local_emd_model", "global_emd_model", "classifier_model", "std"
+# Their parts by our names.
 _EDGEGRASP_PARTS = {
     r"local\.(conv\d)\.local_nn\.0": r"\1.hidden",
     r"local\.(conv\d)\.local_nn\.2": r"\1.output",
@@ -75,9 +71,8 @@ def import_checkpoint(directory: Path) -> tuple[nn.Module, CheckpointMetadata]:
     config = RECIPES["vn-edgegrasp" if is_vn else "edgegrasp"]
     config = replace(config, crop_radius=CROP_RADIUS)
     theirs = {
-        f"{part}.{name}": weight
-        for part, stem in _FILES.items()
-        if part != "std" or is_vn
+        f"{stem.partition('_')[0]}.{name}": weight
+        for stem in _FILES[: 4 if is_vn else 3]
         for name, weight in _load_weights(directory / f"{stem}-ckpt-{number}.pt").items()
     }
     network = build_network(config)
@@ -102,15 +97,13 @@ def import_checkpoint(directory: Path) -> tuple[nn.Module, CheckpointMetadata]:
 def _load_weights(path: Path) -> dict[str, Tensor]:
     try:
         weights = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, UnpicklingError) as error:
+        if not isinstance(weights, dict):
+            raise TypeError(f"it holds a {type(weights).__name__}")
+    except (OSError, RuntimeError, EOFError, UnpicklingError, TypeError) as error:
         raise InvalidCheckpoint(
             f"directory: got {path}, which cannot be read as a state dict ({error}). "
             "Give complete files that hold tensors alone."
         ) from error
-    if not isinstance(weights, dict):
-        raise InvalidCheckpoint(
-            f"directory: got {path} with a {type(weights).__name__}. Give a state dict."
-        )
     return weights
 
 
@@ -118,11 +111,8 @@ def _renamed(theirs: dict[str, Tensor], parts: dict[str, str]) -> dict[str, Tens
     """Weights under our names; unknown ones keep theirs, so that load_state_dict names them."""
     ours = {}
     for name, weight in theirs.items():
-        module, _, kind = name.rpartition(".")
         for pattern, replacement in parts.items():
-            if match := re.fullmatch(pattern, module):
-                name = f"{match.expand(replacement)}.{kind}"
-                break
+            name = re.sub(rf"^{pattern}(?=\.\w+$)", replacement, name)
         ours[name] = weight
     return ours
 
