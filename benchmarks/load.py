@@ -1,9 +1,9 @@
 """Measure servers under load: `python -m benchmarks.load` writes load.json.
 
-Clients in processes of their own send clouds or depth images, each its next request once it has an
-answer: latency and throughput by the number of clients. Without `--server` one is started, and
-measured over both transports. Several servers take turns, so that other work on the machine meets
-all alike: a new design beside the old one.
+Clients in threads send clouds or depth images, each its next request once it has an answer: latency
+and throughput by the number of clients. Without `--server` one is started, and measured over both
+transports. Several servers take turns, so that other work on the machine meets all alike: a new
+design beside the old one.
 """
 
 import argparse
@@ -12,9 +12,8 @@ import statistics
 import time
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,9 +29,7 @@ POINTS = 20_000
 SAMPLE = Path(edgegrasp_service.__file__).parent / "playground" / "samples" / "seven_depth.png"
 FOCAL = 540.0  # pixels, of the sample's camera
 OPTIONS: DetectOptions = {"num_approach_points": 32, "num_candidates": 500}
-PROCESSES = 2  # that the clients are shared among
 TIMEOUT = 120.0  # seconds until a request is given up
-START_SECONDS = 1.0  # from the order to the first request: clouds are made
 OK = "OK"
 
 
@@ -61,20 +58,9 @@ def main() -> None:
         if not servers:
             own = stack.enter_context(served())
             servers = {"grpc": own.grpc_address, "rest": own.http_url}
-        pool = stack.enter_context(ProcessPoolExecutor(PROCESSES, mp_context=get_context("spawn")))
-        list(pool.map(time.sleep, [START_SECONDS] * PROCESSES))  # until all processes have started
         runs: dict[tuple[int, str], list[list[Sample]]] = {}
-        for _, clients, name in itertools.product(range(given.rounds), given.clients, servers):
-            processes = min(PROCESSES, clients)
-            start = time.monotonic() + START_SECONDS
-            what = start, given.seconds, given.points
-            shares = [
-                pool.submit(
-                    run_clients, servers[name], len(range(k, clients, processes)), *what, seed=k
-                )
-                for k in range(processes)
-            ]
-            samples = [sample for share in shares for sample in share.result()]
+        for turn, clients, name in itertools.product(range(given.rounds), given.clients, servers):
+            samples = run_clients(servers[name], clients, given.seconds, given.points, seed=turn)
             runs.setdefault((clients, name), []).append(samples)
     for (clients, name), found in runs.items():
         rates = [sum(one.code == OK for one in run) / given.seconds for run in found]
@@ -93,20 +79,18 @@ def main() -> None:
     write_results(given.output, "load", results)
 
 
-def run_clients(
-    address: str, clients: int, start: float, seconds: float, points: int, seed: int
-) -> list[Sample]:
-    """Send from `start` on until the time is over; every request that was sent has its sample."""
+def run_clients(address: str, clients: int, seconds: float, points: int, seed: int) -> list[Sample]:
+    """Send until the time is over; every request that was sent has its sample."""
     request: dict[str, Any] = {"cloud": cloud(points, seed)}
     if not points:
         depth = np.asarray(Image.open(SAMPLE))
         request = {"depth_images": [{"depth": depth, "intrinsics": (FOCAL, FOCAL, 320.0, 240.0)}]}
+    end = time.monotonic() + seconds
 
     def work(_: int) -> list[Sample]:
         samples = []
         with GraspClient(address, timeout=TIMEOUT, retry=False) as client:
-            time.sleep(max(0.0, start - time.monotonic()))
-            while (begun := time.monotonic()) < start + seconds:
+            while (begun := time.monotonic()) < end:
                 try:
                     code, detector = OK, client.detect(**request, **OPTIONS).seconds["total"]
                 except GraspClientError as error:

@@ -11,7 +11,6 @@ import re
 import statistics
 import time
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from examples.your_planner import plan
 from edgegrasp_lab.real_scenes import load_scenes
 from edgegrasp_model.detector import ModelCatalogue
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_sim.camera import EVALUATION_VIEWS, Observation, TableView
+from edgegrasp_sim.camera import EVALUATION_VIEWS, Observation
 from edgegrasp_sim.engine import ENGINES, installed
 from edgegrasp_sim.objects import CLUTTER, SceneKind
 from edgegrasp_sim.protocol import load_protocol
@@ -54,8 +53,8 @@ def main() -> None:
     torch.set_num_threads(1)
     start = time.perf_counter()
     results: dict[str, Any] = {"machine": machine()}
-    parts = (camera, shipped, simulators, server_footprint)
-    for name, part in zip(("camera", "shipped", "simulator", "server"), parts, strict=True):
+    for part in (camera, shipped, simulator, server):
+        name = part.__name__
         results[name] = part()
         print(name, results[name], flush=True)
     results["minutes"] = (time.perf_counter() - start) / 60
@@ -119,29 +118,28 @@ def demo_view() -> Observation:
         return simulation.observe_from(EVALUATION_VIEWS.sample(camera), noise, table="auto")
 
 
-def server_footprint() -> dict[str, float]:
+def server() -> dict[str, float]:
     """Seconds of the clock until the server is ready; its memory, MiB, then and after requests."""
     from edgegrasp_client import GraspClient
 
     start = time.perf_counter()
-    with served() as server:
+    with served() as running:
         ready = time.perf_counter() - start
-        at_rest = memory(server.pid)
-        seen = observe(table="auto")
+        at_rest = memory(running.pid)
+        seen = demo_view()
         viewpoint = tuple(seen.camera_position.tolist())
-        with GraspClient(server.grpc_address) as client:
+        with GraspClient(running.grpc_address) as client:
             for seed in range(10):
                 client.detect(seen.cloud, seed=seed, viewpoint=viewpoint)
-        return {"ready_seconds": ready, "rest_mb": at_rest, "used_mb": memory(server.pid)}
+        return {"ready_seconds": ready, "rest_mb": at_rest, "used_mb": memory(running.pid)}
 
 
-def simulators() -> dict[str, Any]:
-    """The simulator with each kind of scene, in a separate process like its workers."""
-    with get_context("spawn").Pool(1) as process:
-        return {str(kind): process.apply(simulator, (kind,)) for kind in CLUTTER}
+def simulator() -> dict[str, Any]:
+    """The simulator with each kind of scene."""
+    return {str(kind): engines(kind) for kind in CLUTTER}
 
 
-def simulator(kind: SceneKind) -> dict[str, dict[str, float]]:
+def engines(kind: SceneKind) -> dict[str, dict[str, float]]:
     """Labels a second and rounds a minute of each engine, all but the start included."""
     protocol, options = load_protocol("edgegrasp"), GenerationOptions(grasps_per_view=LABELS)
     # Labels, seconds that they took, and seconds of a round.
@@ -170,12 +168,12 @@ def simulator(kind: SceneKind) -> dict[str, dict[str, float]]:
     return results
 
 
-def observe(kind: SceneKind = SceneKind.PILE, table: TableView = "known") -> Observation:
+def observe(kind: SceneKind) -> Observation:
     """A view of a scene of the built-in objects."""
     with ClutterSimulation() as simulation:
         simulation.reset(kind, np.random.default_rng(1))
         views = EVALUATION_VIEWS.sample(np.random.default_rng(1))
-        return simulation.observe_from(views, np.random.default_rng(2), table=table)
+        return simulation.observe_from(views, np.random.default_rng(2))
 
 
 def request(observation: Observation) -> DetectOptions:
