@@ -252,12 +252,12 @@ class Trainer:
         if self.teacher is not None:
             taught = self._soft_labels(path)
             balls = np.union1d(balls, taught.candidates.approach_index).astype(np.int64)
-        if len(balls) == 0:
-            return None
         balls = np.sort(rng.choice(balls, min(count or len(balls), len(balls)), replace=False))
         if network.architecture == "hand":
-            return pack_hands(grasps, balls, network, rng if vary else None)
-        return pack_balls(grasps, balls, network, taught)
+            packed = pack_hands(grasps, balls, network, rng if vary else None)
+        else:
+            packed = pack_balls(grasps, balls, network, taught)
+        return packed if len(packed.label) else None
 
     def _standardise(self, network: HandNet) -> None:
         """Fit mean and spread of the hand descriptions to the training views."""

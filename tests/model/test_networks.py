@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.candidates.edge_grasps import crop_balls, edge_grasps
+from edgegrasp_model.candidates.edge_grasps import Candidates, edge_grasps
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
@@ -63,22 +63,18 @@ class RandomScene:
         return replace(self, approach_index=self.approach_index[[ball]], edges=edges)
 
     def batch(self, dtype: type = np.float64) -> BallBatch:
-        crop = crop_balls(self.points, self.approach_index, 0.05)
-        size = len(self.points)
-        row = np.searchsorted(
-            crop.ball_of_point * size + crop.ball_rows, self.edges @ np.array([size, 1])
-        )
-        edge = self.points[self.edges[:, 1]] - self.points[self.approach_index[self.edges[:, 0]]]
-        normal = self.normals[self.edges[:, 1]]
+        approach_index, contact_index = self.approach_index[self.edges[:, 0]], self.edges[:, 1]
+        edge = self.points[contact_index] - self.points[approach_index]
+        normal = self.normals[contact_index]
         ahead = edge - (edge * normal).sum(axis=1, keepdims=True) * normal
         depth = np.linalg.norm(ahead, axis=1)
-        points, normals, approach, depth = (
-            each.astype(dtype)
-            for each in (self.points, self.normals, -ahead / depth[:, None], depth)
+        hands = np.zeros((len(edge), 4, 4))
+        hands[:, :3, 2] = ahead / depth[:, None]
+        points, normals, depth, hands = (
+            each.astype(dtype) for each in (self.points, self.normals, depth, hands)
         )
-        return BallBatch.from_cloud(
-            points, normals, self.approach_index, crop, row, approach, depth
-        )
+        edges = Candidates(contact_index, approach_index, contact_index, depth, depth, hands)
+        return BallBatch.of_candidates(Cloud(points, normals), edges, 0.05)
 
 
 def scores(network: torch.nn.Module, batch: BallBatch | HandBatch) -> torch.Tensor:
@@ -139,8 +135,8 @@ def test_neither_single_precision_nor_recorded_gradients_change_a_score(architec
     single = scores(network, batch)  # by fused loops
     in_one_place = replace(batch, points=0 * batch.points, normals=0 * batch.normals)
     assert scores(network, in_one_place).isfinite().all()
-    empty = replace(scene, edges=np.empty((0, 2), dtype=np.int64))
-    assert scores(network, empty.batch(np.float32)).shape == (0,)
+    none = {name: getattr(batch, name)[:0] for name in ("contact", "approach", "depth")}
+    assert scores(network, replace(batch, **none)).shape == (0,)
     network.double()
     exact = scores(network, scene.batch())
     torch.testing.assert_close(single.double(), exact, rtol=0, atol=0.01 * float(exact.std()))

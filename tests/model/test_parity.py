@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from edgegrasp_model.candidates.edge_grasps import crop_balls
+from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls
 from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_training.import_checkpoint import import_checkpoint
 
 RADIUS = 0.05  # of the reference
@@ -26,17 +27,13 @@ def golden_batch(shared_dir: Path, scene: str) -> tuple[BallBatch, np.ndarray]:
     approach_row = golden["approach_index"][crop.ball_of_point]
     ours = np.column_stack((approach_row, crop.ball_rows)).tolist()
     assert sorted(ours) == sorted(golden["ball_edges"].tolist())
-    row_of = {tuple(pair): row for row, pair in enumerate(ours)}
-    scored = golden["ball_edges"][golden["edge_rows"]]
-    batch = BallBatch.from_cloud(
-        golden["points"],
-        golden["normals"],
-        golden["approach_index"],
-        crop,
-        contact=np.array([row_of[tuple(pair)] for pair in scored.tolist()]),
-        approach=golden["approach"],
-        depth=golden["depth"],
-    )
+    approach, contact = golden["ball_edges"][golden["edge_rows"]].T
+    depth = golden["depth"]
+    hands = np.zeros((len(depth), 4, 4), dtype=np.float32)
+    hands[:, :3, 2] = -golden["approach"]
+    edges = Candidates(contact, approach, contact, depth, depth, hands)
+    cloud = Cloud(golden["points"], golden["normals"])
+    batch = BallBatch.of_candidates(cloud, edges, RADIUS)
     return batch, golden["logit"]
 
 

@@ -6,12 +6,10 @@ from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from edgegrasp_camera.arrays import Floats
-from edgegrasp_model.candidates.edge_grasps import BallCrop, Candidates, crop_balls
+from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.scene.cloud import Cloud
 
@@ -29,40 +27,30 @@ class BallBatch:
     depth: Tensor  # (E,) float32, |r_perp|: contact below approach point along u
 
     @classmethod
-    def of_candidates(cls, cloud: Cloud, candidates: Candidates, radius: float, k: int) -> Self:
-        """Candidates with balls of `radius` metres around their approach points; `k` as below."""
+    def of_candidates(
+        cls,
+        cloud: Cloud,
+        candidates: Candidates,
+        radius: float,  # metres, of the balls around their approach points; no contact is farther
+        k: int = 16,  # neighbours of each point (paper, section IV)
+    ) -> Self:
+        """Pack candidates with the balls that they are in."""
         balls, size = np.unique(candidates.approach_index), len(cloud.points)
         crop = crop_balls(cloud.points, balls, radius)
         keys = crop.ball_of_point * size + crop.ball_rows  # ascending
         ball = np.searchsorted(balls, candidates.approach_index)
         contact = np.searchsorted(keys, ball * size + candidates.contact_index)
-        edges = contact, candidates.approach, candidates.depth
-        return cls.from_cloud(cloud.points, cloud.normals, balls, crop, *edges, k)
-
-    @classmethod
-    def from_cloud(
-        cls,
-        points: Floats,  # (N, 3); all arrays of one type
-        normals: Floats,  # (N, 3)
-        approach_index: NDArray[np.integer],  # (A,)
-        crop: BallCrop,
-        contact: NDArray[np.integer],  # (E,)
-        approach: Floats,  # (E, 3)
-        depth: Floats,  # (E,)
-        k: int = 16,  # neighbours of each point (paper, section IV)
-    ) -> Self:
-        """Pack a cloud and its balls; contacts are rows of the crop, as each belongs to a ball."""
-        centred = points[crop.ball_rows] - points[approach_index][crop.ball_of_point]
+        centred = cloud.points[crop.ball_rows] - cloud.points[balls][crop.ball_of_point]
         # The nearest points of the same ball, the point itself first; it fills up small balls.
         neighbors = np.repeat(np.arange(len(centred))[:, None], k, axis=1)
         for start, stop in pairwise(crop.start.tolist()):
-            ball = centred[start:stop]
-            there = min(k, len(ball))
-            nearest = cKDTree(ball).query(ball, k=range(1, there + 1))[1]
+            points = centred[start:stop]
+            there = min(k, len(points))
+            nearest = cKDTree(points).query(points, k=range(1, there + 1))[1]
             neighbors[start:stop, :there] = start + nearest
-        edges = np.asarray(contact, dtype=np.int64), np.ascontiguousarray(approach), depth
-        arrays = centred, normals[crop.ball_rows], neighbors, crop.ball_of_point, *edges
-        return cls(*map(torch.from_numpy, arrays))
+        rows = cloud.normals[crop.ball_rows], neighbors, crop.ball_of_point, contact
+        edges = np.ascontiguousarray(candidates.approach), candidates.depth
+        return cls(*map(torch.from_numpy, (centred, *rows, *edges)))
 
     @classmethod
     def made_up(cls, config: NetworkConfig) -> Self:
@@ -70,20 +58,14 @@ class BallBatch:
         rng = np.random.default_rng(0)
         points = rng.uniform(-0.06, 0.06, (200, 3)).astype(np.float32)
         normals = rng.normal(size=(200, 3))
-        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        balls = np.array([0, 1])
-        crop = crop_balls(points, balls, config.crop_radius)
-        contact = rng.choice(len(crop.ball_rows), 32)
-        return cls.from_cloud(
-            points,
-            normals.astype(np.float32),
-            balls,
-            crop,
-            contact,
-            approach=normals[:32].astype(np.float32),
-            depth=rng.uniform(0.0, 0.04, 32).astype(np.float32),
-            k=config.k,
-        )
+        normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+        crop = crop_balls(points, np.array([0, 1]), config.crop_radius)
+        row = rng.choice(len(crop.ball_rows), 32)
+        depth = rng.uniform(0.0, 0.04, 32).astype(np.float32)
+        hands = np.zeros((32, 4, 4), dtype=np.float32)
+        hands[:, :3, 2] = -normals[:32]
+        edges = Candidates(row, crop.ball_of_point[row], crop.ball_rows[row], depth, depth, hands)
+        return cls.of_candidates(Cloud(points, normals), edges, config.crop_radius, config.k)
 
     @property
     def num_balls(self) -> int:
