@@ -5,7 +5,6 @@ that a bowl or a ring is as hollow for a finger as it is for a camera.
 """
 
 from collections.abc import Callable
-from functools import lru_cache
 
 import numpy as np
 
@@ -278,11 +277,12 @@ def _frame(rng: Random) -> list[Mesh]:
 
 
 FAMILIES: dict[str, Callable[[Random], list[Mesh]]] = {
-    "can": _can, "bottle": _bottle, "jar": _jar, "bowl": _bowl, "cup": _cup, "plate": _plate,
-    "glass": _glass, "carton": _carton, "tray": _tray, "book": _book, "torch": _torch,
-    "hammer": _hammer, "screwdriver": _screwdriver, "spanner": _spanner, "scissors": _scissors,
-    "clamp": _clamp, "pen": _pen, "fruit": _fruit, "bag": _bag, "ring": _ring, "frame": _frame,
-}  # fmt: skip
+    make.__name__[1:]: make
+    for make in (
+        *(_can, _bottle, _jar, _bowl, _cup, _plate, _glass, _carton, _tray, _book, _torch),
+        *(_hammer, _screwdriver, _spanner, _scissors, _clamp, _pen, _fruit, _bag, _ring, _frame),
+    )
+}
 
 
 def oval(sharp: float = 1.0, corners: int = FINE) -> Float64:
@@ -397,12 +397,9 @@ def _placed(parts: list[Mesh], *moves: Float64 | tuple[float, ...]) -> list[Mesh
     return parts
 
 
-@lru_cache(maxsize=64)
 def _faces(rings: int, corners: int) -> Int64:
     """Triangles that join neighbouring rings of corners and close both ends."""
     first, second = strips(rings, corners)
     start, end = np.arange(1, corners - 1), np.arange(2, corners)
     fan = np.stack([np.zeros_like(start), start, end], axis=1)
-    triangles = np.concatenate([first, fan[:, ::-1], second, fan + (rings - 1) * corners])
-    triangles.setflags(write=False)
-    return triangles
+    return np.concatenate([first, fan[:, ::-1], second, fan + (rings - 1) * corners])

@@ -8,6 +8,7 @@ One command makes the whole data set again: `edgegrasp generate-scenes FOLDER --
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -78,21 +79,19 @@ def generate(
 ) -> None:
     """Write files of SCENES_PER_FILE scenes, with VIEWS_PER_SCENE images each."""
     folder.mkdir(parents=True, exist_ok=True)
-    drawn = -1
-    for number in numbers:
-        if drawn != number // FILES_PER_POOL:
-            drawn = number // FILES_PER_POOL
-            rng = np.random.default_rng([seed, drawn, 7])
-            pool, arms = make_pool(rng, objects), make_arms(rng)
-        rng = np.random.default_rng([seed, number])
-        images: list[SceneImage] = []
-        while len(images) < SCENES_PER_FILE * VIEWS_PER_SCENE:
-            images += make_images(draw_scene(rng, pool, arms))
-        path = folder / FILE.format(number)
-        partial = path.with_suffix(".partial.npz")
-        arrays = SceneImage(*map(np.stack, zip(*images, strict=True)))
-        np.savez(partial, allow_pickle=False, **arrays._asdict())
-        partial.replace(path)
+    for drawn, mine in groupby(numbers, lambda number: number // FILES_PER_POOL):
+        rng = np.random.default_rng([seed, drawn, 7])
+        pool, arms = make_pool(rng, objects), make_arms(rng)
+        for number in mine:
+            rng = np.random.default_rng([seed, number])
+            images: list[SceneImage] = []
+            while len(images) < SCENES_PER_FILE * VIEWS_PER_SCENE:
+                images += make_images(draw_scene(rng, pool, arms))
+            path = folder / FILE.format(number)
+            partial = path.with_suffix(".partial.npz")
+            arrays = SceneImage(*map(np.stack, zip(*images, strict=True)))
+            np.savez(partial, allow_pickle=False, **arrays._asdict())
+            partial.replace(path)
 
 
 def make_images(scene: SceneMeshes) -> list[SceneImage]:
