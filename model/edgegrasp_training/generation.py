@@ -49,23 +49,22 @@ SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM, HAND_STR
 HOUSEHOLD_STREAM = 6
 APPROACH_POINTS = 12  # few balls with many labels each are the cheapest to train on
 BIN_APPROACH_POINTS = 24  # walls block most hands there
-PACKED, PILE, BIN, TABLE = SceneKind.PACKED, SceneKind.PILE, SceneKind.BIN, SceneKind.TABLE
-DEEP_BIN, FULL_BIN, SHELF = SceneKind.DEEP_BIN, SceneKind.FULL_BIN, SceneKind.SHELF
+PACKED, PILE, BIN, TABLE, FULL_BIN, DEEP_BIN, SHELF = SceneKind
 BINS = BIN, DEEP_BIN, FULL_BIN  # seen from above only
 # Four in ten scenes are those of the benchmark of the paper.
 MIXTURE = (PACKED, PILE, BIN, TABLE, BIN, PACKED, TABLE, PILE, BIN, TABLE)
 # A scene holds one object and Poisson(this) more.
 FURTHER_OBJECTS = {PACKED: 4, PILE: 4, BIN: 7, DEEP_BIN: 9, FULL_BIN: 24, TABLE: 5, SHELF: 3}
-_ABOVE, _STEEP = (0.0, 40.0), (20.0, 75.0)  # degrees, as the other angles
-_ANY_SIDE, _FRONT = (0.0, 360.0), (230.0, 310.0)
-_LOW_TARGET = (MIDDLE, MIDDLE, 0.1)  # metres
-_OPEN = ViewRange((0.45, 0.75), (0.0, 75.0), _ANY_SIDE, (MIDDLE, MIDDLE, 0.25))
-VIEWS = dict.fromkeys((PACKED, PILE), _OPEN)
-VIEWS |= dict.fromkeys(BINS, ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET))
-VIEWS[TABLE] = ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET)
-VIEWS[SHELF] = ViewRange((0.45, 1.0), (45.0, 90.0), _FRONT, _LOW_TARGET)
+_ANY_SIDE = (0.0, 360.0)  # degrees, as the other angles
+_HIGH, _LOW = (MIDDLE, MIDDLE, 0.25), (MIDDLE, MIDDLE, 0.1)  # metres, looked at
+VIEWS = {
+    **dict.fromkeys((PACKED, PILE), ViewRange((0.45, 0.75), (0.0, 75.0), _ANY_SIDE, _HIGH)),
+    **dict.fromkeys(BINS, ViewRange((0.5, 1.1), (0.0, 40.0), _ANY_SIDE, _LOW)),
+    TABLE: ViewRange((0.5, 1.2), (20.0, 75.0), _ANY_SIDE, _LOW),
+    SHELF: ViewRange((0.45, 1.0), (45.0, 90.0), (230.0, 310.0), _LOW),
+}
 # Of household objects, more from one side: a tall or wide one hides its back there.
-SIDE_VIEWS = ViewRange((0.5, 1.2), (40.0, 80.0), _ANY_SIDE, _LOW_TARGET)
+SIDE_VIEWS = ViewRange((0.5, 1.2), (40.0, 80.0), _ANY_SIDE, _LOW)
 # Metres from the nearest hand that was tried: from where the frame of a Panda's hand would be.
 KEPT_DISTANCE = 0.18
 AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
@@ -199,8 +198,8 @@ def generate_scene(
             drawn = varied_objects(drawn, Path(shapes), streams[SHAPE_STREAM])
         household = options.household > streams[HOUSEHOLD_STREAM].random()
         if household:
-            count = NUM_HOUSEHOLD
-            drawn = household_objects(Path(shapes) / "household", count, streams[HOUSEHOLD_STREAM])
+            folder = Path(shapes) / "household"
+            drawn = household_objects(folder, NUM_HOUSEHOLD, streams[HOUSEHOLD_STREAM])
         gripper = None  # the Panda's
         if options.gripper == "random":
             gripper = random_gripper(streams[HAND_STREAM])
@@ -211,9 +210,10 @@ def generate_scene(
         with ClutterSimulation(made_of, engine=options.engine, gripper=gripper) as simulation:
             _, (low, high), _ = STANDING_IN[kind]
             sizes = low * WIDER_SCALES[0], high * WIDER_SCALES[1]
-            sizes = HOUSEHOLD_SCALE if household else sizes
-            from_side = household and kind in (PACKED, PILE, TABLE)
-            seen_from = SIDE_VIEWS if from_side else VIEWS[kind]
+            seen_from = VIEWS[kind]
+            if household:
+                sizes = HOUSEHOLD_SCALE
+                seen_from = SIDE_VIEWS if kind in (PACKED, PILE, TABLE) else seen_from
             views = list(_views(simulation, kind, sizes, seen_from, options, streams))
     return [replace(view, gripper=hand) for view in views]
 
