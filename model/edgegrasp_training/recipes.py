@@ -21,7 +21,8 @@ VOXEL_SIZE = 0.0045  # metres; that of the training views
 # power of two, so that converting weights back to metres is exact.
 LENGTH_UNIT = 1 / 64
 CONSTANT = 1e-6  # standard deviation below which a number of the description counts as constant
-GAIN = 3**0.5  # with PyTorch's initial weights a dozen layers would shrink signals to nothing
+# With PyTorch's initial weights the dozen layers of a ball network would shrink signals to nothing.
+GAIN = 3**0.5
 RECIPES = {
     # The paper's network (section IV-B and the authors' release): 3.05 M parameters.
     "edgegrasp": NetworkConfig(
@@ -81,16 +82,10 @@ def build_network(config: NetworkConfig, generator: torch.Generator | None = Non
             nn.init.uniform_(module.weight, -bound, bound, generator=generator)
             if module.bias is not None:
                 nn.init.uniform_(module.bias, -bound, bound, generator=generator)
-    return network
-
-
-def prepare_to_train(network: nn.Module) -> None:
-    """Scale the random weights of a network of balls so that signals keep their size."""
-    if isinstance(network, EdgeGraspNet | VNEdgeGraspNet):
-        with torch.no_grad():
-            for module in network.modules():
-                if isinstance(module, nn.Linear):
+            if config.architecture != "hand":
+                with torch.no_grad():
                     module.weight.mul_(GAIN)
+    return network
 
 
 def set_statistics(network: HandNet, mean: Tensor, std: Tensor) -> None:

@@ -36,7 +36,6 @@ from edgegrasp_training.options import TrainingOptions
 from edgegrasp_training.recipes import (
     LENGTH_UNIT,
     build_network,
-    prepare_to_train,
     rescaled,
     set_statistics,
     start_from,
@@ -87,7 +86,6 @@ class Trainer:
             self._soft_labels = lru_cache(maxsize=VIEWS_IN_MEMORY)(teacher.soft_labels)
         generator = torch.Generator().manual_seed(options.seed)
         self.network = build_network(metadata.network, generator).to(device)
-        prepare_to_train(self.network)
         self.start = None if start is None else load_checkpoint(start)
         if self.start is not None:
             start_from(self.network, self.start[0])
