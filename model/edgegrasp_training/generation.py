@@ -147,20 +147,16 @@ def generate(
     digests = [drawn.digest for drawn in sets.values()]
     make_runner = partial(_scene_maker, sets, digests, options)
     for index, views in run_tasks(make_runner, missing, workers=workers, ray=ray):
-        for number, view in enumerate(views):
-            view.save(view_path(folder, index, number, options))
+        for path, view in zip(view_paths(folder, index, options), views, strict=True):
+            view.save(path)
         tried = sum(len(view.tried()) for view in views)
         yield index, tried, sum(int((view.success == 1).sum()) for view in views)
 
 
 def missing_scenes(folder: Path, options: GenerationOptions) -> list[int]:
     """Indices of the scenes that lack a view."""
-    views = range(options.views_per_scene)
-    return [
-        index
-        for index in range(options.scenes)
-        if not all(view_path(folder, index, view, options).is_file() for view in views)
-    ]
+    scenes = {index: view_paths(folder, index, options) for index in range(options.scenes)}
+    return [index for index, paths in scenes.items() if not all(map(Path.is_file, paths))]
 
 
 def kind_of(options: GenerationOptions, index: int) -> SceneKind:
@@ -168,9 +164,10 @@ def kind_of(options: GenerationOptions, index: int) -> SceneKind:
     return SceneKind(options.scene) if options.scene else MIXTURE[index % len(MIXTURE)]
 
 
-def view_path(folder: Path, index: int, view: int, options: GenerationOptions) -> Path:
-    """File of a view."""
-    return folder / f"{kind_of(options, index)}_{options.seed}-{index:06d}_{view}.npz"
+def view_paths(folder: Path, index: int, options: GenerationOptions) -> list[Path]:
+    """Files of a scene's views."""
+    name = f"{kind_of(options, index)}_{options.seed}-{index:06d}"
+    return [folder / f"{name}_{view}.npz" for view in range(options.views_per_scene)]
 
 
 def _scene_maker(
