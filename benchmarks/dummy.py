@@ -37,8 +37,8 @@ class DummyDetector:
         wanted = options.num_approach_points or min(APPROACH_POINTS, len(points))
         drawn = random.choice(len(points), wanted, replace=False)
         scores = np.sort(random.random(len(drawn), dtype=np.float32))[::-1]
-        counts = {"points": len(points), "scored": len(drawn)}
-        counts["crc32"] = zlib.crc32(points.tobytes())  # a caller sees that the cloud is its own
+        crc32 = zlib.crc32(points.tobytes())  # a caller sees that the cloud is its own
+        counts = {"points": len(points), "scored": len(drawn), "crc32": crc32}
         # `drawn`: (A,) approach points, rows of `points` (N, 3); `batch`: (A,) descending scores,
         # which the network gives back.
         stages: dict[str, Any] = {"counts": counts, "seconds": {}, "scene": None}
@@ -55,16 +55,14 @@ class DummyDetector:
         options, drawn = prepared.options, prepared.points[prepared.drawn]
         returned = (logits >= options.min_score) & (np.arange(len(drawn)) < GRASPS)
         returned[options.top_k :] = False  # scores descend
-        grasps = [
-            _top_down(point, float(score))
-            for point, score in zip(drawn[returned], logits[returned], strict=True)
-        ]
+        made = [*map(_top_down, drawn, logits.tolist())]
+        grasps = [grasp for grasp, one in zip(made, returned, strict=True) if one]
         debug = DebugInfo(
             points=prepared.points,
             normals=np.tile(-DOWN, (len(prepared.points), 1)),
             approach_index=prepared.drawn,
             contact_index=prepared.drawn,
-            T_cloud_hand=np.stack([_top_down(point, 0.0).T_cloud_hand for point in drawn]),
+            T_cloud_hand=np.stack([grasp.T_cloud_hand for grasp in made]),
             score=np.where(returned, logits, np.float32(np.nan)),
             outcome=[Outcome.RETURNED if one else Outcome.NOT_SCORED for one in returned],
             support_plane=None,
@@ -97,10 +95,9 @@ class DummyDetector:
             contacts = (poses @ np.array([0.0, 0.0, TCP_Z, 1.0], np.float32))[:, :3]
             is_grasp = np.ones(len(poses), dtype=bool)
         scores = np.random.default_rng(options.seed).random(len(contacts), dtype=np.float32)
-        none = Evaluation(None, NoGrasp.TOO_SHORT)
         evaluations = [
-            Evaluation(_top_down(contact, float(score)), None) if grasps else none
-            for contact, score, grasps in zip(contacts, scores, is_grasp, strict=True)
+            Evaluation(grasp, None) if one else Evaluation(None, NoGrasp.TOO_SHORT)
+            for grasp, one in zip(map(_top_down, contacts, scores.tolist()), is_grasp, strict=True)
         ]
         counts = {"points": len(checked.points), "scored": int(is_grasp.sum())}
         return Scoring(evaluations, counts, {"total": 0.0}, NAME, [WARNING])

@@ -13,6 +13,8 @@ from typing import Any
 
 from google.protobuf import descriptor_pb2, json_format
 
+from edgegrasp.v1 import grasp_pb2
+
 ROOT = Path(__file__).parents[1]
 CONTRACT = Path("edgegrasp/v1/contract.json")
 
@@ -21,11 +23,7 @@ File = descriptor_pb2.FileDescriptorProto
 
 def current() -> File:
     """The descriptors of the generated code."""
-    from edgegrasp.v1 import grasp_pb2
-
-    file = File()
-    grasp_pb2.DESCRIPTOR.CopyToProto(file)
-    return file
+    return File.FromString(grasp_pb2.DESCRIPTOR.serialized_pb)
 
 
 def read(path: Path) -> File:
