@@ -18,12 +18,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from benchmarks.measuring import RESULTS, machine, served, write_results
+from benchmarks.measuring import RESULTS, machine, write_results
 from PIL import Image
 
 import edgegrasp_service
 from edgegrasp_camera.arrays import Float32
 from edgegrasp_client import DetectOptions, GraspClient, GraspClientError
+from edgegrasp_client.connection import local_server
 
 POINTS = 20_000
 SAMPLE = Path(edgegrasp_service.__file__).parent / "playground" / "samples" / "seven_depth.png"
@@ -56,7 +57,7 @@ def main() -> None:
     with ExitStack() as stack:
         servers = {address: address for address in given.server or ()}
         if not servers:
-            own = stack.enter_context(served())
+            own = stack.enter_context(local_server())
             servers = {"grpc": own.grpc_address, "rest": own.http_url}
         runs: dict[tuple[int, str], list[list[Sample]]] = {}
         for turn, clients, name in itertools.product(range(given.rounds), given.clients, servers):

@@ -1,18 +1,16 @@
-"""Shared by the benchmarks: alternating runs, the machine, a server to measure."""
+"""Shared by the benchmarks: alternating runs, the machine, a server's memory."""
 
 import json
 import os
 import platform
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import psutil
 
-from edgegrasp_client.connection import Addresses, local_server
 from edgegrasp_service.settings import MIB
 
 RESULTS = Path(__file__).parent / "results"
@@ -60,12 +58,6 @@ def write_results(folder: Path, name: str, results: Mapping[str, Any]) -> None:
     """Write `name`.json into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.json").write_text(json.dumps(results, indent=1) + "\n")
-
-
-def served(*flags: str, program: Sequence[str] = ()) -> AbstractContextManager[Addresses]:
-    """Run `edgegrasp serve` with these flags on free ports of 127.0.0.1 while the context lasts."""
-    quiet = ("--log-level", "error")  # every refusal is a line, and they come by the thousand
-    return local_server(*quiet, *flags, program=program)
 
 
 def memory(pid: int) -> float:

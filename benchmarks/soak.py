@@ -35,7 +35,7 @@ import httpx
 import numpy as np
 import psutil
 from benchmarks import serve_dummy
-from benchmarks.measuring import RESULTS, memory, served, write_results
+from benchmarks.measuring import RESULTS, memory, write_results
 
 from edgegrasp_camera.arrays import Float32
 from edgegrasp_client import (
@@ -46,7 +46,7 @@ from edgegrasp_client import (
     InvalidRequestError,
     StreamRequest,
 )
-from edgegrasp_client.connection import Addresses
+from edgegrasp_client.connection import Addresses, local_server
 
 ANSWERED = "answered"
 REFUSED = "refused"
@@ -65,7 +65,8 @@ HELD_SECONDS = 8.0  # for which the second attacker holds what it opened
 PAGES, CHECKS, STREAMS = 540, 200, 16  # that it opens
 CALLS_PER_CONNECTION = 90  # fewer than the server allows
 CHECK, STREAM = "/grpc.health.v1.Health/Check", "/edgegrasp.v1.GraspService/DetectGraspsStream"
-ROOM = ("--max-queue-length", "512", "--max-streams", "64")  # for all of the clients
+# Room for all of the clients; every refusal would be a line of the log, and they are thousands.
+FLAGS = ("--max-queue-length", "512", "--max-streams", "64", "--log-level", "error")
 
 
 def main() -> None:
@@ -77,7 +78,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     os.environ["DUMMY_SECONDS"] = "0.002"
-    with served(*ROOM, program=[sys.executable, "-P", serve_dummy.__file__]) as server:
+    dummy = [sys.executable, "-P", serve_dummy.__file__]
+    with local_server(*FLAGS, program=dummy) as server:
         results = run(server, given.clients, given.minutes * 60, given.seed)
         process = psutil.Process(server.pid)
         process.terminate()

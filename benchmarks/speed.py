@@ -16,9 +16,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.measuring import RESULTS, RUNS, interleaved, machine, memory, served, write_results
+from benchmarks.measuring import RESULTS, RUNS, interleaved, machine, memory, write_results
 from examples.your_planner import plan
 
+from edgegrasp_client import GraspClient
+from edgegrasp_client.connection import local_server
 from edgegrasp_lab.real_scenes import load_scenes
 from edgegrasp_model.detector import ModelCatalogue
 from edgegrasp_model.options import DetectOptions
@@ -120,10 +122,8 @@ def demo_view() -> Observation:
 
 def server() -> dict[str, float]:
     """Seconds of the clock until the server is ready; its memory, MiB, then and after requests."""
-    from edgegrasp_client import GraspClient
-
     start = time.perf_counter()
-    with served() as running:
+    with local_server() as running:
         ready = time.perf_counter() - start
         at_rest = memory(running.pid)
         seen = demo_view()
