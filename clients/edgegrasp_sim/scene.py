@@ -229,7 +229,6 @@ def _put_down(
             world.restore_state(state)
         else:
             placed = settle(world, [*placed, new], layout.surroundings)
-        world.remove_state(state)
     return placed
 
 

@@ -167,9 +167,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         self, number: int, position: Sequence[float], quaternion_xyzw: Sequence[float]
     ) -> None:
         """Move one of the `placements`, by its index, without simulating."""
-        if self._rest_state is not None:
-            self.world.remove_state(self._rest_state)
-            self._rest_state = None
+        self._rest_state = None
         self._objects[number].body.set_pose(position, quaternion_xyzw)
 
     def observe_from(
@@ -253,9 +251,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         """
         self._hand.motion = motion
         result = self._run(T_world_hand, to_the_end=True)
-        if self._rest_state is not None:
-            self.world.remove_state(self._rest_state)
-            self._rest_state = None
+        self._rest_state = None
         self._hand.park()
         if result.held is not None:
             result.held.body.remove()

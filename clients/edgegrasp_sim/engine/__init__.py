@@ -153,13 +153,10 @@ class World(Protocol):
         """Refresh the contact points without advancing time."""
 
     def save_state(self) -> Any:
-        """Keep the present state in memory; valid for the bodies that are there now."""
+        """Keep the present state until `reset`; valid for the bodies that are there now."""
 
     def restore_state(self, state: Any) -> None:
         """Return to a saved state."""
-
-    def remove_state(self, state: Any) -> None:
-        """Discard a saved state that the engine keeps."""
 
     def load_urdf(
         self, path: Path, position: Vector, quaternion_xyzw: Vector, scale: float

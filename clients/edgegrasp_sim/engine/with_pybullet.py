@@ -77,9 +77,6 @@ class PybulletWorld(World):
     def restore_state(self, state: Any) -> None:
         self.client.restoreState(stateId=state)
 
-    def remove_state(self, state: Any) -> None:
-        self.client.removeState(state)
-
     def load_urdf(
         self, path: Path, position: Vector, quaternion_xyzw: Vector, scale: float
     ) -> "PybulletBody":
