@@ -64,43 +64,30 @@ def _read_urdf(path: Path, _changed: int) -> Shape:
 
 
 def read_obj(path: Path) -> list[tuple[str, Surface]]:
-    """The named objects of an OBJ file: the points that its triangles use, or all points."""
-    return _read_obj(path, path.stat().st_mtime_ns)
-
-
-@lru_cache(maxsize=256)
-def _read_obj(path: Path, _changed: int) -> list[tuple[str, Surface]]:
+    """The named objects of an OBJ file, with the points that their faces use."""
     return parse_obj(path.read_text(errors="replace"))
 
 
+@lru_cache(maxsize=256)
 def parse_obj(text: str) -> list[tuple[str, Surface]]:
     """What `read_obj` reads of a file's text."""
-    points: list[str] = []
-    parts: list[tuple[str, int, list[str]]] = [("", 0, [])]  # name, first point, lines of faces
+    points: list[list[float]] = []
+    parts: list[tuple[str, list[list[int]]]] = [("", [])]  # names and triangles
     # Only points count, not the normals and texture places behind their slashes.
     for line in re.sub(r"/\S*", "", text).splitlines():
-        word, _, rest = line.strip().partition(" ")
-        if word == "v":
-            points.append(rest)
-        elif word == "f":
-            parts[-1][2].append(rest)
-        elif word in ("o", "g"):
-            parts.append((rest, len(points), []))
-    whole = np.array([line.split()[:3] for line in points], dtype=np.float64).reshape(-1, 3)
-    ends = [start for _, start, _ in parts[1:]] + [len(whole)]
-    found = []
-    for (name, start, lines), end in zip(parts, ends, strict=True):
-        if lines:
-            corners = [list(map(int, line.split())) for line in lines]
-            if any(len(row) != 3 for row in corners):
-                corners = [[row[0], *two] for row in corners for two in pairwise(row[1:])]
-            # Faces count points from 1, or back from the last.
-            triangles = np.array(corners)
-            triangles = np.where(triangles > 0, triangles - 1, end + triangles)
+        match line.split():
+            case ["v", *numbers]:
+                points.append([float(number) for number in numbers[:3]])
+            case ["f", *corners]:  # count points from 1, or back from the last
+                row = [k - 1 if k > 0 else len(points) + k for k in map(int, corners)]
+                parts[-1][1].extend([row[0], *two] for two in pairwise(row[1:]))
+            case ["o" | "g", *words]:
+                parts.append((" ".join(words), []))
+    whole, found = np.array(points), []
+    for name, triangles in parts:
+        if triangles:
             used, rows = np.unique(triangles, return_inverse=True)
             found.append((name, Surface(whole[used], rows.reshape(-1, 3))))
-        elif name and start < end and not any(lines for _, _, lines in parts):
-            found.append((name, Surface(whole[start:end], np.empty((0, 3), np.int64))))
     return found
 
 
@@ -121,9 +108,7 @@ def convex_hull(points: Matrix) -> Surface | None:
     a, b, c = points[hull.simplices].transpose(1, 0, 2)
     inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0.0
     faces = np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices)
-    rows = np.full(len(points), -1, np.int64)
-    rows[hull.vertices] = np.arange(len(hull.vertices))
-    return Surface(points[hull.vertices], rows[faces])
+    return Surface(points[hull.vertices], np.searchsorted(hull.vertices, faces))
 
 
 def _parts(element: ElementTree.Element, urdf: Path) -> list[Surface]:
@@ -143,9 +128,8 @@ def _parts(element: ElementTree.Element, urdf: Path) -> list[Surface]:
         signs = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3), axis=-1).reshape(-1, 3)
         points = signs * _numbers(shape, "size", 3)
     elif shape.tag == "cylinder":
-        angle = 2 * np.pi / SIDES * np.arange(SIDES)
+        angle, half = 2 * np.pi / SIDES * np.arange(SIDES), 0.5 * _numbers(shape, "length", 1)
         ring = _numbers(shape, "radius", 1) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        half = 0.5 * _numbers(shape, "length", 1)[0]
         points = np.concatenate([np.insert(ring, 2, end, axis=1) for end in (-half, half)])
     elif shape.tag == "sphere":
         z = np.linspace(-1.0, 1.0, BALL)
