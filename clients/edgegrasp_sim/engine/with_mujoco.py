@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_sim import engine
-from edgegrasp_sim.engine import Body, Contact, Hand, HandModel, Intrinsics, Vector, World
+from edgegrasp_sim.engine import Contact, HandModel, Intrinsics, Vector
 from edgegrasp_sim.engine.urdf import read_urdf
 from edgegrasp_sim.poses import Matrix, about_z, quaternion_xyzw, translation
 
@@ -44,11 +45,14 @@ _URDF_AS_IT_IS = (
 _VISIBLE, _SOLID = 0, 3  # groups of shapes: seen by the camera, and met by rays
 
 
-class MujocoWorld(World):
-    """A model, recompiled whenever bodies are added or removed, and its state."""
+class MujocoWorld(AbstractContextManager["MujocoWorld"]):
+    """A model, recompiled whenever bodies are added or removed, and its state.
+
+    A process may have several worlds. Removed bodies cannot be restored.
+    """
 
     name = "mujoco"
-    constants: ClassVar = {
+    constants: ClassVar = {  # its own, for the record of a result
         "substeps": SUBSTEPS,
         "contact_seconds": CONTACT_SECONDS,
         "friction_impedance": FRICTION_IMPEDANCE,
@@ -58,8 +62,10 @@ class MujocoWorld(World):
         "finger_speed": FINGER_SPEED,
         "finger_inertia": FINGER_INERTIA,
     }
-    collision_depth = COLLISION_DEPTH
-    shake_distance, shake_step = 0.01, 0.005  # at 0.4 m/s: the hand follows, and turns sharply
+    collision_depth = COLLISION_DEPTH  # metres; a finger sliding along an object overlaps by less
+    # How a hand that holds an object is shaken, along x and y: metres to either side, and in each
+    # time step. At 0.4 m/s the hand follows, and turns sharply.
+    shake_distance, shake_step = 0.01, 0.005
 
     def __init__(self) -> None:
         self._drawn: Any = None  # the model that scene and context, made for its first image, show
@@ -67,12 +73,17 @@ class MujocoWorld(World):
         self._context: Any = None
         self.reset()
 
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def close(self) -> None:
+        """Release what it holds. Safe to call twice."""
         if self._context is not None:
             self._context.free()
         self._drawn = self._scene = self._context = None
 
     def reset(self) -> None:
+        """Remove every body."""
         self.spec = spec = mujoco.MjSpec()
         spec.compiler.usethread = 0  # for so few meshes, threads cost more than they save
         spec.option.timestep = engine.TIME_STEP / SUBSTEPS
@@ -88,21 +99,21 @@ class MujocoWorld(World):
         spec.stat.extent = 1.0
         self._model: Any = spec.compile()
         self._data: Any = mujoco.MjData(self._model)
-        self._changed = False
+        self.changed = False
         self._bodies = 0
         self._hand: MujocoHand | None = None
         self.substeps = SUBSTEPS
-        self._uid_of_geom: list[int] = []
+        self.uid_of_geom: list[int] = []
         self._places: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
 
     @property
     def data(self) -> Any:
         """The state, of a model that has all bodies."""
-        if self._changed:
-            self._changed = False
+        if self.changed:
+            self.changed = False
             self._model, self._data = self.spec.recompile(self._model, self._data)
             names = [self._model.body(body).name for body in self._model.geom_bodyid]
-            self._uid_of_geom = [int(name.split()[0]) for name in names]
+            self.uid_of_geom = [int(name.split()[0]) for name in names]
             self._places.clear()
         return self._data
 
@@ -126,35 +137,40 @@ class MujocoWorld(World):
         return self._places[uid]
 
     def step(self, steps: int = 1) -> None:
+        """Advance the world by `steps` time steps of 1/80 s."""
         model, data, hand = self.model, self.data, self._hand
         for _ in range(steps):
             if hand is None or hand.way is None:
                 mujoco.mj_step(model, data, self.substeps)
                 continue
             for place in hand.way:
-                hand.aim(place)
+                hand.goal[:] = place
                 mujoco.mj_step(model, data)
                 hand.watch()
             hand.way = None
 
     def first_hits(self, starts: Matrix, ends: Matrix) -> list[int]:
+        """The body that each ray meets first, -1 for none; (R, 3) metres each, world frame."""
         model, data = self.model, self.data
         solid = np.arange(6) == _SOLID
         hits, geom = [], np.empty(1, np.int32)
         for start, end in zip(starts, ends, strict=True):
             share = mujoco.mj_ray(model, data, start, end - start, solid, 1, -1, geom)
-            hits.append(self._uid_of_geom[geom[0]] if 0 <= share <= 1 else -1)
+            hits.append(self.uid_of_geom[geom[0]] if 0 <= share <= 1 else -1)
         return hits
 
     def detect_collisions(self) -> None:
+        """Refresh the contact points without advancing time."""
         mujoco.mj_forward(self.model, self.data)
 
     def save_state(self) -> Any:
+        """Keep the present state until `reset`; valid for the bodies that are there now."""
         kept = mujoco.MjData(self.model)
         mujoco.mj_copyData(kept, self.model, self.data)
         return kept
 
     def restore_state(self, state: Any) -> None:
+        """Return to a saved state."""
         mujoco.mj_copyData(self.data, self.model, state)
         if self._hand is not None:
             self._hand.way = None
@@ -162,6 +178,7 @@ class MujocoWorld(World):
     def load_urdf(
         self, path: Path, position: Vector, quaternion_xyzw: Vector, scale: float
     ) -> "MujocoBody":
+        """Load an object with its link frame there; its inertia is that of its collision shape."""
         shape = read_urdf(path, scale)
         body = self._add(np.asarray(position), quaternion_xyzw)
         body.add_freejoint()
@@ -189,6 +206,7 @@ class MujocoWorld(World):
     def add_box(
         self, size: Vector, centre: Vector, *, friction: float, yaw: float = 0.0
     ) -> "MujocoBody":
+        """Add a box that never moves, turned about z; `size` is its full extent in metres."""
         kind, half = mujoco.mjtGeom.mjGEOM_BOX, 0.5 * np.asarray(size)
         body = self._add(np.asarray(centre), about_z(yaw))
         # Its friction counts, not the object's.
@@ -198,6 +216,7 @@ class MujocoWorld(World):
         return MujocoBody(self, body, signs * half)
 
     def add_hand(self, model: HandModel, position: Matrix) -> "MujocoHand":
+        """Add an open hand with its centre of mass there; a world may have one."""
         body = self._add(np.asarray(position), (0.0, 0.0, 0.0, 1.0))
         body.add_freejoint().armature = ARM_INERTIA
         palm = self._build_hand(body, model)
@@ -221,6 +240,7 @@ class MujocoWorld(World):
         return self._hand
 
     def add_arm(self, arm: engine.ArmModel, model: HandModel) -> "MujocoArm":
+        """Add an arm at its home with an open hand."""
         self.substeps = ARM_SUBSTEPS
         self.spec.option.timestep = engine.TIME_STEP / ARM_SUBSTEPS
         added = mujoco.MjSpec.from_string(arm.urdf.replace("</robot>", _URDF_AS_IT_IS))
@@ -242,7 +262,7 @@ class MujocoWorld(World):
         for joint in arm.joint_names:
             self.spec.joint(f"{name} {joint}").armature = JOINT_INERTIA
             self._drive(f"{name} {joint}").set_to_position(JOINT_STIFFNESS, JOINT_DAMPING)
-        self._changed = True
+        self.changed = True
         self._hand = added_arm = MujocoArm(self, body, palm, model)
         added_arm.home = np.asarray(arm.home)
         added_arm.rest()
@@ -291,6 +311,7 @@ class MujocoWorld(World):
         return np.concatenate(palm)
 
     def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
+        """Depth (height, width) at the pixels' lower left corners, metres; `far` if empty."""
         _gl_context(camera.width, camera.height)
         model, data = self.model, self.data
         if self._drawn is not model:
@@ -330,7 +351,7 @@ class MujocoWorld(World):
         x, y, z, w = quaternion_xyzw
         name = str(self._bodies)
         self._bodies += 1
-        self._changed = True
+        self.changed = True
         return self.spec.worldbody.add_body(name=name, pos=position, quat=(w, x, y, z))
 
     def _add_hull(self, body: Any, name: str, points: Matrix, **contact: Any) -> None:
@@ -356,42 +377,31 @@ class MujocoWorld(World):
             solimp=IMPEDANCE,
         )
 
-    def remove(self, body: Any) -> None:
-        """Remove a body and its meshes."""
-        names = [geom.meshname for geom in body.geoms if geom.meshname]
-        self.spec.delete(body)
-        for name in names:
-            self.spec.delete(self.spec.mesh(name))
-        self._changed = True
 
-    def contacts(self, uid: int) -> list[Contact]:
-        """The contact points of a body."""
-        found, uids = self.data.contact, self._uid_of_geom
-        distances = found.dist.tolist()
-        pairs = [(uids[one], uids[other]) for one, other in found.geom.tolist()]
-        return [
-            Contact(other if one == uid else one, distance)
-            for (one, other), distance in zip(pairs, distances, strict=True)
-            if uid in (one, other)
-        ]
-
-
-class MujocoBody(Body):
-    """A body of a model; its frame is that of its centre of mass."""
+class MujocoBody:
+    """A body of a model. Its pose is that of its centre of mass."""
 
     def __init__(self, world: MujocoWorld, body: Any, points: Matrix) -> None:
         self.world, self.points, self._body = world, points, body
         self.uid = int(body.name)
 
     def remove(self) -> None:
-        self.world.remove(self._body)
+        """Remove the body from its world."""
+        spec, body = self.world.spec, self._body
+        names = [geom.meshname for geom in body.geoms if geom.meshname]
+        spec.delete(body)
+        for name in names:
+            spec.delete(spec.mesh(name))
+        self.world.changed = True
 
     @property
     def position(self) -> Matrix:
+        """Centre of mass, world frame, metres: (3,)."""
         return self.world.places(self.uid)[0][:3].copy()
 
     @property
     def quaternion_xyzw(self) -> tuple[float, float, float, float]:
+        """Orientation in the world."""
         w, x, y, z = self.world.places(self.uid)[0][3:7].tolist()
         return x, y, z, w
 
@@ -403,6 +413,7 @@ class MujocoBody(Body):
         return matrix.reshape(3, 3)
 
     def set_pose(self, position: Vector, quaternion_xyzw: Vector) -> None:
+        """Set the pose of the centre of mass, at rest."""
         x, y, z, w = quaternion_xyzw
         qpos, qvel = self.world.places(self.uid)
         qpos[:7] = (*position, w, x, y, z)
@@ -410,31 +421,43 @@ class MujocoBody(Body):
 
     @property
     def speed(self) -> float:
+        """Length of linear (m/s) and angular (rad/s) velocity taken together."""
         return float(np.linalg.norm(self.world.places(self.uid)[1]))
 
     @property
     def bounds(self) -> Matrix:
+        """Lowest and highest corner of the axis-aligned box around it: (2, 3) metres."""
         corners = self.points @ self.rotation.T + self.position
         return np.stack((corners.min(axis=0), corners.max(axis=0)))
 
     def contacts(self) -> list[Contact]:
-        return self.world.contacts(self.uid)
+        """The contact points found by the last step or collision detection."""
+        found, uids = self.world.data.contact, self.world.uid_of_geom
+        pairs = [(uids[one], uids[other]) for one, other in found.geom.tolist()]
+        return [
+            Contact(other if one == self.uid else one, distance)
+            for (one, other), distance in zip(pairs, found.dist.tolist(), strict=True)
+            if self.uid in (one, other)
+        ]
 
 
-class MujocoHand(MujocoBody, Hand):
-    """A hand that springs pull to a target, and motors at its fingers."""
+class MujocoHand(MujocoBody):
+    """A body, the palm, that springs of limited force pull to a target; motors at two fingers."""
 
     def __init__(self, world: MujocoWorld, body: Any, points: Matrix, model: HandModel) -> None:
         super().__init__(world, body, points)
         self.hand = model
-        self.way: Matrix | None = None  # (substeps, D) of its target in the next time step
+        self.way: Matrix | None = None  # (substeps, D) in the next time step, of
+        self.goal: Matrix = np.empty(0)  # (D,) part of the state: its target's place
 
     @property
     def opening(self) -> float:
+        """Metres between the fingers."""
         one, other = self.world.places(self.uid)[0][-2:].tolist()
         return float(one + other)
 
     def set_pose(self, position: Vector, quaternion_xyzw: Vector) -> None:
+        """Set the hand's pose at once, open and at rest, and hold it there."""
         super().set_pose(position, quaternion_xyzw)
         data = self.world.data
         joints = self.world.places(self.uid)[0][7:]
@@ -445,57 +468,61 @@ class MujocoHand(MujocoBody, Hand):
         self.way = None
 
     def move(self, position: Vector, quaternion_xyzw: Vector) -> None:
+        """Pull the centre of mass there in the next step."""
         x, y, z, w = quaternion_xyzw
         data = self.world.data
-        here = data.mocap_pos[0]
-        self.way = here + _SHARES * (np.asarray(position) - here)
+        self.goal = data.mocap_pos[0]
+        self.way = self.goal + _SHARES * (np.asarray(position) - self.goal)
         data.mocap_quat[0] = (w, x, y, z)
 
     def close_fingers(self) -> None:
+        """Drive the fingers together with full force from now on."""
         self.world.data.ctrl[:2] = -FINGER_SPEED
-
-    def aim(self, place: Matrix) -> None:
-        """Set its target (3,) for the next substep."""
-        self.world.data.mocap_pos[0] = place
 
     def watch(self) -> None:
         """Record what happened in the last substep."""
 
 
-class MujocoArm(MujocoHand, engine.Arm):
-    """A hand on an arm; its contacts are those of all substeps of the last time step."""
+class MujocoArm(MujocoHand):
+    """A hand on an arm: its joints move it, not its pose.
 
-    substeps = ARM_SUBSTEPS
+    Its contacts are those of all links in all substeps of the last time step.
+    """
+
+    substeps = ARM_SUBSTEPS  # of a time step
     home: Matrix  # (J,)
     _found: tuple[Contact, ...] = ()
 
     @property
     def position(self) -> Matrix:
+        """As of other bodies; an arm's joints come first in its places."""
         return np.array(self.world.data.body(str(self.uid)).xpos)
 
     def rest(self) -> None:
+        """Move the arm to its home at once, at rest, with an open hand."""
         joints, velocities = self.world.places(self.uid)
         data, count = self.world.data, len(self.home)
         joints[:count], joints[count:-2], joints[-2:] = self.home, 0.0, self.hand.max_opening / 2
         velocities[:] = 0.0
-        data.ctrl[:2] = FINGER_SPEED
-        self.aim(self.home)
+        data.ctrl[:2], data.ctrl[2 : 2 + count] = FINGER_SPEED, self.home
         self.way, self._found = None, ()
 
     def drive(self, positions: Matrix, velocities: Matrix) -> None:
+        """Have the joints' controllers follow (substeps, J) in the next time step."""
+        self.goal = self.world.data.ctrl[2 : 2 + len(self.home)]
         self.way = positions + JOINT_DAMPING / JOINT_STIFFNESS * velocities
         self._found = ()
 
-    def aim(self, place: Matrix) -> None:
-        self.world.data.ctrl[2 : 2 + len(place)] = place
-
     def watch(self) -> None:
-        self._found += tuple(self.world.contacts(self.uid))
+        """Keep the contacts of the last substep."""
+        self._found += tuple(super().contacts())
 
     def contacts(self) -> list[Contact]:
+        """Those of the last time step; at its home, those found by collision detection."""
         return list(self._found) or super().contacts()
 
     def close_fingers(self) -> None:
+        """Drive the fingers together, and forget the contacts before."""
         super().close_fingers()
         self._found = ()
 

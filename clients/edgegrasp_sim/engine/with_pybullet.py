@@ -1,8 +1,9 @@
 """PyBullet, which the published figures were measured in."""
 
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 import pybullet
@@ -10,7 +11,7 @@ import pybullet_data
 from numpy.typing import NDArray
 
 from edgegrasp_sim import engine
-from edgegrasp_sim.engine import Body, Contact, Hand, HandModel, Intrinsics, Parts, Vector, World
+from edgegrasp_sim.engine import ArmModel, Contact, HandModel, Intrinsics, Parts, Vector
 from edgegrasp_sim.poses import Matrix, about_z
 
 SOLVER_ITERATIONS = 100
@@ -25,7 +26,7 @@ _MESHES = Path(pybullet_data.getDataPath()) / "franka_panda" / "meshes" / "colli
 _STRAIGHT, _HALF_TURN = [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]  # xyzw
 
 
-class PybulletWorld(World):
+class PybulletWorld(AbstractContextManager["PybulletWorld"]):
     """One physics server; raises RuntimeError if none is left in this process."""
 
     name = "pybullet"
@@ -42,6 +43,9 @@ class PybulletWorld(World):
         if self.client.number < 0:
             raise RuntimeError("PyBullet did not start a physics server; close unused worlds")
         self.reset()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def close(self) -> None:
         if self.client.number >= 0:
@@ -104,6 +108,9 @@ class PybulletWorld(World):
         self._hand = PybulletHand(self.client, model, position)
         return self._hand
 
+    def add_arm(self, arm: ArmModel, model: HandModel) -> NoReturn:
+        raise ValueError(f"engine is {self.name}; an arm takes mujoco")
+
     def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
         return self.render(T_world_camera, camera, pybullet.ER_NO_SEGMENTATION_MASK)[0]
 
@@ -145,7 +152,7 @@ class _Client:
         return partial(getattr(pybullet, function), physicsClientId=self.number)
 
 
-class PybulletBody(Body):
+class PybulletBody:
     """A body of a physics server."""
 
     def __init__(self, client: _Client, uid: int) -> None:
@@ -182,7 +189,7 @@ class PybulletBody(Body):
         return [Contact(other_uid=point[2], distance=point[8]) for point in points]
 
 
-class PybulletHand(PybulletBody, Hand):
+class PybulletHand(PybulletBody):
     """A hand that a fixed constraint drags; the last two links are its fingers."""
 
     def __init__(self, client: _Client, model: HandModel, position: Matrix) -> None:
