@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from edgegrasp_results import ArmTrajectory
-from edgegrasp_sim.engine import TIME_STEP, ArmModel, Body, Hand, HandModel, Parts, World
+from edgegrasp_sim.engine import TIME_STEP, ArmModel, Hand, HandModel, Parts, World
 from edgegrasp_sim.engine.urdf import read_obj
 from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
 from edgegrasp_sim.scene import SceneObject
@@ -103,9 +103,9 @@ def run_grasp(
     missed = gripper.is_shut
     caught = _touched(gripper, objects)
     if not missed or to_the_end:
-        watch = _Watch(gripper, objects)
+        clear = _is_clear(gripper, objects, gripper.body.opening)
         for _ in gripper.retreat(T_world_hand):
-            if not to_the_end and watch.is_clear():
+            if not to_the_end and next(clear):
                 break
         held = next(iter(_touched(gripper, objects)), None)
         if held is not None and not gripper.is_shut:
@@ -297,38 +297,33 @@ def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: 
         gripper.world.step()
         before, opening = opening, gripper.body.opening
         still_steps = still_steps + 1 if abs(opening - before) < STILL else 0
-        shut = opening <= gripper.min_opening
-        if not to_the_end and (shut or (still_steps >= STILL_STEPS and _touched(gripper, objects))):
+        held = still_steps >= STILL_STEPS and _touched(gripper, objects)
+        if not to_the_end and (gripper.is_shut or held):
             return
 
 
-class _Watch:
-    """Observes a retreating hand after every time step, to know early what it will hold."""
+def _is_clear(
+    gripper: Gripper, objects: Mapping[int, SceneObject], opening: float
+) -> Iterator[bool]:
+    """After every time step of a retreat: is it clear what the hand, that open before, will hold?
 
-    def __init__(self, gripper: Gripper, objects: Mapping[int, SceneObject]) -> None:
-        self._gripper, self._objects = gripper, objects
-        self._empty_steps = self._held_steps = 0
-        self._opening = gripper.body.opening
-        self._offset: Matrix | None = None
-
-    def is_clear(self) -> bool:
-        """Whether the fingers are empty, or hold one object that rests on nothing else."""
-        touched = _touched(self._gripper, self._objects)
-        before, self._opening = self._opening, self._gripper.body.opening
-        closing = abs(self._opening - before) >= STILL  # and may yet catch something
-        self._empty_steps = 0 if touched or closing else self._empty_steps + 1
-        if self._gripper.is_shut or self._empty_steps >= EMPTY_STEPS:
-            return True
-        held = len(touched) == 1 and self._hangs_still(touched[0].body)
-        self._held_steps = self._held_steps + 1 if held else 0
-        return self._held_steps >= HELD_STEPS
-
-    def _hangs_still(self, held: Body) -> bool:
-        hand = self._gripper.body
-        if any(contact.other_uid != hand.uid for contact in held.contacts()):
-            return False
-        before, self._offset = self._offset, held.position - hand.position
-        return before is None or bool(np.linalg.norm(self._offset - before) < SLIP)
+    The fingers are empty then, or hold one object that rests on nothing else.
+    """
+    hand, empty_steps, held_steps = gripper.body, 0, 0
+    offset: Matrix | None = None
+    while True:
+        touched = _touched(gripper, objects)
+        before, opening = opening, hand.opening
+        closing = abs(opening - before) >= STILL  # and may yet catch something
+        empty_steps = 0 if touched or closing else empty_steps + 1
+        held = touched[0].body if len(touched) == 1 else None
+        if held is None or any(contact.other_uid != hand.uid for contact in held.contacts()):
+            held_steps = 0
+        else:
+            was, offset = offset, held.position - hand.position
+            slips = was is not None and np.linalg.norm(offset - was) >= SLIP
+            held_steps = 0 if slips else held_steps + 1
+        yield gripper.is_shut or empty_steps >= EMPTY_STEPS or held_steps >= HELD_STEPS
 
 
 def _holds_when_shaken(
