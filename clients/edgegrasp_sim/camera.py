@@ -71,10 +71,8 @@ class ViewRange:
         target = np.asarray(self.target)
         poses = []
         for azimuth in first + 2 * np.pi * np.arange(views) / views:
-            direction = np.array(
-                [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
-            )
-            poses.append(look_at(target + radius * direction, target))
+            level = np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth)
+            poses.append(look_at(target + radius * np.array([*level, np.cos(polar)]), target))
         return poses
 
 

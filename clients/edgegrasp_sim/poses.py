@@ -37,14 +37,9 @@ def translation(x: float, y: float, z: float) -> Matrix:
 
 def require_pose(T_world_hand: ArrayLike) -> Matrix:
     """Check that the pose of a hand is a finite rigid transform (4, 4); raises ValueError."""
-    matrix = np.asarray(T_world_hand, dtype=np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise ValueError(f"T_world_hand is {matrix.tolist()}; pass one finite 4 x 4 transform")
-    rotation = matrix[:3, :3]
-    error, det = float(np.abs(rotation @ rotation.T - np.eye(3)).max()), np.linalg.det(rotation)
-    if error > 1e-3 or det < 0:
-        raise ValueError(
-            f"T_world_hand is not a rigid transform (R Rᵀ is off the identity by {error:.3g}, det "
-            f"{det:.3g}); pass a right-handed rotation without scale"
-        )
-    return matrix
+    T = np.asarray(T_world_hand, dtype=np.float64)
+    R = T[:3, :3] if T.shape == (4, 4) and np.isfinite(T).all() else np.zeros((3, 3))
+    if not np.allclose(R @ R.T, np.eye(3), rtol=0.0, atol=1e-3) or np.linalg.det(R) < 0:
+        wanted = "pass a finite 4 x 4 matrix with a right-handed rotation without scale"
+        raise ValueError(f"T_world_hand is not a rigid transform: {T.tolist()}; {wanted}")
+    return T

@@ -35,7 +35,7 @@ CLEARANCE = 0.002  # metres above the table at which objects are put down
 # The open box that a pile is dropped into, which is taken away afterwards.
 PILE_DROP_HEIGHT = 0.2  # metres above the table
 PILE_CORNER = 0.02  # metres, x and y
-PILE_EXTENT = (0.26, 0.26, 0.13)  # metres
+PILE_SIDE, PILE_HEIGHT = 0.26, 0.13  # metres
 PILE_WALL = 0.0039  # metres
 PILE_SECONDS = 1.0  # given to each object to come to rest
 
@@ -126,14 +126,10 @@ def make_full_bin(layout: Layout) -> list[SceneObject]:
 
 def make_pile(layout: Layout) -> list[SceneObject]:
     """Drop objects into an open box one by one, then remove the box."""
-    length, width, height = PILE_EXTENT
-    half, z, middle = PILE_WALL / 2, TABLE_HEIGHT + height / 2, PILE_CORNER + length / 2
-    box = [
-        Box((PILE_WALL, width, height), (PILE_CORNER + half, middle, z)),
-        Box((PILE_WALL, width, height), (PILE_CORNER + length - half, middle, z)),
-        Box((length, PILE_WALL, height), (middle, PILE_CORNER + half, z)),
-        Box((length, PILE_WALL, height), (middle, PILE_CORNER + width - half, z)),
-    ]
+    half, z, middle = PILE_WALL / 2, TABLE_HEIGHT + PILE_HEIGHT / 2, PILE_CORNER + PILE_SIDE / 2
+    ends = PILE_CORNER + half, PILE_CORNER + PILE_SIDE - half
+    box = [Box((PILE_WALL, PILE_SIDE, PILE_HEIGHT), (x, middle, z)) for x in ends]
+    box += [Box((PILE_SIDE, PILE_WALL, PILE_HEIGHT), (middle, y, z)) for y in ends]
     walls = [side.add_to(layout.world) for side in box]
     where = np.full(2, SIZE / 3), np.full(2, 2 * SIZE / 3)
     top = TABLE_HEIGHT + PILE_DROP_HEIGHT

@@ -11,46 +11,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_camera.picture import lit
 from edgegrasp_results import ArmTrajectory
+from edgegrasp_sim import hand
 from edgegrasp_sim.camera import CAMERA, FARTHEST, Observation, TableView, crop, points_of
 from edgegrasp_sim.engine import ArmModel, make_world
 from edgegrasp_sim.engine.urdf import least_width
-from edgegrasp_sim.hand import (
-    MIN_OPENING,
-    ArmGripper,
-    GraspResult,
-    Gripper,
-    hand_of,
-    panda,
-    run_grasp,
-)
+from edgegrasp_sim.hand import MIN_OPENING, ArmGripper, GraspResult, Gripper, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import Matrix, require_pose
 from edgegrasp_sim.scene import STANDING_IN, Layout, SceneObject, load_object, settle
 from edgegrasp_sim.sensor import DepthNoise, DepthSensor
-from edgegrasp_sim.surroundings import (
-    OPEN_TABLE,
-    OPEN_THICKNESS,
-    TABLE_HEIGHT,
-    Surroundings,
-    open_table,
-)
+from edgegrasp_sim.surroundings import OPEN_TABLE, TABLE_HEIGHT, Surroundings
 
 NOISE_STD = 0.001  # metres
 WOOD = np.array([168.0, 140.0, 110.0])  # colour of what never moves
-PAINTS = np.array(
-    [
-        (230, 72, 60),
-        (52, 132, 210),
-        (238, 128, 50),
-        (62, 176, 116),
-        (245, 240, 226),
-        (150, 96, 180),
-        (52, 66, 86),
-    ],
-    dtype=np.float64,
-)  # of objects; none is yellow, as good grasps are
+# Of objects, RGB; none is yellow, as good grasps are.
+PAINTS = np.reshape([*bytes.fromhex("E6483C 3484D2 EE8032 3EB074 F5F0E2 9660B4 344256")], (-1, 3))
 _ALOFT = np.array([[0.0, 0.0, 0.015], [0.0, 0.0, 0.0]])  # metres the table is below the workspace
 _AROUND = np.array([[-0.06], [0.06]])  # metres; wrong depths move points that far out
+_EVERYWHERE = np.array([[-np.inf], [np.inf]])
 _CROP_MARGIN = 0.01  # metres; points further out cannot come back in by noise
 
 
@@ -77,7 +55,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         min_opening: float = MIN_OPENING,  # metres; a hand that is open by less holds nothing
     ) -> None:
         self.gripper, self.arm, self.min_opening = gripper, arm, min_opening
-        self.hand = panda() if gripper is None else hand_of(gripper)
+        self.hand = hand.panda() if gripper is None else hand.hand_of(gripper)
         if objects is None:
             objects = {kind: ObjectSet.builtin(kind) for kind in SceneKind}
         self.object_sets = dict(objects)
@@ -135,7 +113,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         rng: np.random.Generator,  # the scene's own stream
         num_objects: int = 5,  # how many to try to place
         scales: tuple[float, float] | None = None,  # of the factor on sizes; None: usual
-        table_thickness: float = OPEN_THICKNESS,  # of packed and pile scenes, metres
+        table: Surroundings = OPEN_TABLE,  # of packed and pile scenes
     ) -> int:
         """Make a new scene at rest; returns how many objects are there."""
         kind = SceneKind(scene)
@@ -143,7 +121,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         if objects is None:
             raise ValueError(f"no object set for scene {kind.value!r}; pass one in `objects`")
         surround, usual, make = STANDING_IN[kind]
-        around = self._clear(open_table(table_thickness) if surround is None else surround(rng))
+        around = self._clear(table if surround is None else surround(rng))
         layout = Layout(self.world, around, objects, rng, num_objects, scales or usual)
         self._objects = make(layout)
         self._gripper = self._add_gripper()
@@ -182,9 +160,8 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
     ) -> Observation:
         """Look at the scene from each of the given poses, (4, 4) each."""
         workspace = np.asarray(self.surroundings.workspace)
-        box: Matrix | None = None  # to crop the cloud to
-        if table in ("known", "seen"):
-            box = workspace if table == "known" else workspace - _ALOFT + _AROUND
+        boxes = {"known": workspace, "seen": workspace - _ALOFT + _AROUND}
+        box = boxes.get(table, _EVERYWHERE)
         clouds = []
         for T_world_camera in T_world_cameras:
             depth = self.world.render_depth(T_world_camera, CAMERA)
@@ -192,12 +169,10 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
                 depth = depth_noise.apply(depth, rng_noise)
             if sensor is not None:
                 depth = sensor.apply(depth, CAMERA, rng_noise)
-            points = points_of(depth, T_world_camera, CAMERA)
-            points = points if box is None else crop(points, box, _CROP_MARGIN)
+            points = crop(points_of(depth, T_world_camera, CAMERA), box, _CROP_MARGIN)
             points = points + rng_noise.normal(0.0, noise_std, size=points.shape)
-            points = points if box is None else crop(points, box)
-            clouds.append(points.astype(np.float32, order="C"))
-        whole = box is None and len(clouds) == 1
+            clouds.append(crop(points, box).astype(np.float32, order="C"))
+        whole = table not in boxes and len(clouds) == 1
         positions = np.stack([T[:3, 3] for T in T_world_cameras]).astype(np.float32)
         return Observation(
             cloud=np.concatenate(clouds),
@@ -214,16 +189,15 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         depth = self.world.render_depth(T_world_camera, CAMERA)
         seen = depth < FARTHEST * CAMERA.far
         points, eye = points_of(depth, T_world_camera, CAMERA), T_world_camera[:3, 3]
-        numbers = {item.body.uid: number for number, item in enumerate(self._objects)}
-        around = [(low - 0.003, high + 0.003) for low, high in self.object_bounds]
+        around = np.add(self.object_bounds, [[-0.003], [0.003]])
         inside = [((points > low) & (points < high)).all(axis=1) for low, high in around]
         row = np.flatnonzero(np.any(inside, axis=0))
         painted = np.full((len(points), 3), WOOD)
         for part in np.array_split(row, len(row) // 10_000 + 1):
             starts = np.tile(eye, (len(part), 1))  # rays end a little behind what is seen
             hits = self.world.first_hits(starts, starts + 1.01 * (points[part] - eye))
-            found = np.array([numbers.get(uid, -1) for uid in hits], dtype=np.int64)
-            painted[part[found >= 0]] = PAINTS[found[found >= 0] % len(PAINTS)]
+            for number, item in enumerate(self._objects):
+                painted[part[np.equal(hits, item.body.uid)]] = PAINTS[number % len(PAINTS)]
         light = lit(np.where(seen, depth, np.nan), CAMERA.focal_length, CAMERA.focal_length)
         image = np.full((*depth.shape, 3), 255.0)
         image[seen] = painted * (0.45 + 0.55 * light[seen][:, None])
@@ -270,19 +244,11 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
             raise RuntimeError("there is no scene yet; call reset or reset_from_poses first")
         return self._gripper
 
-    def _run(
-        self, T_world_hand: ArrayLike, *, to_the_end: bool, shake: bool = False
-    ) -> GraspResult:
+    def _run(self, T_world_hand: ArrayLike, **how: bool) -> GraspResult:
         T = require_pose(T_world_hand)
         self._restore_rest()
-        return run_grasp(
-            self._hand,
-            T,
-            {item.body.uid: item for item in self._objects},
-            self._obstacles,
-            to_the_end=to_the_end,
-            shake=shake,
-        )
+        objects = {item.body.uid: item for item in self._objects}
+        return run_grasp(self._hand, T, objects, self._obstacles, **how)
 
     def _restore_rest(self) -> None:
         # Every grasp starts from one saved state, so that earlier tries leave no trace.

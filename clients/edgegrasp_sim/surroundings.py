@@ -7,15 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgegrasp_sim.engine import Body, World
+from edgegrasp_sim.engine import Body, Vector, World
 from edgegrasp_sim.poses import Matrix
 
 SIZE = 0.30  # metres, edge of the workspace cube
 TABLE_HEIGHT = 0.05  # metres
 OPEN_EXTENT = 1.2  # metres along both sides of an open table
 OPEN_THICKNESS = 0.2  # metres; objects sink into a thin table, as into the reference's of 12 mm
-TABLE_FRICTION = 0.5
-WALL_FRICTION = 0.5
+TABLE_FRICTION = 0.5  # and of walls
 SUPPORT_CLEARANCE = 0.005  # metres over the table at which the workspace begins
 # Lowest and highest corner of where grasps are looked for on an open table.
 WORKSPACE = ((0.02, 0.02, TABLE_HEIGHT + SUPPORT_CLEARANCE), (SIZE - 0.02, SIZE - 0.02, SIZE))
@@ -34,6 +33,7 @@ GROUND = 0.2  # metres, depth of a floor into what it stands on, for the same re
 STAND_SHARE = 0.3  # of the bins, which stand off the table: on a stand, a conveyor
 STAND: Span = (0.1, 0.4)
 HEAP = 0.10  # metres that a heap may rise over the walls
+FLOOR = (6.0, 6.0, 0.2)  # metres, size of the floor below tables and shelves
 
 # Random crowded tables.
 REACH = 0.16  # metres from the middle, along x and y, where objects are put
@@ -60,12 +60,11 @@ class Box:
     size: tuple[float, float, float]  # full extent along its own axes
     centre: tuple[float, float, float]  # of the box
     yaw: float = 0.0  # radians about world z
-    friction: float = WALL_FRICTION  # lateral
     obstacle: bool = True  # a hand that hits it has failed; the table is none
 
     def add_to(self, world: World) -> Body:
         """Add it to a world."""
-        return world.add_box(self.size, self.centre, friction=self.friction, yaw=self.yaw)
+        return world.add_box(self.size, self.centre, friction=TABLE_FRICTION, yaw=self.yaw)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,15 +90,14 @@ class Surroundings:
         return bool((position >= low).all() and (position <= high).all())
 
 
-def _slab(size: Matrix, top: float, x: float = MIDDLE, y: float = MIDDLE) -> Box:
+def _slab(size: Vector, top: float, x: float = MIDDLE, y: float = MIDDLE) -> Box:
     length, width, height = map(float, size)
-    centre = (x, y, top - height / 2)
-    return Box((length, width, height), centre, friction=TABLE_FRICTION, obstacle=False)
+    return Box((length, width, height), (x, y, top - height / 2), obstacle=False)
 
 
 def open_table(thickness: float = OPEN_THICKNESS) -> Surroundings:
     """A table alone, of a thickness in metres."""
-    table = _slab(np.array([OPEN_EXTENT, OPEN_EXTENT, thickness]), TABLE_HEIGHT)
+    table = _slab((OPEN_EXTENT, OPEN_EXTENT, thickness), TABLE_HEIGHT)
     return Surroundings((table,), WORKSPACE, ((0.0, 0.0, 0.0), (SIZE, SIZE, np.inf)))
 
 
@@ -115,10 +113,8 @@ def random_bin(
     stand = rng.uniform(*STAND) if rng.random() < STAND_SHARE else 0.0
     half = np.array([length, width]) / 2
     outer = half + wall
-    depth = wall + stand + GROUND
-    floor = _slab(np.array([*(2 * outer), depth]), TABLE_HEIGHT)
-    size = np.array([OPEN_EXTENT, OPEN_EXTENT, OPEN_THICKNESS])
-    boxes = [_slab(size, TABLE_HEIGHT - wall - stand), floor]
+    floor = _slab((*(2 * outer), wall + stand + GROUND), TABLE_HEIGHT)
+    boxes = [_slab((OPEN_EXTENT, OPEN_EXTENT, OPEN_THICKNESS), TABLE_HEIGHT - wall - stand), floor]
     z = TABLE_HEIGHT + height / 2
     for side in (-1.0, 1.0):
         x, y = MIDDLE + side * (half + wall / 2)
@@ -138,12 +134,11 @@ def random_table(rng: np.random.Generator) -> Surroundings:
     reach = np.full(2, REACH)
     low, high = MIDDLE - reach, MIDDLE + reach
     over = float(rng.uniform(*TABLE_OVER_FLOOR))
-    size = np.array([*rng.uniform(*TABLE_LENGTH, size=2), over])
+    size = rng.uniform(*TABLE_LENGTH, size=2)
     # All the objects' places are on it; an edge may be close to them.
-    aside = rng.uniform(-1.0, 1.0, size=2) * (size[:2] / 2 - reach - 0.02)
-    table = _slab(size, TABLE_HEIGHT, *(MIDDLE + aside))
-    floor = _slab(np.array([6.0, 6.0, 0.2]), TABLE_HEIGHT - over)
-    boxes = [floor, table]
+    aside = rng.uniform(-1.0, 1.0, size=2) * (size / 2 - reach - 0.02)
+    table = _slab((*size, over), TABLE_HEIGHT, *(MIDDLE + aside))
+    boxes = [_slab(FLOOR, TABLE_HEIGHT - over), table]
     large = int(rng.integers(*LARGE_OBJECTS, endpoint=True))
     boxes += [_large_object(rng) for _ in range(large)]
     bottom = TABLE_HEIGHT + SUPPORT_CLEARANCE
@@ -158,11 +153,9 @@ def random_shelf(rng: np.random.Generator) -> Surroundings:
     """A compartment of a shelf, open toward -y, its floor at `TABLE_HEIGHT`, another one above."""
     width, depth, height = (float(rng.uniform(*extent)) for extent in SHELF_INSIDE)
     board, over = float(rng.uniform(*SHELF_BOARD)), float(rng.uniform(*SHELF_OVER_FLOOR))
-    floor = _slab(np.array([6.0, 6.0, 0.2]), TABLE_HEIGHT - over)
-    bottom = _slab(np.array([width, depth, GROUND]), TABLE_HEIGHT)
     tall = GROUND + 2 * height
     middle = TABLE_HEIGHT - GROUND + tall / 2
-    boxes = [floor, bottom]
+    boxes = [_slab(FLOOR, TABLE_HEIGHT - over), _slab((width, depth, GROUND), TABLE_HEIGHT)]
     for side in (-1.0, 1.0):
         x = MIDDLE + side * (width + board) / 2
         boxes.append(Box((board, depth, tall), (x, MIDDLE, middle)))

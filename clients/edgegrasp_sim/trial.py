@@ -18,6 +18,7 @@ from edgegrasp_sim.hand import FailureCause, seconds_of
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import Protocol as BenchmarkProtocol
 from edgegrasp_sim.simulation import ClutterSimulation
+from edgegrasp_sim.surroundings import open_table
 
 MIN_SEEN = 100  # points above the table; with fewer the planner is not asked
 
@@ -120,7 +121,7 @@ class RoundDriver:
             layout,
             rules.num_objects[index % len(rules.num_objects)],
             rules.packed_scale if upright else rules.pile_scale,
-            rules.table_thickness,
+            open_table(rules.table_thickness),
         )
         self.view, self._points = -1, 0
         self._failures = 0
