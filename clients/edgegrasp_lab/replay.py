@@ -5,15 +5,18 @@ import sys
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+from google.protobuf import json_format
 from rich.console import Console
 from typer import Argument, Option, Typer
 
-if TYPE_CHECKING:
-    from edgegrasp_service.settings import Settings
-    from edgegrasp_service.worker.process import Answer, Job
-
+from edgegrasp.v1 import grasp_pb2
+from edgegrasp_service.settings import Settings, load_settings
+from edgegrasp_service.worker import answer as worker
+from edgegrasp_service.worker.process import Answer, Job, receive
+from edgegrasp_sim.report import attempt_title, draw_attempt, repeat
+from edgegrasp_sim.results import ResultFolder
 
 replay = Typer(
     help="Repeat a recording: an attempt of a benchmark, or a request.",
@@ -36,20 +39,13 @@ def attempt(
     ] = None,
 ) -> None:
     """Repeat one recorded attempt, in its scene and view."""
-    from edgegrasp_camera.picture import Picture, View
-    from edgegrasp_sim.report import Replay, attempt_title
-    from edgegrasp_sim.results import ResultFolder
-
     folder = ResultFolder(results)
     first = folder.manifest()["seeds"][0]
-    waiting = Console(stderr=True).status("Making the attempt again…")
-    with waiting, Replay(folder, objects) as repeated:
-        done, now, seen = repeated.repeat(first if seed is None else seed, round, number)
+    with Console(stderr=True).status("Making the attempt again…"):
+        done, now, seen = repeat(folder, first if seed is None else seed, round, number, objects)
     before, title = done.attempts[number], attempt_title(done, number)
     if picture is not None:
-        drawn = Picture(View.of(seen.cloud, seen.camera_position), seen.cloud, title=title)
-        drawn.grasps([before])
-        drawn.save(picture)
+        draw_attempt(picture, done, number, seen)
     print(title)
     if any(getattr(now, name) != getattr(before, name) for name in ("cause", "object", "opening")):
         sys.exit(f"edgegrasp replay: the result differs: {now.cause or 'success'}")
@@ -65,8 +61,6 @@ def request(
 
     Weights and limits are those of --config and of EDGEGRASP_* variables, as for `serve`.
     """
-    from edgegrasp_service.settings import load_settings
-
     job, recorded, answer = answer_again(file, load_settings(config))
     print(f"{answer.facts.grasps} grasps" if answer.error is None else answer.error.detail)
     before, now = ((one.error, _without_times(job, one.body)) for one in (recorded, answer))
@@ -75,11 +69,8 @@ def request(
     print("the answer is the same")
 
 
-def answer_again(file: Path, settings: "Settings") -> "tuple[Job, Answer, Answer]":
+def answer_again(file: Path, settings: Settings) -> tuple[Job, Answer, Answer]:
     """A recorded request, the answer that is recorded, and the answer now; raises ValueError."""
-    from edgegrasp_service.worker import answer as worker
-    from edgegrasp_service.worker.process import Answer, Job, receive
-
     job = recorded = None
     wrong = LookupError, MemoryError, OverflowError, TypeError, ValueError  # of another file
     with file.open("rb") as stream, suppress(*wrong):
@@ -91,12 +82,8 @@ def answer_again(file: Path, settings: "Settings") -> "tuple[Job, Answer, Answer
     return job, recorded, worker.answer(job, worker.load_catalogue(settings), settings)
 
 
-def _without_times(job: Any, body: bytes) -> Any:
+def _without_times(job: Job, body: bytes) -> Any:
     """An answer without the seconds it took; None for an error, whose body is empty."""
-    from google.protobuf import json_format
-
-    from edgegrasp.v1 import grasp_pb2
-
     if not body:
         return None
     if job.transport == "http":

@@ -52,6 +52,18 @@ class BenchmarkConfig:
         """The objects to draw scenes from; FileNotFoundError if `objects` holds none for them."""
         return ObjectSet.from_folder(self.objects, self.scene, self.split)
 
+    def simulation(self, digest: str) -> ClutterSimulation:
+        """What its rounds run in; ValueError: its objects have another digest."""
+        objects = self.object_set()
+        objects.check_same(digest)
+        return ClutterSimulation(
+            {self.scene: objects},
+            engine=self.engine,
+            gripper=self.gripper,
+            arm=self.arm,
+            min_opening=self.protocol.round.min_opening,
+        )
+
     def tasks(self) -> list[Task]:
         """Seed and index of every round, in order."""
         return [(seed, index) for seed in self.seeds for index in range(self.rounds)]
@@ -145,17 +157,8 @@ class RoundRunner:
     """A simulation with a planner, for one process."""
 
     def __init__(self, config: BenchmarkConfig, make_planner: PlannerFactory, digest: str) -> None:
-        objects = config.object_set()
-        objects.check_same(digest)
-        self.config = config
+        self.config, self.simulation = config, config.simulation(digest)
         self.planner: Planner = make_planner()
-        self.simulation = ClutterSimulation(
-            {config.scene: objects},
-            engine=config.engine,
-            gripper=config.gripper,
-            arm=config.arm,
-            min_opening=config.protocol.round.min_opening,
-        )
 
     def __call__(self, task: Task) -> Round:
         """Run the round of a seed and an index."""

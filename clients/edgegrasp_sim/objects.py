@@ -5,7 +5,6 @@ A mesh is scaled to the hand, decomposed into convex parts and cached on disk.
 
 import contextlib
 import hashlib
-import logging
 import os
 import shutil
 import tempfile
@@ -33,7 +32,6 @@ CONCAVITY = 0.05
 SEARCH = {"mcts_iterations": 20, "mcts_nodes": 8, "mcts_max_depth": 2, "resolution": 1000}
 Size = tuple[float, float, float]
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]  # points (P, 3), triangles (F, 3)
-logger = logging.getLogger(__name__)
 
 
 class SceneKind(StrEnum):
@@ -109,11 +107,11 @@ class ObjectSet:
         return digest.hexdigest()
 
     def check_same(self, digest: str) -> None:
-        """Raise ValueError unless the set has this digest, which another process read."""
+        """Raise ValueError unless the set has this digest, which was read elsewhere or earlier."""
         if self.digest != digest:
             raise ValueError(
-                f"the objects {self.name} differ between the machines of the cluster; put the same "
-                "folder at the same path on each"
+                f"the objects {self.name} differ between the machines of the cluster, or from those"
+                " of the recorded benchmark; use the same folder, on each at the same path"
             )
 
     def sample(self, rng: np.random.Generator) -> ObjectModel:
@@ -137,13 +135,11 @@ class ObjectSet:
         urdfs = sorted(folder.glob("*.urdf"))
         if urdfs:
             return cls(name, tuple(ObjectModel(path.stem, path) for path in urdfs))
-        files = folder.iterdir() if folder.is_dir() else ()
-        meshes = sorted(path for path in files if path.suffix.lower() in MESH_SUFFIXES)
+        meshes = sorted(path for path in folder.glob("*") if path.suffix.lower() in MESH_SUFFIXES)
         if not meshes:
             raise FileNotFoundError(
-                f"no *.urdf, *.obj or *.stl files in {folder}; an object folder holds "
-                "<scene>/<split>/<name>.urdf with scene packed or pile and split train or test, "
-                "or the files themselves"
+                f"no *.urdf, *.obj or *.stl files in {folder}; an object folder holds them, or "
+                "<scene>/<split>/<name>.urdf with scene packed or pile and split train or test"
             )
         names = [path.stem for path in meshes]
         if twice := sorted({each for each in names if names.count(each) > 1}):
@@ -206,7 +202,6 @@ def prepare_mesh(mesh: Path) -> Path:
         solid.density = OBJECT_MASS / solid.volume
         visible, hulls = ([(m.vertices, m.faces) for m in meshes] for meshes in ([surface], parts))
         write_parts("object", visible, hulls, solid.center_mass, solid.moment_inertia, folder)
-        logger.info("%s: %d convex parts", mesh.name, len(parts))
 
     return _kept_in(_digest(mesh), write) / "object.urdf"
 
@@ -238,7 +233,7 @@ def write_parts(
     folder.mkdir(parents=True, exist_ok=True)
     meshes = {f"{name}_visual": visible, f"{name}_collision": parts}
     for mesh, surfaces in meshes.items():
-        (folder / f"{mesh}.obj").write_text(as_obj(surfaces, decimals=7, named=True))
+        (folder / f"{mesh}.obj").write_text(as_obj(surfaces, named=True))
     xyz = " ".join(f"{value:.7f}" for value in centre)
     rows, columns = np.triu_indices(3)
     moments = " ".join(
@@ -253,11 +248,10 @@ def write_parts(
 def as_obj(
     meshes: Iterable[Mesh],  # points (P, 3) and triangles (F, 3) of each
     *,
-    decimals: int = 6,  # of coordinates
     named: bool = False,  # each mesh an object, of which the engine takes the hull
 ) -> str:
     """Meshes as one OBJ file."""
-    lines, before = [], 1
+    lines, before, decimals = [], 1, 7 if named else 6
     for number, (points, faces) in enumerate(meshes):
         if named:
             lines.append(f"o part_{number}")
@@ -339,9 +333,7 @@ def _read(mesh: Path) -> Any:
     if len(surface.faces) == 0 or surface.extents is None:
         raise ValueError(f"{mesh} contains no triangles; export the object as a triangle mesh")
     if not np.isfinite(surface.vertices).all() or min(surface.extents) <= 1e-9:
-        raise ValueError(
-            f"{mesh} is not a solid object (its extents are {surface.extents.tolist()})"
-        )
+        raise ValueError(f"{mesh} is not a solid object: its extents are {surface.extents}")
     return surface
 
 
@@ -349,17 +341,16 @@ def _write_urdf(
     folder: Path, name: str, inertial: Iterable[str], meshes: Iterable[str], contact: str = ""
 ) -> Path:
     """The URDF file of an object: elements of its inertial, its visual and its collision mesh."""
-    elements = "\n".join(f"      {element}" for element in inertial)
-    visual, collision = (f'<geometry><mesh filename="{each}.obj"/></geometry>' for each in meshes)
+    elements, (visual, collision) = "\n      ".join(inertial), meshes
     urdf = folder / f"{name}.urdf"
     urdf.write_text(f"""<?xml version="1.0"?>
 <robot name="{name}">
   <link name="base_link">
 {contact}    <inertial>
-{elements}
+      {elements}
     </inertial>
-    <visual>{visual}</visual>
-    <collision>{collision}</collision>
+    <visual><geometry><mesh filename="{visual}.obj"/></geometry></visual>
+    <collision><geometry><mesh filename="{collision}.obj"/></geometry></collision>
   </link>
 </robot>
 """)

@@ -5,17 +5,16 @@ import json
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from edgegrasp_camera.picture import Picture, View
+from edgegrasp_sim.benchmark import BenchmarkConfig
 from edgegrasp_sim.camera import Observation
-from edgegrasp_sim.objects import ObjectSet, SceneKind
+from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import protocol_from
 from edgegrasp_sim.results import RATE_LABELS, ResultFolder, over_seeds, percent, planner_title
-from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trial import Attempt, PlannedGrasp, Round, RoundDriver
 
 PICTURES = 6
@@ -28,56 +27,47 @@ img { max-width: 100%; margin: 1.2em 0; }
 Row = Sequence[object]
 
 
-class Replay(AbstractContextManager["Replay"]):
-    """The recorded rounds of a folder, to repeat; raises FileNotFoundError or ValueError."""
+def repeat(
+    folder: ResultFolder,
+    seed: int,
+    index: int,  # of the round
+    number: int,  # of the attempt in it
+    objects: Path | None = None,  # their folder, if it has moved
+) -> tuple[Round, Attempt, Observation]:
+    """Repeat a round up to an attempt; raises FileNotFoundError or ValueError.
 
-    def __init__(self, folder: ResultFolder, objects: Path | None = None) -> None:
-        facts = folder.manifest()
-        run = facts["run"]
-        if "arm" in run:
-            raise ValueError(f"{folder.path} holds attempts of an arm, whose motions are not kept")
-        if objects is None and facts["objects_folder"] is not None:
-            objects = Path(facts["objects_folder"])
-        self.scene, self.protocol = SceneKind(run["scene"]), protocol_from(run["protocol"])
-        models = ObjectSet.from_folder(objects, self.scene, facts["split"])
-        if models.digest != run["objects"]["digest"]:
-            raise ValueError(
-                f"the objects in {objects} are not those of the benchmark in {folder.path}; "
-                "pass the folder it was run with"
-            )
-        self.rounds = {(done.seed, done.index): done for done in folder.rounds()}
-        self.simulation = ClutterSimulation(
-            {self.scene: models},
-            engine=run["engine"],
-            gripper=run.get("gripper"),
-            min_opening=self.protocol.round.min_opening,
-        )
-
-    def __exit__(self, *_: object) -> None:
-        self.simulation.close()
-
-    def repeat(self, seed: int, index: int, attempt: int) -> tuple[Round, Attempt, Observation]:
-        """Repeat a round up to an attempt; ValueError: it is not recorded.
-
-        Returns the recorded round, the attempt now, and the image before it.
-        """
-        done = self.rounds.get((seed, index))
-        if done is None:
-            known = ", ".join(f"{s}/{i}" for s, i in list(self.rounds)[:10])
-            raise ValueError(f"round is {index} of seed {seed}; the folder has {known}, …")
-        if not 0 <= attempt < len(done.attempts):
-            raise ValueError(
-                f"attempt is {attempt}; round {index} of seed {seed} has {len(done.attempts)}, "
-                "counted from 0"
-            )
-        driver = RoundDriver(self.simulation, self.scene, self.protocol, seed=seed, index=index)
-        for recorded in done.attempts[: attempt + 1]:
+    Returns the recorded round, the attempt now, and the image before it.
+    """
+    facts = folder.manifest()
+    run, known = facts["run"], facts["objects_folder"]
+    if "arm" in run:
+        raise ValueError(f"{folder.path} holds attempts of an arm, whose motions are not kept")
+    rounds = {(done.seed, done.index): done for done in folder.rounds()}
+    done = rounds.get((seed, index))
+    if done is None:
+        kept = ", ".join(f"{s}/{i}" for s, i in list(rounds)[:10])
+        raise ValueError(f"round is {index} of seed {seed}; the folder has {kept}, …")
+    if not 0 <= number < len(done.attempts):
+        raise ValueError(f"attempt is {number}; the round has {len(done.attempts)}, from 0 on")
+    config = BenchmarkConfig(
+        SceneKind(run["scene"]),
+        facts["rounds"],
+        tuple(facts["seeds"]),
+        protocol_from(run["protocol"]),
+        objects or (known and Path(known)),
+        facts["split"],
+        run["engine"],
+        run.get("gripper"),
+    )
+    with config.simulation(run["objects"]["digest"]) as simulation:
+        driver = RoundDriver(simulation, config.scene, config.protocol, seed=seed, index=index)
+        for recorded in done.attempts[: number + 1]:
             seen = driver.look()
             while driver.view < recorded.view:  # views in which no grasp was found
                 seen = driver.look()
             grasp = PlannedGrasp(recorded.T_world_hand, recorded.score, recorded.width)
             repeated = driver.execute(grasp)
-        return done, repeated, seen
+    return done, repeated, seen
 
 
 def write_report(folder: ResultFolder, summary: dict[str, Any]) -> Path:
@@ -85,8 +75,7 @@ def write_report(folder: ResultFolder, summary: dict[str, Any]) -> Path:
     rounds, facts = folder.rounds(), folder.manifest()
     pictures: list[str] = []
     if "arm" not in facts["run"]:
-        with Replay(folder) as replay:
-            pictures = list(_failure_pictures(replay, rounds))
+        pictures = list(_failure_pictures(folder, rounds))
     title = f"{planner_title(facts['run']['planner'])} on {summary['scene']} scenes"
     parts = [
         table(_key_figures(summary)),
@@ -112,6 +101,14 @@ def attempt_title(done: Round, number: int) -> str:
         f"seed {done.seed}, round {done.index}, attempt {number}: {outcome} "
         f"(aimed at {target}; score {attempt.score:.2f})"
     )
+
+
+def draw_attempt(path: Path, done: Round, number: int, seen: Observation) -> None:
+    """Write a picture of an attempt in the cloud that was seen before it."""
+    view = View.of(seen.cloud, seen.camera_position)
+    picture = Picture(view, seen.cloud, title=attempt_title(done, number))
+    picture.grasps([done.attempts[number]])
+    picture.save(path)
 
 
 def page(title: str, parts: Iterable[str]) -> str:
@@ -168,7 +165,7 @@ def _share(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.1f}"
 
 
-def _failure_pictures(replay: Replay, rounds: Sequence[Round]) -> Iterator[str]:
+def _failure_pictures(folder: ResultFolder, rounds: Sequence[Round]) -> Iterator[str]:
     """Pictures of failed attempts: one for each cause, then more, `PICTURES` in all."""
     before: Counter[str] = Counter()  # failures with the same cause
     failed = []
@@ -178,11 +175,7 @@ def _failure_pictures(replay: Replay, rounds: Sequence[Round]) -> Iterator[str]:
                 before[str(attempt.cause)] += 1
                 failed.append((before[str(attempt.cause)], done, number))
     for _, done, number in sorted(failed, key=lambda each: each[0])[:PICTURES]:
-        _, _, seen = replay.repeat(done.seed, done.index, number)
-        title = attempt_title(done, number)
-        with tempfile.TemporaryDirectory() as folder:
-            file, view = Path(folder) / "failure.jpg", View.of(seen.cloud, seen.camera_position)
-            picture = Picture(view, seen.cloud, title=title)
-            picture.grasps([done.attempts[number]])
-            picture.save(file)
-            yield image("jpeg", file.read_bytes(), title)
+        _, _, seen = repeat(folder, done.seed, done.index, number)
+        with tempfile.NamedTemporaryFile(suffix=".jpg") as file:
+            draw_attempt(Path(file.name), done, number, seen)
+            yield image("jpeg", file.read(), attempt_title(done, number))
