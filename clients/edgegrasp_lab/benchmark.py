@@ -5,7 +5,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel
@@ -14,14 +15,18 @@ from rich.progress import Progress, TimeElapsedColumn
 from rich.table import Table
 from typer import Argument, Option
 
-from edgegrasp_cli.flags import Connection, option_flags, parse_option_flags, takes_flags
-
-if TYPE_CHECKING:
-    from edgegrasp_sim.benchmark import BenchmarkConfig
-    from edgegrasp_sim.engine import ArmModel
-    from edgegrasp_sim.protocol import CameraRules
-    from edgegrasp_sim.results import ResultFolder
-    from edgegrasp_sim.trial import Round
+from edgegrasp_cli.flags import option_flags, parse_option_flags, takes_flags
+from edgegrasp_lab.planners import PlannerFlags, open_planner
+from edgegrasp_model.gripper import gripper_fields
+from edgegrasp_sim import results
+from edgegrasp_sim.benchmark import BenchmarkConfig, manifest, run_benchmark
+from edgegrasp_sim.engine import ArmModel
+from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.protocol import CameraRules, load_protocol
+from edgegrasp_sim.report import write_report
+from edgegrasp_sim.results import RATE_LABELS, ResultFolder, over_seeds, percent
+from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
+from edgegrasp_sim.trial import Round
 
 FAR = 0.5  # metres from the arm's base to the middle of a scene
 LIFT = {"retreat_length": 0.1, "retreat_direction": "up"}  # metres
@@ -41,23 +46,6 @@ class Cluster(BaseModel, use_attribute_docstrings=True):
     """Processes, which do not change results; default: one per core"""
     ray: str | None = None
     """Address of a Ray cluster to run on; local: this machine"""
-
-
-class PlannerFlags(Connection):
-    """The flags that choose a planner of the benchmark."""
-
-    timeout: float = 300.0
-    """Seconds to wait for a server"""
-    planner: str = "server"
-    """server, in-process, name of an installed planner, or module:callable"""
-    server: str | None = None
-    """host:port (gRPC) or http://host:port; without it, one is started"""
-    weights: tuple[Path, ...] = ()
-    """Weights besides those that ship"""
-    model: str = ""
-    """Weights to use: a name or a .safetensors file; empty: the default"""
-    robot: str | None = None
-    """Arm that executes the grasps with its own hand, in MuJoCo: name or .toml file"""
 
 
 class BenchmarkFlags(Cluster, PlannerFlags):
@@ -92,34 +80,23 @@ def benchmark(*, asked: BenchmarkFlags, options: dict[str, Any]) -> None:
     GSR: successes / attempts. DR: objects removed / present. The protocol defines a round.
     Options of the detection are the protocol's unless a flag is given.
     """
-    from edgegrasp_sim.results import ResultFolder, below_gate, planner_title, summary_of
-
-    with interruptible("benchmark", resumes=asked.output is not None):
-        config, fields = _plan(asked, parse_option_flags(options))
-        print(f"engine: {config.engine}")
-        folder = ResultFolder(asked.output) if asked.output is not None else None
-        done, run = run_rounds(config, asked, fields, folder)
-    summary = summary_of(run, done) if folder is None else folder.finish(done)
-    if folder is not None and asked.report:
-        from edgegrasp_sim.report import write_report
-
-        print(f"report: {write_report(folder, summary)}")
-    _print_summary(summary, planner_title(run["planner"]))
+    with TemporaryDirectory() as scratch:
+        folder = ResultFolder(asked.output or Path(scratch))
+        with interruptible("benchmark", resumes=asked.output is not None):
+            config, fields = _plan(asked, parse_option_flags(options))
+            print(f"engine: {config.engine}")
+            summary = folder.finish(run_rounds(config, asked, fields, folder))
+        if asked.output is not None and asked.report:
+            print(f"report: {write_report(folder, summary)}")
+        _print_summary(summary, results.planner_title(folder.manifest()["run"]["planner"]))
     if asked.gate is not None:
-        if below := below_gate(summary, asked.gate):
+        if below := results.below_gate(summary, asked.gate):
             sys.exit("edgegrasp benchmark: below the gate: " + "; ".join(below))
         print("not below the gate")
 
 
-def _plan(
-    asked: BenchmarkFlags, options: dict[str, Any]
-) -> "tuple[BenchmarkConfig, dict[str, Any]]":
+def _plan(asked: BenchmarkFlags, options: dict[str, Any]) -> tuple[BenchmarkConfig, dict[str, Any]]:
     """The benchmark to run, and the options of its requests."""
-    from edgegrasp_model.gripper import gripper_fields
-    from edgegrasp_sim.benchmark import BenchmarkConfig
-    from edgegrasp_sim.objects import SceneKind
-    from edgegrasp_sim.protocol import load_protocol
-
     rules = load_protocol(asked.protocol)
     # The Panda's hand has its own shapes.
     hand = gripper_fields(asked.gripper) if asked.gripper not in (None, "panda") else None
@@ -143,16 +120,14 @@ def _plan(
         arm,
     )
     if asked.ray not in (None, "local") and asked.planner == "server" and asked.server is None:
-        raise ValueError(
-            f"ray is {asked.ray!r}; the cluster cannot reach a server of this command's own: pass "
-            "--server, or --planner in-process"
-        )
+        wanted = "pass --server with an address that the cluster reaches, or --planner in-process"
+        raise ValueError(f"ray is {asked.ray!r}; {wanted}")
     return config, options
 
 
 def benchmark_arm(
-    name: str, camera: "CameraRules"
-) -> "tuple[ArmModel, dict[str, Any] | None, dict[str, Any]]":
+    name: str, camera: CameraRules
+) -> tuple[ArmModel, dict[str, Any] | None, dict[str, Any]]:
     """The robot's arm, on the camera's side of a scene as if the camera were on its wrist.
 
     Returns:
@@ -161,9 +136,7 @@ def benchmark_arm(
     Raises:
         InvalidRobot: the file cannot be used.
     """
-    from edgegrasp_robot import load_robot
-    from edgegrasp_sim.engine import ArmModel
-    from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
+    from edgegrasp_robot import load_robot  # an extra
 
     robot = load_robot(name)
     # The base stands on the table, on the camera's side; its x points to the middle of the scene.
@@ -196,10 +169,7 @@ def compare(
     output: Annotated[Path | None, Option(help="JSON file for the figures as well.")] = None,
 ) -> None:
     """Compare two benchmarks scene by scene, with 95 % confidence intervals."""
-    from edgegrasp_sim.results import RATE_LABELS, ResultFolder, percent
-    from edgegrasp_sim.results import compare as figures_of
-
-    figures = figures_of(ResultFolder(first), ResultFolder(second))
+    figures = results.compare(ResultFolder(first), ResultFolder(second))
     if output is not None:
         output.write_text(json.dumps(figures, indent=1) + "\n")
     table = Table("", str(first), str(second), "difference, paired")
@@ -230,16 +200,9 @@ def interruptible(command: str, *, resumes: bool) -> Iterator[None]:
 
 
 def run_rounds(
-    config: "BenchmarkConfig",
-    asked: BenchmarkFlags,
-    options: dict[str, Any],
-    folder: "ResultFolder | None",
-) -> "tuple[list[Round], dict[str, Any]]":
-    """Run the remaining rounds, with a progress bar; returns all, and `run` of the manifest."""
-    from edgegrasp_lab.planners import open_planner
-    from edgegrasp_sim.benchmark import manifest, run_benchmark
-    from edgegrasp_sim.results import below_gate, count, summary_of
-
+    config: BenchmarkConfig, asked: BenchmarkFlags, options: dict[str, Any], folder: ResultFolder
+) -> list[Round]:
+    """Run the rounds that a folder lacks, with a progress bar; returns all."""
     # Fails on a wrong folder before a server is started, and prepares meshes once for all workers.
     with Console(stderr=True).status("reading objects"):
         config.object_set()
@@ -248,45 +211,31 @@ def run_rounds(
     with open_planner(asked, config.protocol.planning, options) as planner:
         facts = manifest(config, planner.facts)
         if asked.gate is not None:  # another file fails here, not after hours
-            below_gate(summary_of(facts["run"], []), asked.gate)
-        if folder is not None:
-            folder.open(facts)
-        kept = folder.rounds() if folder is not None else []
-        finished = sum((done.seed, done.index) in tasks for done in kept)
+            results.below_gate(results.summary_of(facts["run"], []), asked.gate)
+        folder.open(facts)
+        finished = sum((done.seed, done.index) in tasks for done in folder.rounds())
         with Progress(*Progress.get_default_columns(), TimeElapsedColumn()) as progress:
             bar = progress.add_task(scene, total=len(tasks), completed=finished)
 
-            def on_round(done: "Round") -> None:
+            def on_round(done: Round) -> None:
                 came.append(done)
-                successes, attempts, objects = count(came).sum(axis=1)
+                successes, attempts, objects = results.count(came).sum(axis=1)
                 text = f"{scene} GSR {successes}/{attempts} DR {successes}/{objects}"
                 progress.update(bar, advance=1, description=text)
 
-            done = run_benchmark(
-                config,
-                planner.make,
-                workers=asked.workers,
-                ray=asked.ray,
-                folder=folder,
-                on_round=on_round,
-            )
-    return done, facts["run"]
+            where: dict[str, Any] = {"workers": asked.workers, "ray": asked.ray, "folder": folder}
+            return run_benchmark(config, planner.make, **where, on_round=on_round)
 
 
 def _print_summary(summary: dict[str, Any], planner: str) -> None:
-    from edgegrasp_sim.results import RATE_LABELS, over_seeds, percent
-
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
-    gsr, dr = (
-        f"{percent(rate)} %, {over_seeds(rate)} over seeds"
-        for rate in (summary["grasp_success_rate"], summary["declutter_rate"])
+    trials = f"{summary['attempts']} grasps", f"{summary['objects']} objects"
+    rates = (
+        f"{label} {percent(summary[name])} %, {over_seeds(summary[name])} over seeds "
+        f"({summary['successes']} of {number})"
+        for (name, label), number in zip(RATE_LABELS.items(), trials, strict=True)
     )
-    console.print(
-        f"{planner}: GSR {gsr} "
-        f"({summary['successes']} of {summary['attempts']} grasps), "
-        f"DR {dr} "
-        f"({summary['successes']} of {summary['objects']} objects)"
-    )
+    console.print(f"{planner}: {', '.join(rates)}")
     wide = summary["too_wide"]
     if wide["objects"]:
         gsr, dr = (percent(wide[f"{name}_of_others"]) for name in RATE_LABELS)

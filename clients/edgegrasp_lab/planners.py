@@ -3,16 +3,15 @@
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from edgegrasp_cli.detect import OwnDetector
+from edgegrasp_cli.flags import Connection
 from edgegrasp_client import GraspClientError, Model, ServerUnavailableError, StartCollisionError
 from edgegrasp_client.connection import local_server
-from edgegrasp_lab.benchmark import PlannerFlags
 from edgegrasp_model.errors import StartCollision
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.protocol import PlanningRules
@@ -21,6 +20,23 @@ from edgegrasp_sim.trial import PlannedGrasp, Planner, StartCollides
 GROUP = "edgegrasp.planners"  # entry points under which packages may name their planners
 SHIPPED = ("server", "in-process")
 SUFFIX = ".safetensors"
+
+
+class PlannerFlags(Connection):
+    """The flags that choose a planner of the benchmark."""
+
+    timeout: float = 300.0
+    """Seconds to wait for a server"""
+    planner: str = "server"
+    """server, in-process, name of an installed planner, or module:callable"""
+    server: str | None = None
+    """host:port (gRPC) or http://host:port; without it, one is started"""
+    weights: tuple[Path, ...] = ()
+    """Weights besides those that ship"""
+    model: str = ""
+    """Weights to use: a name or a .safetensors file; empty: the default"""
+    robot: str | None = None
+    """Arm that executes the grasps with its own hand, in MuJoCo: name or .toml file"""
 
 
 class ChosenPlanner(NamedTuple):
@@ -119,15 +135,18 @@ class _OneThread(OwnDetector):
             return super().detect(cloud, **options)
 
 
-@dataclass
 class ClientPlanner:
     """Requests the best grasp of each observation; waits while a server restarts."""
 
-    open_client: Callable[[], Any]  # a GraspClient or the like
-    rules: PlanningRules  # of the protocol
-    options: Mapping[str, Any]  # of each request, besides the protocol's
-    timeout: float  # seconds
-    _client: Any = field(default=None, init=False)
+    def __init__(
+        self,
+        open_client: Callable[[], Any],  # a GraspClient or the like
+        rules: PlanningRules,  # of the protocol
+        options: Mapping[str, Any],  # of each request, besides the protocol's
+        timeout: float,  # seconds
+    ) -> None:
+        self.client, self.rules, self.options, self.timeout = open_client(), rules, options, timeout
+        self.close = self.client.close
 
     def __call__(self, observation: Observation, seed: int) -> PlannedGrasp | None:
         """The best grasp; None if there is none.
@@ -136,16 +155,14 @@ class ClientPlanner:
             GraspClientError: the server refuses the request, or is away for `timeout`.
             EdgeGraspError: the detector in this process refuses it.
         """
-        if self._client is None:
-            self._client = self.open_client()
         options = request_options(observation, seed, self.rules, self.options)
         views = observation.view_ids if len(observation.camera_positions) > 1 else None
-        ask = partial(self._client.detect, observation.image, view_ids=views, **options)
+        ask = partial(self.client.detect, observation.image, view_ids=views, **options)
         try:
             try:
                 grasps = ask().grasps
             except ServerUnavailableError:
-                self._client.wait_until_ready(self.timeout)
+                self.client.wait_until_ready(self.timeout)
                 grasps = ask().grasps
         except (StartCollision, StartCollisionError) as error:
             raise StartCollides(str(error)) from None
@@ -156,11 +173,6 @@ class ClientPlanner:
         if "robot" in options and motion is None:
             return None
         return PlannedGrasp(best.T_cloud_hand, best.score, best.width, motion)
-
-    def close(self) -> None:
-        """Close the connection."""
-        if self._client is not None:
-            self._client.close()
 
 
 def model_used(client: Any, name: str) -> Model:
