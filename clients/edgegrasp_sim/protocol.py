@@ -109,10 +109,8 @@ def load_protocol(name: str) -> Protocol:
     """A shipped protocol by name, or a `.toml` file; raises FileNotFoundError or ValueError."""
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if not path.is_file():
-        raise FileNotFoundError(
-            f"no protocol {name!r}; choose one of {', '.join(protocol_names())}, "
-            "or pass a .toml file"
-        )
+        known = ", ".join(protocol_names())
+        raise FileNotFoundError(f"no protocol {name!r}; choose one of {known}, or a .toml file")
     try:
         return protocol_from(_constants(path))
     except ValidationError as error:

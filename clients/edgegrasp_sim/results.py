@@ -6,7 +6,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import fmean, median, stdev
 from typing import Any
@@ -28,11 +28,11 @@ RESAMPLES = 10_000
 ROUND = TypeAdapter(Round)
 
 
+@dataclass(frozen=True)
 class ResultFolder:
     """A folder with a benchmark's manifest, its rounds, and at the end attempts and summary."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    path: Path
 
     def open(self, manifest: dict[str, Any]) -> None:
         """Start a benchmark in this folder, or resume an interrupted one.
@@ -50,9 +50,8 @@ class ResultFolder:
             changed += ["rounds"] if held["rounds"] > manifest["rounds"] else []
             if changed:
                 raise ValueError(
-                    f"{self.path} holds another benchmark (different {', '.join(changed)}); "
-                    "choose another folder, or repeat the command that began it, with more rounds "
-                    "or seeds if you like"
+                    f"{self.path} holds another benchmark (different {', '.join(changed)}), which "
+                    "can get more rounds and seeds; choose another folder"
                 )
         (self.path / "rounds").mkdir(parents=True, exist_ok=True)
         _write(known, json.dumps(manifest, indent=1) + "\n")
@@ -239,16 +238,12 @@ def below_gate(summary: dict[str, Any], gate: Path) -> list[str]:
             f"{gate} is of another benchmark: "
             + ", ".join(f"{name} {committed[name]!r}, not {summary[name]!r}" for name in differing)
         )
-    found = []
-    for name, label in RATE_LABELS.items():
-        value, limit = summary[name]["value"], limits[name]
-        if limit is not None and (value is None or value < limit[0]):
-            shown = "undefined" if value is None else f"{100 * value:.1f} %"
-            found.append(
-                f"{label} {shown} is below {100 * limit[0]:.1f} %, the lower end of the "
-                f"committed {100 * committed[name]['value']:.1f} %"
-            )
-    return found
+    return [
+        f"{label} {100 * value:.1f} % is below {100 * limits[name][0]:.1f} %, the lower end of the "
+        f"committed {100 * committed[name]['value']:.1f} %"
+        for name, label in RATE_LABELS.items()
+        if limits[name] is not None and (value := summary[name]["value"] or 0.0) < limits[name][0]
+    ]
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float] | None:
