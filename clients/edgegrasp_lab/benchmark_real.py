@@ -5,6 +5,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,11 +18,14 @@ from edgegrasp_camera.arrays import Int64
 from edgegrasp_camera.picture import Picture
 from edgegrasp_cli.detect import DetectorFlags, open_client
 from edgegrasp_cli.flags import option_flags, parse_option_flags, takes_flags
+from edgegrasp_client import InvalidRequestError
+from edgegrasp_lab.planners import model_used
 from edgegrasp_lab.real_scenes import BEST, RealScene, SceneFigures, judge, load_scenes, renumbered
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import choose_gripper, load_gripper
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.results import SUPPORT, UNLABELLED
+from edgegrasp_sim.report import image, page, table
 
 Rows = list[tuple[str, ...]]
 # Options that are set by the scene or by this command.
@@ -46,8 +50,6 @@ def benchmark_real(
     A request contains the image and its intrinsics, or the cloud with the camera at its origin, and
     the options given as flags; nothing else about the scene.
     """
-    from edgegrasp_lab.planners import model_used
-
     fields, loaded = parse_option_flags(options), load_scenes(scenes)
     output.mkdir(parents=True, exist_ok=True)
     done: dict[str, SceneFigures] = {}
@@ -62,38 +64,32 @@ def benchmark_real(
             milliseconds = 1000 * (time.perf_counter() - start)
             # Not timed: a server takes up to twice as long to send labels.
             found, refused = _ask(client, scene, {**fields, "debug": True})
-            grasps = [] if found is None else found.grasps
-            seen = None if found is None else found.support
+            seen, labels = found.support, np.full(len(scene.points), UNLABELLED)
             plane = None if seen is None else (np.asarray(seen.normal, np.float64), seen.offset)
-            labels = np.full(len(scene.points), UNLABELLED)
-            if found is not None and found.objects:
+            if found.objects:
                 labels = np.asarray(found.debug.labels, np.int64)
             answer = np.maximum(labels + 1, 0)
-            figures = judge(scene, grasps, plane, answer, gripper, milliseconds, refused)
+            figures = judge(scene, found.grasps, plane, answer, gripper, milliseconds, refused)
             done[scene.name] = figures
             said = f"of the {figures.best} best {figures.on_object} on an object, plane: "
             title = f"{scene.name}: {refused or said + _plane_text(figures)}"
-            draw(output / f"{scene.name}.png", scene, grasps[:BEST], title)
+            draw(output / f"{scene.name}.png", scene, found.grasps[:BEST], title)
             draw_labels(output / f"{scene.name}-labels.png", scene, labels)
     _write(output, model.name, fields, done)
 
 
-def _ask(client: Any, scene: RealScene, fields: Mapping[str, Any]) -> tuple[Any | None, str]:
-    """The answer for a scene, or None and the reason if the request is refused."""
-    from edgegrasp_client import InvalidRequestError
-
+def _ask(client: Any, scene: RealScene, fields: Mapping[str, Any]) -> tuple[Any, str]:
+    """The answer for a scene; an empty one and the reason if the request is refused."""
     try:
         return client.detect(**scene.request, **fields), ""
     except (InvalidRequest, InvalidRequestError) as error:
-        return None, str(error)
+        return SimpleNamespace(grasps=[], support=None, objects=[]), str(error)
 
 
 def _write(
     output: Path, model: str, options: Mapping[str, Any], done: dict[str, SceneFigures]
 ) -> None:
     """Write results.json and the page, and print the table."""
-    from edgegrasp_sim.report import image, page, table
-
     total = summary(list(done.values()))
     scenes = {name: asdict(figures) for name, figures in done.items()}
     results = {"model": model, "options": dict(options), "all": total, "scenes": scenes}
@@ -157,8 +153,7 @@ def _grasp_table(done: Mapping[str, SceneFigures], total: Mapping[str, Any]) -> 
         rows.append((name, *counts, held, f"{one.milliseconds:.0f}"))
     of_best = (f"{_shares(total[name])} %" for name in SHARES)
     held = f"{total['objects_with_grasp']} of {total['objects']}"
-    rows.append(("all", str(total["best"]), *of_best, held, f"{total['milliseconds']:.0f}"))
-    return rows
+    return [*rows, ("all", str(total["best"]), *of_best, held, f"{total['milliseconds']:.0f}")]
 
 
 def _segmentation_table(done: Mapping[str, SceneFigures], total: Mapping[str, Any]) -> Rows:

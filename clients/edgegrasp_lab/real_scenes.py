@@ -37,7 +37,7 @@ class RealScene:
     request: Mapping[str, Any]  # the detector's input, as arguments of `GraspClient.detect`
     points: Float32  # (R, 3) NaN where there is no reading
     labels: Int64  # (R,) 0 anything else, 1 the support plane, 2 and up objects
-    normal: Float64 | None  # (3,) of the support plane, toward the camera; None: it is hidden
+    normal: Float64  # (3,) of the support plane, toward the camera; 0: it is hidden
     offset: float  # normal . x of its points
     camera: View
     rgb: NDArray[np.uint8] | None  # (H, W, 3)
@@ -55,7 +55,6 @@ class RealScene:
     @property
     def feet(self) -> Float64:
         """(K, 3) the middle of each object, projected onto the visible support plane."""
-        assert self.normal is not None
         middles = [
             np.nanmedian(self.points[self.labels == label], axis=0) for label in self.objects
         ]
@@ -189,7 +188,7 @@ def load_scene(file: Path) -> RealScene:
     checked = _Arrays(file.name, arrays)
     normal, offset = _plane(checked)
     try:
-        request, points = _cloud(checked)
+        request, points, camera = _cloud(checked)
     except InvalidRequest as error:
         raise ValueError(f"{file.name}: {error}") from None
     labels = checked.get("labels", "iu", "an integer from 0 for each row", points.shape[:-1])
@@ -201,15 +200,9 @@ def load_scene(file: Path) -> RealScene:
     rgb = arrays.get("rgb")
     if rgb is not None:
         checked.get("rgb", "u", "a colour of three bytes for each pixel", points.shape)
-    camera = None
-    if points.ndim == 3 and "intrinsics" in arrays:
-        intrinsics = checked.get("intrinsics", "fiu", "fx, fy, cx, cy", (4,))
-        camera = View((points.shape[0], points.shape[1]), *intrinsics.tolist())
-    elif points.ndim == 3:
-        camera = View.of_image(points)
     if camera is None:  # it is unknown, or could not have seen them
         seen = points[np.isfinite(points).all(axis=-1)].reshape(-1, 3)
-        camera, rgb = View.of(seen, np.zeros(3), (0, -1, 0) if normal is None else normal), None
+        camera, rgb = View.of(seen, np.zeros(3), normal if normal.any() else (0, -1, 0)), None
     flat = points.reshape(-1, 3)
     return RealScene(file.stem, request, flat, labels, normal, offset, camera, rgb)
 
@@ -229,9 +222,8 @@ def judge(
     on_object = _objects_held(scene, grasps)
     scores = np.array([grasp.score for grasp in grasps])
     well_held = {label for label in on_object[scores >= GOOD_SCORE] if label >= FIRST_OBJECT}
-    apart = scene.normal is not None
-    up = np.zeros(3) if scene.normal is None else scene.normal
-    upward = [float(grasp.approach_direction @ up) for grasp in best]
+    apart = bool(scene.normal.any())
+    upward = [float(grasp.approach_direction @ scene.normal) for grasp in best]
     called = answer if apart else np.minimum(answer, 1)
     return SceneFigures(
         grasps=len(grasps),
@@ -273,7 +265,6 @@ def _objects_held(scene: RealScene, grasps: Sequence[Any]) -> Int64:
 
 
 def _compare(scene: RealScene, normal: Array, offset: float) -> PlaneFigures:
-    assert scene.normal is not None
     cosine = float(np.clip(np.asarray(normal, dtype=np.float64) @ scene.normal, -1.0, 1.0))
     angle = float(np.degrees(np.arccos(cosine)))
     apart = float(np.abs(scene.feet @ normal - offset).max())
@@ -301,10 +292,10 @@ class _Arrays(NamedTuple):
         raise ValueError(f"{self.file}: {field}: got {value}. Save {wanted}.")
 
 
-def _plane(arrays: _Arrays) -> tuple[Float64 | None, float]:
-    """Normal (3,) and offset of the support plane; None and 0 if the file has neither."""
+def _plane(arrays: _Arrays) -> tuple[Float64, float]:
+    """Normal (3,) and offset of the support plane; 0 if the file has neither."""
     if not {"support_normal", "support_offset"} & arrays.arrays.keys():
-        return None, 0.0
+        return np.zeros(3), 0.0
     normal = arrays.get("support_normal", "fiu", "three numbers, of length 1", (3,))
     if not abs(np.linalg.norm(normal) - 1.0) <= 1e-3:  # nor NaN
         arrays.refuse("support_normal", f"length {np.linalg.norm(normal):g}", "a unit normal")
@@ -314,16 +305,19 @@ def _plane(arrays: _Arrays) -> tuple[Float64 | None, float]:
     return normal.astype(np.float64), offset
 
 
-def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32]:
-    """The detector's input, and the points (H, W, 3) or (N, 3), NaN without a reading."""
+def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32, View | None]:
+    """The detector's input, points (H, W, 3) or (N, 3), NaN without a reading, and the camera."""
     if "depth" in arrays.arrays:
         depth = arrays.get("depth", "u", "(H, W) uint16 millimetres")
         values = arrays.get("intrinsics", "fiu", "fx, fy, cx, cy beside depth", (4,)).tolist()
         view = DepthView(intrinsics_of(values))
         points = np.asarray(fuse_depth_images([depth], [view]).points, dtype=np.float32)
-        return {"depth_images": [{"depth": depth, "intrinsics": values}]}, points
+        camera = View((depth.shape[0], depth.shape[1]), *values)
+        return {"depth_images": [{"depth": depth, "intrinsics": values}]}, points, camera
     wanted = "(H, W, 3) or (N, 3) float32 metres, or depth and intrinsics"
     points = arrays.get("points", "f", wanted)
     if points.ndim not in (2, 3) or points.shape[-1] != 3:
         arrays.refuse("points", f"shape {points.shape}", wanted)
-    return {"cloud": points, "viewpoint": (0.0, 0.0, 0.0)}, points.astype(np.float32)
+    points = points.astype(np.float32)
+    request = {"cloud": points, "viewpoint": (0.0, 0.0, 0.0)}
+    return request, points, View.of_image(points) if points.ndim == 3 else None
