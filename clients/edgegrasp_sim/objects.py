@@ -203,7 +203,11 @@ def prepare_mesh(mesh: Path) -> Path:
         visible, hulls = ([(m.vertices, m.faces) for m in meshes] for meshes in ([surface], parts))
         write_parts("object", visible, hulls, solid.center_mass, solid.moment_inertia, folder)
 
-    return _kept_in(_digest(mesh), write) / "object.urdf"
+    # Everything that decides how it is prepared.
+    sizes = SHORTEST_SIDE, LONGEST_SIDE, CONCAVITY, OBJECT_MASS, OBJECT_FRICTION
+    recipe = LAYOUT, sizes, SEARCH, version("coacd"), mesh.suffix.lower()
+    digest = hashlib.sha256(repr(recipe).encode() + mesh.read_bytes()).hexdigest()
+    return _kept_in(digest, write) / "object.urdf"
 
 
 def cache_folder() -> Path:
@@ -313,13 +317,6 @@ def _kept_in(name: str, write: Callable[[Path], None]) -> Path:
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
     return folder
-
-
-def _digest(mesh: Path) -> str:
-    """SHA-256 of a mesh and of everything that decides how it is prepared."""
-    sizes = SHORTEST_SIDE, LONGEST_SIDE, CONCAVITY, OBJECT_MASS, OBJECT_FRICTION
-    recipe = LAYOUT, sizes, SEARCH, version("coacd"), mesh.suffix.lower()
-    return hashlib.sha256(repr(recipe).encode() + mesh.read_bytes()).hexdigest()
 
 
 def _read(mesh: Path) -> Any:
