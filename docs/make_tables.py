@@ -62,7 +62,7 @@ def _settings() -> Rows:
     for name, field in Settings.model_json_schema()["properties"].items():
         default = field.get("default")
         shown = "none" if default in (None, [], "") else f"`{json.dumps(default)}`"
-        yield [f"`{name}`", _kind(field), shown, field["description"]]
+        yield [f"`{name}`", _kind(field), shown, _text(field)]
 
 
 def _default(value: Any) -> str:

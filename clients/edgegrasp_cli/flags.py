@@ -101,8 +101,9 @@ def model_flags(
         if name in leave_out:
             continue
         flag_type, choices = _flag_type(field.annotation)
+        meaning = " ".join((field.description or "").split())
         option = typer.Option(
-            help=f"{field.description}{_default_text(field.default) if defaults else ''}",
+            help=f"{meaning}{_default_text(field.default) if defaults else ''}",
             show_default=False,
             metavar=choices,
             rich_help_panel=panel,

@@ -96,10 +96,22 @@ Quaternion = Annotated[
 ]
 
 
+def _in_one_line(schema: dict[str, Any]) -> None:
+    """Descriptions of fields without the line breaks of their docstrings."""
+    for part in schema.get("properties", {}).values():
+        if "description" in part:
+            part["description"] = " ".join(part["description"].split())
+
+
 class Strict(BaseModel):
     """Base of every option object: unknown fields are refused, instances are frozen."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        use_attribute_docstrings=True,
+        json_schema_extra=_in_one_line,
+    )
 
 
 def _ordered(corners: Tuple) -> Tuple:
@@ -261,11 +273,9 @@ class SupportPlane(Strict):
     kind: Literal["plane"] = "plane"
     normal: UnitVector = Field(description="unit normal, away from the table")
     offset: Finite = Field(description="normal . x of its points, metres")
-    max_depth_error: Annotated[float, Field(ge=0.0, le=0.3), numeric] = Field(
-        default=0.0,
-        description="greatest relative error of a camera's depths: each view is scaled about its "
-        "viewpoint by up to this, so that its table lies in the plane; 0: no correction",
-    )
+    max_depth_error: Annotated[float, Field(ge=0.0, le=0.3), numeric] = 0.0
+    """greatest relative error of a camera's depths: each view is scaled about its viewpoint by up
+    to this, so that its table lies in the plane; 0: no correction"""
 
     def heights(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
         """Heights (N,) of points (N, 3) over the plane, metres."""
@@ -321,17 +331,14 @@ class GripperGeometry(Strict):
     name: Name = Field(default="custom", description="shown in results")
     max_opening: HandLength = Field(description="metres between the open fingers' inner faces")
     tip_z: HandLength = Field(description="fingertips of the open gripper, metres along z")
-    contact_z: HandLength = Field(
-        description="contact, metres along z; between palm and fingertips"
-    )
+    contact_z: HandLength
+    """contact, metres along z; between palm and fingertips"""
     tcp_z: NearHand = Field(description="origin of the TCP frame, metres along z")
     hand: HandPart = Field(description="the hand without its fingers")
-    finger: HandPart = Field(
-        description="one finger, its inner face at y = 0; mirrored for the other"
-    )
-    swing: Linkage | None = Field(
-        default=None, description="how the fingers swing; null: they close in a straight line"
-    )
+    finger: HandPart
+    """one finger, its inner face at y = 0; mirrored for the other"""
+    swing: Linkage | None = None
+    """how the fingers swing; null: they close in a straight line"""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -391,11 +398,9 @@ class Suppression(Strict):
 class Collision(Strict):
     """Collision checks of the hand and its motion: cloud, support plane and obstacles."""
 
-    mode: CollisionMode = Field(
-        default="avoid",
-        description="avoid: grasps whose hand collides are left out; penalise: they are ranked by "
-        "half their score; ignore: collisions are not checked",
-    )
+    mode: CollisionMode = "avoid"
+    """avoid: grasps whose hand collides are left out; penalise: they are ranked by half their
+    score; ignore: collisions are not checked"""
     margin: Number = Field(default=0.0, ge=0.0, le=0.1)
     """metres by which the hand's boxes are grown on every side"""
     opening: HandLength | None = None
@@ -458,16 +463,12 @@ class PlaceRegion(Workspace):
 class Place(Strict):
     """Where the arm puts the object down: in one pose, or anywhere in a region."""
 
-    T_base_object: RigidPose | None = Field(
-        default=None,
-        description="pose of the object's box, as in `objects` of the answer, in the arm's base "
-        "frame: a 4 x 4 matrix, row by row",
-    )
-    region: PlaceRegion | None = Field(
-        default=None,
-        description="box for the whole object, which may be turned about the vertical; the base "
-        "frame's z must be up",
-    )
+    T_base_object: RigidPose | None = None
+    """pose of the object's box, as in `objects` of the answer, in the arm's base frame: a 4 x 4
+    matrix, row by row"""
+    region: PlaceRegion | None = None
+    """box for the whole object, which may be turned about the vertical; the base frame's z must be
+    up"""
 
     @model_validator(mode="after")
     def _one_of_two(self) -> Self:
@@ -487,11 +488,9 @@ class RobotArm(Strict):
     """the arm's joints now, radians or metres, in the order of the robot file"""
     plan: Literal["reach", "motion"] = "motion"
     """reach: joints at each pregrasp and grasp; motion: also a timed trajectory"""
-    place: Place | None = Field(
-        default=None,
-        description="where to put the object; a grasp is within reach only if this place is too; "
-        "null: the motion ends with the object lifted",
-    )
+    place: Place | None = None
+    """where to put the object; a grasp is within reach only if this place is too; null: the motion
+    ends with the object lifted"""
     avoid_unseen: StrictBool = False
     """whether unseen space behind a surface is an obstacle for the arm"""
 
@@ -524,17 +523,13 @@ class Previous(Strict):
 
     gripper: Name = Field(default="", description="name of the gripper in that answer")
     next_id: Row = Field(default=0, description="as in that answer")
-    grasps: tuple[PreviousGrasp, ...] = Field(
-        default=(), max_length=MAX_PREVIOUS, description="best first; the first is the one to keep"
-    )
-    objects: tuple[PreviousObject, ...] = Field(
-        default=(), max_length=MAX_PREVIOUS, description="objects of these grasps, and others"
-    )
-    search: StrictBool = Field(
-        default=True,
-        description="whether to detect other grasps too; false: these are only moved and scored "
-        "again, in a fraction of the time; then also send the `support` of that answer",
-    )
+    grasps: tuple[PreviousGrasp, ...] = Field(default=(), max_length=MAX_PREVIOUS)
+    """best first; the first is the one to keep"""
+    objects: tuple[PreviousObject, ...] = Field(default=(), max_length=MAX_PREVIOUS)
+    """objects of these grasps, and others"""
+    search: StrictBool = True
+    """whether to detect other grasps too; false: these are only moved and scored again, in a
+    fraction of the time; then also send the `support` of that answer"""
 
     @property
     def free_id(self) -> int:
@@ -620,32 +615,24 @@ class DetectOptions(Strict):
             BeforeValidator(_one_of_one),
         ]
         | None
-    ) = Field(
-        default=None,
-        description="camera position, metres; normals are oriented towards it. If there are "
-        "several, `view_ids` beside the cloud says which one saw each point",
-    )
-    up: Direction | None = Field(
-        default=None,
-        description="direction away from gravity; any length but zero; null: the support plane's "
-        "normal, else +z",
-    )
+    ) = None
+    """camera position, metres; normals are oriented towards it. If there are several, `view_ids`
+    beside the cloud says which one saw each point"""
+    up: Direction | None = None
+    """direction away from gravity; any length but zero; null: the support plane's normal, else
+    +z"""
     support: Annotated[
         SupportRequest | None,
         BeforeValidator(
             _kind_as_object, json_schema_input_type=SupportKind | SupportRequest | None
         ),
-    ] = Field(
-        default=AutoPlane(),
-        description="plane that the objects rest on and the hand stays above; a kind alone is "
-        "allowed; null: none",
-    )
-    objects: Literal["auto", "off"] | ObjectChoice = Field(
-        default="auto",
-        description="objects to grasp: those recognised (auto), some of them by number, or "
-        "everything above the support (off); all else is an obstacle. If segment_ids are sent, "
-        "those above 0 are the objects",
-    )
+    ] = AutoPlane()
+    """plane that the objects rest on and the hand stays above; a kind alone is allowed; null:
+    none"""
+    objects: Literal["auto", "off"] | ObjectChoice = "auto"
+    """objects to grasp: those recognised (auto), some of them by number, or everything above the
+    support (off); all else is an obstacle. If segment_ids are sent, those above 0 are the
+    objects"""
     at: Pixel | None = None
     """pixel of the image; grasps are for the object at this pixel"""
     near: Vector | None = None
@@ -676,18 +663,13 @@ class DetectOptions(Strict):
     """grasps returned at most"""
     suppression: Suppression | None = Suppression()
     """non-maximum suppression; null: none"""
-    order: Literal["score", "highest", "clearance"] = Field(
-        default="score",
-        description="score: first, for each object with a grasp of 0.5 or more, one surrounded by "
-        "other good ones; then by score, and by the pose of the hand where scores are close. "
-        "highest: scores of 0.9 or more by height of the TCP along up, then the others by score. "
-        "clearance: by clearance",
-    )
-    previous: Previous | None = Field(
-        default=None,
-        description="grasps and objects of an earlier answer, which keep their ids, numbers and "
-        "order; an empty object for the first image; null: no tracking",
-    )
+    order: Literal["score", "highest", "clearance"] = "score"
+    """score: first, for each object with a grasp of 0.5 or more, one surrounded by other good ones;
+    then by score, and by the pose of the hand where scores are close. highest: scores of 0.9 or
+    more by height of the TCP along up, then the others by score. clearance: by clearance"""
+    previous: Previous | None = None
+    """grasps and objects of an earlier answer, which keep their ids, numbers and order; an empty
+    object for the first image; null: no tracking"""
     debug: StrictBool = False
     """whether to return the processed cloud and every candidate"""
 

@@ -208,9 +208,8 @@ class Depth(Strict):
 
     height: Size = Field(default=0, description="pixels; not needed of a PNG, like the width")
     width: Size = 0
-    encoding: Literal["32FC1", "64FC1", "16UC1", "png"] = Field(
-        description="32FC1 or 64FC1, metres; 16UC1 or a 16-bit PNG file, millimetres"
-    )
+    encoding: Literal["32FC1", "64FC1", "16UC1", "png"]
+    """32FC1 or 64FC1, metres; 16UC1 or a 16-bit PNG file, millimetres"""
     data: Bytes = Field(description="packed little-endian pixels or the file, as base64 in JSON")
 
 

@@ -31,11 +31,9 @@ class Settings(BaseModel):
 
     host: str = "127.0.0.1"
     """address for HTTP and gRPC; unix:FOLDER: sockets http.sock and grpc.sock in a folder"""
-    allowed_hosts: tuple[str, ...] = Field(
-        (),
-        description="names accepted in the Host header; *: any; none: any if tokens are set, else "
-        "addresses and names without a dot",
-    )
+    allowed_hosts: tuple[str, ...] = ()
+    """names accepted in the Host header; *: any; none: any if tokens are set, else addresses and
+    names without a dot"""
     http_port: Port = 8000
     """port for HTTP; 0: any free port"""
     grpc_port: Port = 50051
