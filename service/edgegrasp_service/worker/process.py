@@ -26,7 +26,6 @@ import traceback
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
@@ -144,6 +143,24 @@ def receive(file: BinaryIO) -> Any:
     return unpack(file.read(length), file.read(body_length))
 
 
+async def received(reader: asyncio.StreamReader) -> Any:
+    """As `receive`, in the front."""
+    try:
+        length, body_length = HEADER.unpack(await reader.readexactly(HEADER.size))
+        text = await reader.readexactly(length)
+        return unpack(text, await reader.readexactly(body_length))
+    except (asyncio.IncompleteReadError, OSError):
+        return None
+
+
+async def _ready(reader: asyncio.StreamReader) -> Ready:
+    """The first message of a process; raises InvalidSettings if it could not load."""
+    ready: Ready | None = await received(reader)
+    if ready is None or ready.failure:
+        raise InvalidSettings(ready.failure if ready else "a process died as it started")
+    return ready
+
+
 # The pool
 
 
@@ -201,7 +218,7 @@ class WorkerPool:
         while not self._idle.empty():
             self._idle.get_nowait()
         self.models, self.robots = workers[0].ready.models, workers[0].ready.robots
-        nursery.watch(lambda: self._nursery_lost(nursery))
+        self.spawn(self._watch(nursery))
         for worker in workers:
             self.spawn(self._tend(worker))
         if old_nursery is None:
@@ -253,7 +270,7 @@ class WorkerPool:
                     worker.close()  # there are newer ones
                 elif not worker.killed:  # its last answer may arrive after that
                     self._idle.put_nowait(worker)
-                answer = await worker.receive()
+                answer = await received(worker.reader)
                 if answer is None:
                     break
                 worker.finish(answer)
@@ -296,10 +313,12 @@ class WorkerPool:
                 logger.error("a dead process cannot be replaced yet: %s", error)
                 await asyncio.sleep(RETRY_SECONDS)
 
-    def _nursery_lost(self, nursery: "Nursery") -> None:
-        """Load the weights again in a new nursery; the workers continue meanwhile."""
-        logger.error("the process that workers fork from died; weights are loaded again")
-        self.spawn(self._until_done(nursery, self.start))
+    async def _watch(self, nursery: "Nursery") -> None:
+        """When a nursery dies, load the weights again in a new one; the workers go on meanwhile."""
+        await nursery.watch()
+        if nursery is self._nursery:
+            logger.error("the process that workers fork from died; weights are loaded again")
+            await self._until_done(nursery, self.start)
 
 
 class Nursery:
@@ -311,34 +330,23 @@ class Nursery:
             environment = KEPT_MEMORY | os.environ | dict.fromkeys(ONE_THREAD, "1")
             words = [*(command or NURSERY), settings.model_dump_json()]
             self._process = subprocess.Popen(words, stdin=theirs.fileno(), env=environment)
+        self._writer: asyncio.StreamWriter | None = None  # once it has loaded
         # Whether each ended worker, by process id, ended by itself.
         self._crashed: defaultdict[int, asyncio.Future[bool]] = defaultdict(asyncio.Future)
 
     async def loaded(self) -> None:
         """Wait until it has loaded; raises InvalidSettings on failure."""
-        ready = await asyncio.to_thread(receive, self._control.makefile("rb"))
-        if ready is None or ready.failure:
-            raise InvalidSettings(ready.failure if ready else "the process that loads weights died")
-        self.pid = ready.pid
-        self._control.setblocking(False)
+        self._reader, self._writer = await asyncio.open_unix_connection(sock=self._control)
+        self.pid = (await _ready(self._reader)).pid
 
-    def watch(self, lost: Callable[[], None]) -> None:
-        """Call `lost` when the nursery dies."""
-        loop = asyncio.get_running_loop()
-
-        def readable() -> None:
-            ended = b""
-            with contextlib.suppress(OSError):
-                ended = self._control.recv(ENDED.size * 64)
-            for pid, status in ENDED.iter_unpack(ended[: len(ended) // ENDED.size * ENDED.size]):
+    async def watch(self) -> None:
+        """Note how its workers end, until it dies itself."""
+        with contextlib.suppress(asyncio.IncompleteReadError, OSError):
+            while True:
+                pid, status = ENDED.unpack(await self._reader.readexactly(ENDED.size))
                 crashed = os.WIFSIGNALED(status) and os.WTERMSIG(status) in CRASHES
                 if not self._crashed[pid].done():
                     self._crashed[pid].set_result(crashed or os.WIFEXITED(status))
-            if not ended:
-                loop.remove_reader(self._control)
-                lost()
-
-        loop.add_reader(self._control, readable)
 
     async def crashed(self, pid: int) -> bool:
         """Whether a dead worker crashed or exited, and was not killed."""
@@ -365,11 +373,9 @@ class Nursery:
 
     def close(self) -> None:
         """Kill the nursery; the workers that it forked continue."""
-        with contextlib.suppress(RuntimeError, ValueError):
-            asyncio.get_running_loop().remove_reader(self._control)
         self._process.kill()
         self._process.wait()
-        self._control.close()
+        (self._writer or self._control).close()
 
 
 class _Worker:
@@ -378,7 +384,7 @@ class _Worker:
     def __init__(self, nursery: Nursery) -> None:
         self.nursery = nursery
         self.pid = 0
-        self.ready: Any = None  # the message that it sent when it had loaded
+        self.ready = Ready(0, [])  # the message that it sent when it had loaded
         self.answer: asyncio.Future[Answer] | None = None  # of the job that it works on
         self._writer: asyncio.StreamWriter | None = None
         self.killed = False
@@ -386,20 +392,9 @@ class _Worker:
     async def start(self) -> None:
         """Fork the worker and wait until it is ready; raises InvalidSettings if it cannot load."""
         ours = self.nursery.fork()
-        self._reader, self._writer = await asyncio.open_unix_connection(sock=ours)
-        ready = await self.receive()
-        if ready is None or ready.failure:
-            raise InvalidSettings(ready.failure if ready else "a worker died as it started")
-        self.pid, self.ready = ready.pid, ready
-
-    async def receive(self) -> Any:
-        """The worker's next message; None when it has ended."""
-        try:
-            length, body_length = HEADER.unpack(await self._reader.readexactly(HEADER.size))
-            text = await self._reader.readexactly(length)
-            return unpack(text, await self._reader.readexactly(body_length))
-        except (asyncio.IncompleteReadError, OSError):
-            return None
+        self.reader, self._writer = await asyncio.open_unix_connection(sock=ours)
+        self.ready = await _ready(self.reader)
+        self.pid = self.ready.pid
 
     async def run(self, job: Job, deadline: float) -> Answer:
         """Run a job until a deadline of the event loop's clock; if cancelled, soon kill it.
@@ -456,13 +451,9 @@ def main(settings_json: str, load: Callable[[Settings], Any] | None = None) -> N
     from edgegrasp_service.worker.answer import load_catalogue
 
     pool, settings = socket.socket(fileno=0), Settings(**json.loads(settings_json))
-    loading = partial(load or load_catalogue, settings)
-    try:
-        # A GPU's context cannot be forked: with one, every worker loads the weights for itself.
-        catalogue = loading() if settings.device == "cpu" else None
-    except (EdgeGraspError, ModuleNotFoundError) as error:
-        _send(pool, Ready(os.getpid(), [], str(error)))
-        return
+    load = load or load_catalogue
+    # A GPU's context cannot be forked: with one, every worker loads the weights for itself.
+    catalogue = _loaded(pool, settings, load) if settings.device == "cpu" else None
     _send(pool, Ready(os.getpid(), []))
     signal.signal(signal.SIGCHLD, lambda *_: _tell_of_ended(pool))
     gc.freeze()  # collecting garbage would write to shared pages
@@ -474,7 +465,7 @@ def main(settings_json: str, load: Callable[[Settings], Any] | None = None) -> N
             try:
                 signal.signal(signal.SIGCHLD, signal.SIG_DFL)
                 pool.close()
-                _work(socket.socket(fileno=descriptors[0]), settings, catalogue, loading)
+                _work(socket.socket(fileno=descriptors[0]), settings, catalogue, load)
             except Exception:
                 traceback.print_exc()
             finally:
@@ -488,17 +479,22 @@ def _tell_of_ended(pool: socket.socket) -> None:
             pool.send(ENDED.pack(*ended), socket.MSG_DONTWAIT)
 
 
+def _loaded(pool: socket.socket, settings: Settings, load: Callable[[Settings], Any]) -> Any:
+    """Load what answers requests; if that fails, tell the pool why and end this process."""
+    try:
+        return load(settings)
+    except (EdgeGraspError, ModuleNotFoundError) as error:
+        _send(pool, Ready(os.getpid(), [], str(error)))
+        sys.exit()
+
+
 def _work(
-    pool: socket.socket, settings: Settings, catalogue: Any, loading: Callable[[], Any]
+    pool: socket.socket, settings: Settings, catalogue: Any, load: Callable[[Settings], Any]
 ) -> None:
     """Answer jobs, one after the other, until the pool closes the socket."""
     from edgegrasp_service.worker.answer import answer, load_robots
 
-    try:
-        catalogue = catalogue or loading()
-    except (EdgeGraspError, ModuleNotFoundError) as error:
-        _send(pool, Ready(os.getpid(), [], str(error)))
-        return
+    catalogue = catalogue or _loaded(pool, settings, load)
     robots = [robot.describe() for robot in load_robots(settings).values()]
     with limited_memory(settings.max_worker_bytes):
         _send(pool, Ready(os.getpid(), catalogue.describe(), robots=robots))
