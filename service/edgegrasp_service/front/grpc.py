@@ -36,17 +36,7 @@ from grpc_reflection.v1alpha import reflection, reflection_pb2
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
-from edgegrasp_service.errors import (
-    STOPPING,
-    AddressInUse,
-    Cancelled,
-    HeadersTooLarge,
-    NotReady,
-    Problem,
-    RequestTimeout,
-    no_message,
-    report,
-)
+from edgegrasp_service import errors
 from edgegrasp_service.front.service import MAX_HEADERS, GraspService, Places
 from edgegrasp_service.observability import LONG, REQUEST_ID_HEADER, Call, network_of
 from edgegrasp_service.settings import UNIX, Settings
@@ -135,7 +125,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
             else:
                 port = self.server.add_secure_port(place, tls.grpc)
         except RuntimeError as error:
-            raise AddressInUse("gRPC", place, str(error)) from None
+            raise errors.AddressInUse("gRPC", place, str(error)) from None
         return (place, 0) if sockets else (f"{host}:{port}", port)
 
     async def trim(self, others: Sized) -> None:
@@ -174,20 +164,20 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                 context.set_trailing_metadata(name)
                 if len(metadata) > MAX_HEADERS:
                     value, fix = f"{len(metadata)} entries", f"Send at most {MAX_HEADERS}."
-                    raise HeadersTooLarge("metadata", value, fix)
+                    raise errors.HeadersTooLarge("metadata", value, fix)
                 if not path.startswith(f"/{HEALTH}/"):
                     self._service.authorize(call, headers.get("authorization"))
                 if method in LONG:
                     await context.send_initial_metadata(name)
                 await behave(call, context)
-            except Cancelled:
+            except errors.Cancelled:
                 raise asyncio.CancelledError from None  # an error could not be sent either
             except aio.AbortError:
                 raise
             except Exception as error:
                 if not isinstance(error, EdgeGraspError):
                     logger.exception("%s failed", method)
-                await _abort(call, context, report(error))
+                await _abort(call, context, errors.report(error))
 
     async def _answer(self, method: Method, call: Call, context: Any) -> None:
         service, remaining = self._service, context.time_remaining()
@@ -231,7 +221,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                     )
                     if not done:
                         value = f"no message in {timeout:.0f} s"
-                        raise RequestTimeout("request", value, "Open another stream.")
+                        raise errors.RequestTimeout("request", value, "Open another stream.")
                     if ahead and ahead[0].done():
                         response = ahead.popleft().result()
                         async with service.sending(len(response)):
@@ -245,7 +235,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                         reading.cancel()
                         reading = None
                 if stopping.done():
-                    raise NotReady(STOPPING)
+                    raise errors.NotReady(errors.STOPPING)
         finally:
             for task in (stopping, reading, *ahead):
                 if task is not None:
@@ -275,7 +265,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(WATCH_SECONDS):
                         await self._service.stopping.wait()
-        raise NotReady(STOPPING)
+        raise errors.NotReady(errors.STOPPING)
 
     async def _reflect(self, call: Call, context: Any) -> None:
         async def requests() -> AsyncIterator[Any]:
@@ -283,7 +273,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                 try:
                     request = reflection_pb2.ServerReflectionRequest.FromString(data)
                 except DecodeError:
-                    raise no_message(data) from None
+                    raise errors.no_message(data) from None
                 yield request
 
         async with self._watchers.hold(call.client):
@@ -292,7 +282,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
 
 
 async def _unimplemented(call: Call, context: Any) -> None:
-    problem = Problem("grpc", "Method not found!", "", "", "", "UNIMPLEMENTED", 404)
+    problem = errors.Problem("grpc", "Method not found!", "", "", "", "UNIMPLEMENTED", 404)
     await _abort(call, context, problem)
 
 
@@ -301,7 +291,7 @@ def _serialized(message: Any) -> bytes:
     return data
 
 
-async def _abort(call: Call, context: Any, problem: Problem) -> NoReturn:
+async def _abort(call: Call, context: Any, problem: errors.Problem) -> NoReturn:
     """End a call with an error: our ErrorDetail, google.rpc's details and the request id."""
     call.problem = problem
     code = grpc.StatusCode[problem.code]
@@ -327,7 +317,7 @@ async def _abort(call: Call, context: Any, problem: Problem) -> NoReturn:
     raise AssertionError("abort raises")
 
 
-def error_detail(problem: Problem) -> grasp_pb2.ErrorDetail:
+def error_detail(problem: errors.Problem) -> grasp_pb2.ErrorDetail:
     """An error as the message of edgegrasp.v1."""
     names = [field.name for field in grasp_pb2.ErrorDetail.DESCRIPTOR.fields]
     return grasp_pb2.ErrorDetail(**{name: getattr(problem, name) for name in names})
@@ -360,7 +350,7 @@ async def _next_request(context: Any) -> dict[str, Any] | None:
             place += size
     except (LookupError, UnicodeDecodeError):
         pass
-    raise no_message(data)
+    raise errors.no_message(data)
 
 
 def _varint(data: bytes, place: int) -> tuple[int, int]:

@@ -26,17 +26,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, brief
 from edgegrasp_model.gripper import gripper_names, load_gripper
-from edgegrasp_service.errors import (
-    Cancelled,
-    HeadersTooLarge,
-    InvalidSettings,
-    Overloaded,
-    Problem,
-    RequestTimeout,
-    UnsupportedMediaType,
-    problem_document,
-    report,
-)
+from edgegrasp_service import errors
 from edgegrasp_service.front.service import MAX_HEADERS, GraspService, Place, Places
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics, network_of
 from edgegrasp_service.settings import Settings
@@ -141,7 +131,7 @@ class HttpMiddleware:
                 if not isinstance(error, EdgeGraspError | HTTPException):
                     logger.exception("%s failed", method)
                 if call.code:  # half an answer is sent: the client must see that it is incomplete
-                    call.problem, call.code = report(error), ""
+                    call.problem, call.code = errors.report(error), ""
                     scope["state"]["abort"]()
                     await _disconnected(receive, call)
                 else:
@@ -155,7 +145,7 @@ class HttpMiddleware:
         most = settings.max_header_bytes
         if count > MAX_HEADERS or size > most:
             fix = f"Send at most {MAX_HEADERS}, of {most} bytes."
-            raise HeadersTooLarge("headers", f"{count} entries of {size} bytes", fix)
+            raise errors.HeadersTooLarge("headers", f"{count} entries of {size} bytes", fix)
         # A name that a web page points at this server is refused. Nobody can register one without a
         # dot, or with a number at its end.
         host = headers.get("host", "")
@@ -171,7 +161,7 @@ class HttpMiddleware:
             self._service.authorize(call, headers.get("authorization"))
         if (encoding := headers.get("content-encoding", "identity").lower()) != "identity":
             fix = "Send the body as it is; .npz and .pcd files may be compressed inside."
-            raise UnsupportedMediaType("Content-Encoding", repr(encoding[:40]), fix)
+            raise errors.UnsupportedMediaType("Content-Encoding", repr(encoding[:40]), fix)
 
 
 def create_router(service: GraspService, metrics: Metrics) -> Router:
@@ -225,7 +215,8 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
         ]
         if (folder := settings.samples) is not None:
             if not folder.is_dir():
-                raise InvalidSettings(f"samples: got {str(folder)!r}, which is not a folder.")
+                why = f"samples: got {str(folder)!r}, which is not a folder."
+                raise errors.InvalidSettings(why)
             routes.append(Mount(f"{PLAYGROUND}samples", StaticFiles(directory=folder)))
         routes.append(Mount(PLAYGROUND, StaticFiles(directory=PLAYGROUND_FILES)))
     return Router(routes, redirect_slashes=False)
@@ -249,7 +240,7 @@ class _Work:
             while more:
                 message = await service.receive(receive(), len(body), start)
                 if message["type"] == "http.disconnect":
-                    raise Cancelled("The client left before its request was whole.")
+                    raise errors.Cancelled("The client left before its request was whole.")
                 body += message.get("body", b"")
                 service.check_size(len(body))
                 more = message.get("more_body", False)
@@ -271,7 +262,7 @@ async def _disconnected(receive: Receive, call: Call) -> None:
     """Wait until the client has disconnected, then end its request."""
     while (await receive())["type"] != "http.disconnect":
         pass
-    call.refuse(Cancelled("The client left."))
+    call.refuse(errors.Cancelled("The client left."))
 
 
 def requested_timeout(headers: Headers) -> float:
@@ -285,23 +276,23 @@ def requested_timeout(headers: Headers) -> float:
     return timeout
 
 
-def _problem_response(call: Call, problem: Problem) -> Response:
+def _problem_response(call: Call, problem: errors.Problem) -> Response:
     call.problem = problem
     headers = {}
     if problem.retry_after is not None:
         headers["retry-after"] = str(math.ceil(problem.retry_after))
     if problem.status == 401:
         headers["www-authenticate"] = CHALLENGE
-    document = problem_document(problem)
+    document = errors.problem_document(problem)
     return Response(document, problem.status, headers, "application/problem+json")
 
 
 def _error_response(call: Call, scope: Scope, error: Exception) -> Response:
     if not isinstance(error, HTTPException):
-        return _problem_response(call, report(error))
+        return _problem_response(call, errors.report(error))
     # Of the routing itself: no such path, no such method.
     detail = f"{scope['method']} {scope['path']}: {error.detail}. See /docs."
-    problem = Problem("http", detail, "", "", "", "", error.status_code)
+    problem = errors.Problem("http", detail, "", "", "", "", error.status_code)
     response = _problem_response(call, problem)
     response.headers.update(error.headers or {})
     return response
@@ -329,7 +320,7 @@ class HttpProtocol(HttpToolsProtocol):
         try:
             owner = network_of(self.client[0] if self.client else "")
             self._place = self._places.take(owner, transport.abort)
-        except Overloaded as error:
+        except errors.Overloaded as error:
             self._refuse(error)
 
     def data_received(self, data: bytes) -> None:
@@ -343,7 +334,7 @@ class HttpProtocol(HttpToolsProtocol):
             self._header_bytes = 0
         elif self._header_bytes > self._settings.max_header_bytes:
             most = f"Send at most {self._settings.max_header_bytes}."
-            self._refuse(HeadersTooLarge("headers", f"{self._header_bytes} bytes", most))
+            self._refuse(errors.HeadersTooLarge("headers", f"{self._header_bytes} bytes", most))
 
     def on_message_begin(self) -> None:
         """Prepare for a new request, whose headers must come in time."""
@@ -355,7 +346,7 @@ class HttpProtocol(HttpToolsProtocol):
             seconds = self._settings.read_seconds
             late = "headers", f"not whole in {seconds:g} s", "Send them at once."
             self._header_timer = self.loop.call_later(
-                seconds, lambda: self._refuse(RequestTimeout(*late))
+                seconds, lambda: self._refuse(errors.RequestTimeout(*late))
             )
 
     def on_headers_complete(self) -> None:
@@ -403,8 +394,8 @@ class HttpProtocol(HttpToolsProtocol):
         if pending and self.cycle.response_started:
             self.transport.abort()  # it has half an answer
             return
-        problem = report(error)
-        body = problem_document(problem)
+        problem = errors.report(error)
+        body = errors.problem_document(problem)
         head = (
             f"HTTP/1.1 {problem.status} {problem.kind}\r\n"
             "content-type: application/problem+json\r\n"

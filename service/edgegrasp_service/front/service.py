@@ -18,19 +18,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from edgegrasp_model.errors import EdgeGraspError
-from edgegrasp_service.errors import (
-    STOPPING,
-    Cancelled,
-    DeadlineExceeded,
-    HarmfulRequest,
-    NotReady,
-    Overloaded,
-    PayloadTooLarge,
-    PermissionDenied,
-    ReloadFailed,
-    RequestTimeout,
-    report,
-)
+from edgegrasp_service import errors
 from edgegrasp_service.observability import CALL, Call, Metrics, log_call
 from edgegrasp_service.recording import Recorder
 from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens
@@ -76,9 +64,9 @@ class GraspService:
     def loaded(self) -> WorkerPool:
         """The workers; raises NotReady while weights are loading or the server is stopping."""
         if self.stopping.is_set():
-            raise NotReady(STOPPING)
+            raise errors.NotReady(errors.STOPPING)
         if not self.pool.models:
-            raise NotReady("Weights are still loading. Try again in some seconds.")
+            raise errors.NotReady("Weights are still loading. Try again in some seconds.")
         return self.pool
 
     @contextmanager
@@ -89,8 +77,9 @@ class GraspService:
         try:
             yield
         except BaseException as error:
-            gone = Cancelled("The caller cancelled the request.")
-            call.problem = call.problem or report(error if isinstance(error, Exception) else gone)
+            gone = errors.Cancelled("The caller cancelled the request.")
+            known = error if isinstance(error, Exception) else gone
+            call.problem = call.problem or errors.report(known)
             raise
         finally:
             self.in_flight -= 1
@@ -144,7 +133,7 @@ class GraspService:
         if self._deaths:
             _, deaths = self._deaths.get(await asyncio.to_thread(_digest, job), (0.0, 0))
             if deaths >= MOST_DEATHS:
-                raise HarmfulRequest()
+                raise errors.HarmfulRequest()
         worker = await self.pool.take()
         call.end_stage("wait")
         call.at_work, began = True, time.monotonic()
@@ -179,7 +168,7 @@ class GraspService:
         except TimeoutError:
             fix = f"Send at least {slowest} bytes a second."
             value = f"{received} bytes in {seconds:.0f} s"
-            raise RequestTimeout("body", value, fix) from None
+            raise errors.RequestTimeout("body", value, fix) from None
 
     @asynccontextmanager
     async def sending(self, size: int) -> AsyncIterator[None]:
@@ -189,7 +178,7 @@ class GraspService:
             async with asyncio.timeout(seconds):
                 yield
         except TimeoutError:
-            raise Cancelled(f"The client did not take {size} bytes.") from None
+            raise errors.Cancelled(f"The client did not take {size} bytes.") from None
 
     async def _note_deaths(self, job: Job, answer: Answer) -> None:
         """Count the workers that a request has killed; forget them once it is answered."""
@@ -210,8 +199,9 @@ class GraspService:
             async with asyncio.timeout(grace):
                 return await self.admission.empty()
         logger.warning("grace is over: requests in flight are abandoned")
+        late = errors.NotReady("The server stopped before there was an answer. Try another one.")
         for call in self.admission.calls:
-            call.refuse(NotReady("The server stopped before there was an answer. Try another one."))
+            call.refuse(late)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(SEND_SECONDS):
                 await self.admission.empty()
@@ -228,10 +218,10 @@ class GraspService:
                 way.
         """
         if call is not None and not call.is_admin:  # however its path is spelled
-            raise PermissionDenied(HEADER, "no token of an administrator", ADMIN_FIX)
+            raise errors.PermissionDenied(HEADER, "no token of an administrator", ADMIN_FIX)
         self.loaded()
         if self._reloading.locked():
-            raise ReloadFailed("A reload is under way already. Try again later.")
+            raise errors.ReloadFailed("A reload is under way already. Try again later.")
         async with self._reloading:
             try:
                 tokens = Tokens(self.settings)
@@ -242,7 +232,7 @@ class GraspService:
                 known = isinstance(error, EdgeGraspError)
                 logger.error("reload failed: %s", error, exc_info=not known)
                 why = error if known else "The log says why."
-                raise ReloadFailed(f"The old weights still serve. {why}") from None
+                raise errors.ReloadFailed(f"The old weights still serve. {why}") from None
             self.tokens = tokens
             if self.tls and certificates:
                 self.tls.use(certificates)
@@ -256,7 +246,7 @@ class GraspService:
         most = self.settings.max_body_bytes
         if size > most:
             fix = f"Send at most {most} bytes, e.g. float32 points or a downsampled cloud."
-            raise PayloadTooLarge("body", f"{size} bytes", fix)
+            raise errors.PayloadTooLarge("body", f"{size} bytes", fix)
 
 
 def _digest(job: Job) -> bytes:
@@ -298,7 +288,7 @@ class Admission:
         """
         remaining = call.deadline - asyncio.get_running_loop().time()
         if remaining <= 0.0:
-            raise DeadlineExceeded()
+            raise errors.DeadlineExceeded()
         if self.calls and (wait := self._estimated_wait) * MARGIN > remaining:
             raise self._overloaded(
                 f"{len(self.calls)} requests come first, which take about {wait:.3g} s, and "
@@ -320,7 +310,7 @@ class Admission:
         except TimeoutError:
             if not call.timeout.expired():
                 raise
-            raise call.refusal or DeadlineExceeded() from None
+            raise call.refusal or errors.DeadlineExceeded() from None
         finally:
             call.timeout = None
             if call in self.calls:  # not refused
@@ -375,9 +365,9 @@ class Admission:
         ahead = sum("read" in call.stages for call in self.calls)  # others' bodies may be late
         return max(0, ahead + 1 - self._workers) * pace / self._workers
 
-    def _overloaded(self, why: str) -> Overloaded:
+    def _overloaded(self, why: str) -> errors.Overloaded:
         seconds = max(1, math.ceil(self._estimated_wait))  # as the header Retry-After has them
-        return Overloaded(f"The server is busy: {why}. Try again in {seconds} s.", seconds)
+        return errors.Overloaded(f"The server is busy: {why}. Try again in {seconds} s.", seconds)
 
     async def _reserve(self, call: Call, size: int) -> None:
         """Wait until the limits of all clients and of this client leave room for so many bytes."""
@@ -434,7 +424,7 @@ class Places:
                 if place.idle and (place.used <= since or counts[place.owner] > mine)
             ]
             if not idle:
-                raise Overloaded(f"All {self._most} places are in use. Try again in 1 s.")
+                raise errors.Overloaded(f"All {self._most} places are in use. Try again in 1 s.")
             greedy = Counter(place.owner for place in idle).most_common(1)[0][0]
             evicted = next(place for place in idle if place.owner == greedy)
             self.release(evicted)
@@ -448,7 +438,7 @@ class Places:
         if place.idle and not idle and self._spare:
             busy = sum(not other.idle for other in self.taken)
             if busy >= self._most - self._spare:
-                raise Overloaded(f"{busy} connections have requests. Try again in 1 s.")
+                raise errors.Overloaded(f"{busy} connections have requests. Try again in 1 s.")
         place.idle, place.used = idle, time.monotonic()
         if place in self.taken:
             self.taken[place] = self.taken.pop(place)
@@ -475,4 +465,4 @@ class Places:
         except TimeoutError:
             if not eviction.expired():
                 raise
-            raise Overloaded("Another client got this place. Try again in 1 s.") from None
+            raise errors.Overloaded("Another client got this place. Try again in 1 s.") from None

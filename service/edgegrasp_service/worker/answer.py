@@ -45,14 +45,7 @@ from edgegrasp_model.request_cloud import (
 )
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Detection, Scoring, plain
-from edgegrasp_service import recording
-from edgegrasp_service.errors import (
-    DeadlineExceeded,
-    PayloadTooLarge,
-    UnsupportedMediaType,
-    no_message,
-    report,
-)
+from edgegrasp_service import errors, recording
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.process import Answer, Facts, Job, Transport, limited_memory
 
@@ -132,13 +125,13 @@ def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
             body = write(job.transport, result)
         return Answer(body, facts)
     except EdgeGraspError as error:
-        problem = report(error)
+        problem = errors.report(error)
     except Exception as error:
         # PyTorch raises an error of its own for each kind of device.
         torch_error = type(error).__name__ == "OutOfMemoryError"
         if isinstance(error, MemoryError) or torch_error or "can't allocate memory" in str(error):
             raise MemoryError(str(error)) from None
-        problem = report(error)
+        problem = errors.report(error)
         facts.traceback = traceback.format_exc()
         if work.options is not None:  # rows in it may be millions
             facts.options = work.options.model_dump_json(exclude_defaults=True)[:2000]
@@ -161,7 +154,7 @@ class _Work:
         kind, path = self.job.content_type, self.settings.outcomes_file
         if not kind.lower().startswith(JSON):  # foreign web pages cannot send it
             fix = f"Send {JSON}."
-            raise UnsupportedMediaType("Content-Type", repr(kind[:40]), fix)
+            raise errors.UnsupportedMediaType("Content-Type", repr(kind[:40]), fix)
         if path is None:  # Ray has this path without the setting too
             raise InvalidRequest("path", "/v1/outcomes", "Set the setting `outcomes_file`.")
         fields = read_json("body", self.job.body)
@@ -213,12 +206,12 @@ class _Work:
                 cloud, options = decode_cloud(fields, options, in_time)
         except MemoryError:
             value, fix = f"{size} bytes that take too much memory to read", "Send packed arrays."
-            raise PayloadTooLarge("body", value, fix) from None
-        except PayloadTooLarge as error:
+            raise errors.PayloadTooLarge("body", value, fix) from None
+        except errors.PayloadTooLarge as error:
             if in_time == most:
                 raise
             why = f"{error.value} take longer than the deadline allows. Send fewer, or allow more."
-            raise DeadlineExceeded(f"{error.field}: {why}") from None
+            raise errors.DeadlineExceeded(f"{error.field}: {why}") from None
         points = cloud.points
         self.facts.points = points.size // 3 if isinstance(points, np.ndarray) else 0
         return detector, cloud, options, given
@@ -233,7 +226,7 @@ class _Work:
         """Time a stage; raises DeadlineExceeded instead of starting it too late."""
         start = time.monotonic()
         if start > self.deadline:
-            raise DeadlineExceeded()
+            raise errors.DeadlineExceeded()
         try:
             yield
         finally:
@@ -277,7 +270,7 @@ def read_request(job: Job) -> dict[str, Any]:
     accepted = (JSON, FORM) if scores else (JSON, *FILE_TYPES, FORM)
     if media_type not in accepted:
         fix = f"Send one of: {', '.join(accepted)}."
-        raise UnsupportedMediaType("Content-Type", repr(media_type), fix)
+        raise errors.UnsupportedMediaType("Content-Type", repr(media_type), fix)
     try:
         parameters = parse_qsl(job.query, True, max_num_fields=MAX_QUERY_FIELDS)
     except ValueError:
@@ -420,7 +413,7 @@ def _fields_of_message(job: Job) -> dict[str, Any]:
     try:
         message = kind.FromString(job.body)
     except DecodeError:
-        raise no_message(job.body) from None
+        raise errors.no_message(job.body) from None
     fields: dict[str, Any] = {"options": {}, **_plain(message, "request")}
     if "encoded" in fields:
         fields["cloud"] = fields.pop("encoded")

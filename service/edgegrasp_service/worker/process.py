@@ -30,13 +30,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from edgegrasp_model.errors import EdgeGraspError
-from edgegrasp_service.errors import (
-    HarmfulRequest,
-    InvalidSettings,
-    Problem,
-    WorkerLost,
-    report,
-)
+from edgegrasp_service import errors
 from edgegrasp_service.settings import Settings
 
 # -P: nothing is imported from the folder the server was started in.
@@ -99,7 +93,7 @@ class Answer:
 
     body: bytes  # JSON, or the serialized response message; empty for an error
     facts: Facts
-    error: Problem | None = None  # None: a success
+    error: errors.Problem | None = None  # None: a success
 
 
 @dataclass(frozen=True)
@@ -130,7 +124,7 @@ def unpack(text: bytes, body: bytes) -> Any:
         fields["body"] = body
     if name == "Answer":
         fields["facts"] = Facts(**fields["facts"])
-        fields["error"] = fields["error"] and Problem(**fields["error"])
+        fields["error"] = fields["error"] and errors.Problem(**fields["error"])
     return MESSAGES[name](**fields)
 
 
@@ -157,7 +151,7 @@ async def _ready(reader: asyncio.StreamReader) -> Ready:
     """The first message of a process; raises InvalidSettings if it could not load."""
     ready: Ready | None = await received(reader)
     if ready is None or ready.failure:
-        raise InvalidSettings(ready.failure if ready else "a process died as it started")
+        raise errors.InvalidSettings(ready.failure if ready else "a process died as it started")
     return ready
 
 
@@ -280,8 +274,8 @@ class WorkerPool:
             if await worker.nursery.crashed(worker.pid):
                 deaths = MOST_DEATHS
         finally:
-            error = WorkerLost(LOST) if deaths < MOST_DEATHS else HarmfulRequest()
-            worker.finish(Answer(b"", Facts(deaths=deaths), report(error)))
+            error = errors.WorkerLost(LOST) if deaths < MOST_DEATHS else errors.HarmfulRequest()
+            worker.finish(Answer(b"", Facts(deaths=deaths), errors.report(error)))
             worker.close()
         if worker.nursery is self._nursery:
             logger.warning("worker %d died and is replaced", worker.pid)
@@ -296,7 +290,8 @@ class WorkerPool:
         except TimeoutError:  # it is stopped or hangs; its death is handled like any other
             worker.close()
             nursery.kill()
-            raise InvalidSettings("the process that workers fork from does not answer") from None
+            why = "the process that workers fork from does not answer"
+            raise errors.InvalidSettings(why) from None
         except BaseException:
             worker.close()
             raise
@@ -505,7 +500,7 @@ def _work(
                 found = answer(job, catalogue, settings)
             except BaseException:  # out of memory
                 facts = Facts(traceback=traceback.format_exc(), deaths=1)
-                _send(pool, Answer(b"", facts, report(WorkerLost(LOST))))
+                _send(pool, Answer(b"", facts, errors.report(errors.WorkerLost(LOST))))
                 return
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             _send(pool, found)
