@@ -15,6 +15,7 @@ from scipy.special import expit, logit
 from torch import nn
 
 from edgegrasp_camera.arrays import Array, Float32, Floats, Int64
+from edgegrasp_model import ranking, tracking
 from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import Sample, Sampler
@@ -26,15 +27,6 @@ from edgegrasp_model.networks.checkpoint import check_reference_logits, load_che
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import Collision, DetectOptions
-from edgegrasp_model.ranking import (
-    GOOD_SCORE,
-    SURE_SCORE,
-    debug_info,
-    detected_objects,
-    grasps_in_cloud,
-    judged_together,
-    select,
-)
 from edgegrasp_model.results import NoGrasp, Pace
 from edgegrasp_model.scene.cloud import check_cloud, seen_from_origin
 from edgegrasp_model.scene.scene import (
@@ -44,15 +36,6 @@ from edgegrasp_model.scene.scene import (
     build_scene,
     select_points,
 )
-from edgegrasp_model.tracking import (
-    Followed,
-    follow,
-    merged,
-    narrowed,
-    only_chosen,
-    relabelled,
-    untracked,
-)
 from edgegrasp_results import Detection, Evaluation, FoundSupport, GripperOutline, Scoring
 
 NO_APPROACH_POINT = (
@@ -61,7 +44,7 @@ NO_APPROACH_POINT = (
 )
 NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
 # Rating of a grasp from which its object gets no approach points in each round.
-ROUNDS = (1.0, SURE_SCORE, GOOD_SCORE, GOOD_SCORE)
+ROUNDS = (1.0, ranking.SURE_SCORE, ranking.GOOD_SCORE, ranking.GOOD_SCORE)
 BALLS_AT_A_TIME = 64
 MANY_HANDS = 20  # grippers in the last training run from which weights suit any gripper
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
@@ -80,7 +63,7 @@ class Prepared:
     counts: defaultdict[str, int]
     warnings: list[str]
     seconds: dict[str, float]
-    followed: Followed | None = None  # objects followed from an earlier answer
+    followed: tracking.Followed | None = None  # objects followed from an earlier answer
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -162,7 +145,7 @@ class GraspDetector:
             )
         previous, followed, choice = options.previous, None, options.objects
         if previous is not None:
-            options = narrowed(options, gripper.name, sent.points)
+            options = tracking.narrowed(options, gripper.name, sent.points)
         selected = select_points(sent, options, counts, warnings)
         scene = build_scene(selected, options, self.metadata.voxel_size, counts, max_voxels)
         if scene is None:
@@ -172,11 +155,11 @@ class GraspDetector:
             )
         elif previous is not None:
             chosen, given = bool(options.at or options.near), sent.segment_ids is not None
-            scene, followed = follow(scene, previous, given, chosen)
+            scene, followed = tracking.follow(scene, previous, given, chosen)
             if previous.search:
-                scene, followed = only_chosen(scene, followed, choice, warnings)
+                scene, followed = tracking.only_chosen(scene, followed, choice, warnings)
             if options.debug:
-                labels = relabelled(selected.labels, followed.named)
+                labels = tracking.relabelled(selected.labels, followed.named)
                 selected = replace(selected, labels=labels)
         seconds = {"cloud": time.perf_counter() - start}
         return Prepared(
@@ -202,7 +185,7 @@ class GraspDetector:
                     if prepared.options.collision.mode != "ignore":
                         held &= scored.collision_free
                     done = scene.object_of_point[scored.candidates.approach_index[held]]
-                sample = sampler.sample(done, last_resort=enough == GOOD_SCORE)
+                sample = sampler.sample(done, last_resort=enough == ranking.GOOD_SCORE)
             if sample is None:
                 continue
             logits = self._logits(prepared, scene, sample.candidates) / self.metadata.temperature
@@ -215,32 +198,33 @@ class GraspDetector:
         scene, gripper, options = prepared.scene, prepared.gripper, prepared.options
         counts, grasps, debug = prepared.counts, [], None
         with prepared.timed("ranking"):
-            logits, outcome = np.empty(0, dtype=np.float32), np.empty(0, dtype=np.int8)
-            if sample is not None and scene is not None:
-                logits = sample.logits
-                if self.sees_hands:
-                    logits = judged_together(logits, sample, scene, gripper)
-            score: Floats = expit(logits)
+            score: Floats = np.empty(0, dtype=np.float32)
+            outcome = np.empty(0, dtype=np.int8)
             if scene is not None and not scene.approach_allowed.any():
                 prepared.warnings.append(NO_APPROACH_POINT)
-            elif sample is not None and len(logits) == 0:
+            elif sample is not None and len(sample.logits) == 0:
                 prepared.warnings.append(NO_CANDIDATE)
             elif scene is not None and sample is not None:
-                rating, score = self._scores(scene, sample.candidates.contact_index, score)
-                rows, outcome = select(scene, sample, score, rating, gripper, options, counts)
+                logits = sample.logits
+                if self.sees_hands:
+                    logits = ranking.judged_together(logits, sample, scene, gripper)
+                contact = sample.candidates.contact_index
+                rating, score = self._scores(scene, contact, expit(logits))
+                ordering = score, rating, gripper, options, counts
+                rows, outcome = ranking.select(scene, sample, *ordering)
                 best, free = sample.candidates.take(rows), sample.collision_free[rows]
-                grasps = grasps_in_cloud(scene, best, gripper, score[rows], free)
+                grasps = ranking.grasps_in_cloud(scene, best, gripper, score[rows], free)
             if options.debug and scene is not None:
-                debug = debug_info(scene, sample, score, outcome, prepared.selected.labels)
-        tracking = None if options.previous is None else untracked(options.previous)
+                debug = ranking.debug_info(scene, sample, score, outcome, prepared.selected.labels)
+        tracked = None if options.previous is None else tracking.untracked(options.previous)
         objects = []
         if scene is not None:
             if prepared.followed is not None:
                 score_poses = partial(self._score_poses, prepared, scene)
                 context = options, scene, gripper, score_poses
-                grasps, tracking = merged(grasps, prepared.followed, *context)
+                grasps, tracked = tracking.merged(grasps, prepared.followed, *context)
             with prepared.timed("ranking"):
-                objects = detected_objects(scene, grasps, sample, score, gripper)
+                objects = ranking.detected_objects(scene, grasps, sample, score, gripper)
             if prepared.followed is not None:
                 surface = prepared.followed.surface
                 objects = [replace(one, surface=surface.get(one.number)) for one in objects]
@@ -260,7 +244,7 @@ class GraspDetector:
             plane,
             prepared.selected.up.astype(np.float32),
             objects,
-            tracking,
+            tracked,
         )
 
     def score(
@@ -324,7 +308,7 @@ class GraspDetector:
             free = ~collides(scene, *hands, gripper, request)
             if given.T_cloud_hand is not None:
                 candidates = replace(candidates, T_cloud_hand=given.T_cloud_hand)
-            grasps = grasps_in_cloud(scene, candidates, gripper, score, free)
+            grasps = ranking.grasps_in_cloud(scene, candidates, gripper, score, free)
         evaluations = [Evaluation(None, reason) for reason in given.reason]
         for number, grasp in zip(candidates.pair.tolist(), grasps, strict=True):
             evaluations[number] = Evaluation(grasp, None)
