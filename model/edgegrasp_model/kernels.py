@@ -113,7 +113,7 @@ def any_point_on_way(hands: InHands, boxes: Float64, lift: Float32) -> Bools:
             low, high = solid[b]
             for k in range(len(sphere)):
                 near = _may_reach(sphere[k], turn[e], shift[e], low + below, high + above)
-                if near and _count_on_way(columns, k, turn[e], shift[e], low, high, per_way):
+                if near and _count_on_way(columns, k, turn[e], shift[e], solid[b], per_way):
                     hit[e] = True
                     break
             if hit[e]:
@@ -155,13 +155,14 @@ def free_way(hands: InHands, boxes: Float64, behind: float) -> Float32:
     for e in range(len(turn)):
         nearest = np.float32(np.inf)
         for b in range(len(solid)):
-            low, high = solid[b, 0].copy(), solid[b, 1].copy()
+            box = solid[b].copy()
+            low, high = box
             front = high[2]
             low[2] -= np.float32(behind)
             for k in range(len(sphere)):
                 high[2] = front + nearest  # farther boxes change nothing
                 if _may_reach(sphere[k], turn[e], shift[e], low, high):
-                    least = _least_between(columns, k, turn[e], shift[e], low, high, ahead)
+                    least = _least_between(columns, k, turn[e], shift[e], box, ahead)
                     nearest = min(nearest, least - front)
         way[e] = nearest
     return way
@@ -337,15 +338,10 @@ def _count_between(
 
 @compiled("contract")
 def _count_on_way(
-    columns: Float32,
-    k: int,
-    turn: Float32,
-    shift: Float32,
-    low: Float32,
-    high: Float32,
-    per_way: Floats,
+    columns: Float32, k: int, turn: Float32, shift: Float32, box: Float32, per_way: Floats
 ) -> int:
     """How many points of block k a box passes over; `per_way` (3,): 1 / its way, hand frame."""
+    low, high = box[0], box[1]
     start, stop = k * BLOCK, (k + 1) * BLOCK
     xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
     found = 0
@@ -380,15 +376,10 @@ def _nearest_to_box(columns: Float32, turn: Float32, shift: Float32, extent: Flo
 
 @compiled("contract")
 def _least_between(
-    columns: Float32,
-    k: int,
-    turn: Float32,
-    shift: Float32,
-    low: Float32,
-    high: Float32,
-    ahead: Float32,
+    columns: Float32, k: int, turn: Float32, shift: Float32, box: Float32, ahead: Float32
 ) -> np.float32:
-    """Least z of the points of block k between two corners; `ahead` (BLOCK,) is written over."""
+    """Least z of the points of block k in a box (2, 3); `ahead` (BLOCK,) is written over."""
+    low, high = box[0], box[1]
     start, stop = k * BLOCK, (k + 1) * BLOCK
     xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
     for i in range(len(xs)):

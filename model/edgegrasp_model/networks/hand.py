@@ -178,14 +178,13 @@ def describe_hands(
     cloud, up, hands = around.cloud, around.up, candidates.T_cloud_hand
     mirrored = hands[:, :3, :3].copy()
     mirrored[:, :, 0] *= side[:, None]
-    seen, first_met, runs = (np.zeros((len(side), count), np.float32) for count in (37, 2, 3))
     boxes = gripper.open_boxes.astype(np.float32)
     first, last = len(gripper.hand.boxes), len(gripper.hand.boxes) + len(gripper.finger.boxes)
     across = gripper.pad_half_width, gripper.max_opening / 2
     lengths = map(np.float32, (*across, gripper.seen_palm_z, gripper.tip_z, gripper.max_tip_z))
     hand = _Hand(boxes[:first], boxes[first:last], *lengths)
     looked = view, cloud.normals, mirrored, side, around.at_side, hand
-    _look_from_each(*looked, seen, first_met, runs)
+    seen, first_met, runs = _look_from_each(*looked)
     unseen = unseen_space(around.depths, hands, first_met, gripper)
     toward = np.zeros((len(mirrored), 3), dtype=np.float32)
     if eye is not None:
@@ -249,22 +248,16 @@ def _stance(around: Surroundings, candidates: Candidates, gripper: Gripper) -> l
 
 @compiled("contract")
 def _look_from_each(
-    view: HandView,
-    normals: Float32,
-    axes: Float32,
-    side: Float32,
-    cut: Bools,
-    hand: _Hand,
-    seen: Float32,
-    first_met: Float32,
-    runs: Float32,
-) -> None:
+    view: HandView, normals: Float32, axes: Float32, side: Float32, cut: Bools, hand: _Hand
+) -> tuple[Float32, Float32, Float32]:
     """Look from hands with axes (E, 3, 3), the x of which is mirrored where `side` (E,) is -1.
 
-    Fills in 37 numbers (E, 37): those of `_count_hits`, those of `_measure_between`, and how many
+    Returns 37 numbers (E, 37): those of `_count_hits`, those of `_measure_between`, and how many
     points between the fingers lie where the workspace cuts objects off, `cut` (N,), all counts n as
     log(1 + n); then greatest and least y between the fingers (E, 2), and runs (E, 3).
     """
+    seen, first_met = np.zeros((len(side), 37), np.float32), np.zeros((len(side), 2), np.float32)
+    runs = np.zeros((len(side), 3), np.float32)
     for e in range(len(side)):
         start, stop = view.bounds[e], view.bounds[e + 1]
         x, y, z = view.position[:, start:stop]
@@ -282,6 +275,7 @@ def _look_from_each(
         _measure_between(points, facing, hand, seen[e, 7:36])
         seen[e, 36] = np.log1p(np.sum(cut[view.row[start:stop]] & pads))
         _runs_along(points[1][np.abs(points[0]) < hand.half], first_met[e], runs[e])
+    return seen, first_met, runs
 
 
 @compiled("contract")
