@@ -6,12 +6,7 @@ import numpy as np
 
 from edgegrasp_camera.arrays import Array, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import HandView, hand_views
-from edgegrasp_model.candidates.edge_grasps import (
-    MIN_EDGE,
-    Candidates,
-    edge_grasps,
-    retract,
-)
+from edgegrasp_model.candidates.edge_grasps import MIN_EDGE, Candidates, edge_grasps, retract
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.options import MAX_CANDIDATES, are_rigid
