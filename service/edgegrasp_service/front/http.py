@@ -308,7 +308,7 @@ class HttpProtocol(HttpToolsProtocol):
         super().__init__(**arguments)
         self._settings = settings
         self._places = places
-        self._header_timer: asyncio.TimerHandle | None = None
+        self._header_timer: asyncio.TimerHandle | None = None  # while headers arrive
         self._header_bytes = 0
         self._place = Place("", lambda: None)
 
@@ -330,7 +330,7 @@ class HttpProtocol(HttpToolsProtocol):
         self._header_bytes += len(data)
         self._places.use(self._place, self._place.idle)
         super().data_received(data)
-        if not self._in_headers:
+        if self._header_timer is None:
             self._header_bytes = 0
         elif self._header_bytes > self._settings.max_header_bytes:
             most = f"Send at most {self._settings.max_header_bytes}."
@@ -341,7 +341,6 @@ class HttpProtocol(HttpToolsProtocol):
         super().on_message_begin()
         self.scope["state"] |= {"abort": self.transport.abort, "linger": self._linger}
         self._pieces = self._body_bytes = 0
-        self._in_headers = True
         if self._header_timer is None:
             seconds = self._settings.read_seconds
             late = "headers", f"not whole in {seconds:g} s", "Send them at once."
@@ -352,7 +351,6 @@ class HttpProtocol(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         """Mark the connection as busy for requests to /v1/."""
         self._places.use(self._place, idle=not self.url.startswith(b"/v1/"))
-        self._in_headers = False
         if self._header_timer is not None:
             self._header_timer.cancel()
             self._header_timer = None
