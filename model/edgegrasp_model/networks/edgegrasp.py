@@ -8,22 +8,9 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
+from edgegrasp_model.networks import layers
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
-from edgegrasp_model.networks.layers import (
-    CONVOLVED,
-    EDGE_ROWS,
-    ball_chunks,
-    ball_maximum,
-    by_chunks,
-    gather_rows,
-    in_chunks,
-    maximum,
-    mlp,
-    packed,
-    packed_linear,
-    shared_product,
-)
 
 GRASP_WIDTH = 3 + 3 + 1 + 3  # contact point, its normal, depth, approach direction
 
@@ -43,7 +30,7 @@ class EdgeGraspNet(nn.Module):
         )
         own_width = GRASP_WIDTH + width_3
         self.join = nn.Linear(own_width + config.global_widths_2[-1], config.classifier_widths[0])
-        self.classifier = mlp((*config.classifier_widths, 1))
+        self.classifier = layers.mlp((*config.classifier_widths, 1))
 
     def forward(self, batch: BallBatch) -> Tensor:
         """Scores the edge grasps of a batch: logits (E,) of success."""
@@ -54,9 +41,9 @@ class EdgeGraspNet(nn.Module):
         contact, depth = batch.contact, batch.depth.unsqueeze(1)
         own = batch.points[contact], batch.normals[contact], depth, batch.approach, f3[contact]
         grasp = torch.cat(own, dim=1)  # (E, 138)
-        join = shared_product(self.join.weight, self.join.bias, ball)
-        classifier, logits = packed(self.classifier), []
-        for rows, ball_of_edge in in_chunks(EDGE_ROWS, grasp, batch.ball_of_edge):
+        join = layers.shared_product(self.join.weight, self.join.bias, ball)
+        classifier, logits = layers.packed(self.classifier), []
+        for rows, ball_of_edge in layers.in_chunks(layers.EDGE_ROWS, grasp, batch.ball_of_edge):
             logits.append(classifier(join(rows, ball_of_edge).relu_()))  # (e, 1)
         return torch.cat(logits).squeeze(1)[: len(grasp)]
 
@@ -72,14 +59,15 @@ class PointNetConv(nn.Module):
     def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, inputs) to (P, width)."""
         # W [f_j, p_j - p_i] + b = W [f_j, p_j] + b - V p_i: the product runs per point.
-        weight, output = self.hidden.weight, packed_linear(self.output.weight)
+        weight, output = self.hidden.weight, layers.packed_linear(self.output.weight)
         u = torch.cat((features, batch.points), dim=1)
-        u = by_chunks(packed_linear(weight, self.hidden.bias), u)  # (P, width)
+        u = layers.by_chunks(layers.packed_linear(weight, self.hidden.bias), u)  # (P, width)
         # The bias is the same for all neighbours: added once, after the maximum.
         here, pooled = batch.points @ weight[:, -3:].t(), []  # (P, width)
-        for neighbors, own in in_chunks(CONVOLVED, batch.neighbors, here):
-            hidden = gather_rows(u, neighbors).sub_(own.unsqueeze(1)).relu_()  # (p, k, width)
-            pooled.append(maximum(output(hidden), dim=1))  # (p, width)
+        for neighbors, own in layers.in_chunks(layers.CONVOLVED, batch.neighbors, here):
+            there = layers.gather_rows(u, neighbors)  # (p, k, width)
+            hidden = there.sub_(own.unsqueeze(1)).relu_()
+            pooled.append(layers.maximum(output(hidden), dim=1))  # (p, width)
         return torch.cat(pooled)[: len(features)] + self.output.bias
 
 
@@ -88,16 +76,16 @@ class GlobalFeature(nn.Module):
 
     def __init__(self, inputs: int, widths_1: tuple[int, ...], widths_2: tuple[int, ...]) -> None:
         super().__init__()
-        self.mlp_1 = mlp((inputs, *widths_1))
+        self.mlp_1 = layers.mlp((inputs, *widths_1))
         self.join = nn.Linear(inputs + widths_1[-1], widths_2[0])
-        self.mlp_2 = mlp(widths_2)
+        self.mlp_2 = layers.mlp(widths_2)
 
     def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 224) to ball features (B, 1024)."""
-        chunks = ball_chunks(local, batch)
-        mlp_1, mlp_2 = packed(self.mlp_1), packed(self.mlp_2)
-        pooled = ball_maximum(chunks, lambda chunk: mlp_1(chunk.values))  # (B, 512)
-        join = shared_product(self.join.weight, self.join.bias, pooled)
-        return ball_maximum(
+        chunks = layers.ball_chunks(local, batch)
+        mlp_1, mlp_2 = layers.packed(self.mlp_1), layers.packed(self.mlp_2)
+        pooled = layers.ball_maximum(chunks, lambda chunk: mlp_1(chunk.values))  # (B, 512)
+        join = layers.shared_product(self.join.weight, self.join.bias, pooled)
+        return layers.ball_maximum(
             chunks, lambda chunk: mlp_2(join(chunk.values, chunk.ball_of_point).relu_())
         )

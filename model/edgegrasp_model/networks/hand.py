@@ -22,16 +22,8 @@ from edgegrasp_model.candidates.collision import NEAR, HandView, hand_views
 from edgegrasp_model.candidates.edge_grasps import GAP, Candidates, support_clearance
 from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
 from edgegrasp_model.kernels import compiled
+from edgegrasp_model.networks import layers
 from edgegrasp_model.networks.config import HAND_DESCRIPTION_SIZE, NetworkConfig
-from edgegrasp_model.networks.layers import (
-    EDGE_ROWS,
-    by_chunks,
-    float32_inference,
-    in_chunks,
-    maximum,
-    mlp,
-    packed,
-)
 from edgegrasp_model.scene.cloud import UP, unit
 from edgegrasp_model.scene.scene import Surroundings
 from edgegrasp_model.unseen import unseen_space, visible_extents
@@ -116,32 +108,32 @@ class HandNet(nn.Module):
         self.config = config
         self.register_buffer("mean", torch.zeros(config.description_size))
         self.register_buffer("std", torch.ones(config.description_size))
-        self.point_encoder = mlp((6, *config.hand_widths))
+        self.point_encoder = layers.mlp((6, *config.hand_widths))
         inputs = config.description_size + 2 * config.hand_widths[-1]
-        self.classifier = mlp((inputs, *config.classifier_widths, 1))
+        self.classifier = layers.mlp((inputs, *config.classifier_widths, 1))
 
     def forward(self, batch: HandBatch, left_out: torch.Generator | None = None) -> Tensor:
         """Logits (E,) of success; in training `left_out` draws what dropout removes."""
         known = batch.description[:, : self.config.description_size]
         description = (known - self.mean) / self.std  # (E, F)
-        encoder, chunks = packed(self.point_encoder), []
-        for points, count in in_chunks(CHUNK, batch.points, batch.point_count):
+        encoder, chunks = layers.packed(self.point_encoder), []
+        for points, count in layers.in_chunks(CHUNK, batch.points, batch.point_count):
             positions, normals = torch.split(points, 3, dim=2)
             encoded = encoder(torch.cat((positions / POINT_UNIT, normals), dim=2))  # (E, P, C)
-            if float32_inference(encoded):
+            if layers.float32_inference(encoded):
                 pooled = torch.zeros(len(encoded), 2 * encoded.shape[2])
                 _pool(encoded.numpy(), count.numpy(), pooled.numpy())
             else:
                 there = torch.arange(points.shape[1], device=points.device) < count.unsqueeze(1)
                 features = F.relu(encoded) * there.unsqueeze(2)  # (E, P, C), none below 0
                 mean = features.sum(dim=1) / count.clamp_min(1).unsqueeze(1)  # (E, C)
-                pooled = torch.cat((maximum(features, dim=1), mean), dim=1)
+                pooled = torch.cat((layers.maximum(features, dim=1), mean), dim=1)
             chunks.append(pooled)  # (E, 2 C): maximum and mean over the hand's points
         seen = torch.cat((description, torch.cat(chunks)[: len(description)]), dim=1)
         if left_out is not None:
             draws = torch.rand(seen.shape, generator=left_out, device=left_out.device)
             seen = seen * (draws >= DROPOUT).to(seen.device) / (1.0 - DROPOUT)
-        logits = by_chunks(packed(self.classifier), seen, EDGE_ROWS)
+        logits = layers.by_chunks(layers.packed(self.classifier), seen, layers.EDGE_ROWS)
         return logits.squeeze(1)  # (E,)
 
 

@@ -12,21 +12,9 @@ from torch import Tensor, nn
 
 from edgegrasp_camera.arrays import Float32, Int64
 from edgegrasp_model.kernels import compiled
+from edgegrasp_model.networks import layers
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
-from edgegrasp_model.networks.layers import (
-    EDGE_ROWS,
-    Layer,
-    ball_chunks,
-    by_chunks,
-    float32_inference,
-    gather_rows,
-    in_chunks,
-    mlp,
-    packed,
-    packed_linear,
-    shared_product,
-)
 
 _TINY = 1e-7  # keeps the division finite where a direction vanishes; the reference's value
 VN_CONVOLVED = 32  # points at a time in a graph convolution, each with its neighbours
@@ -53,7 +41,7 @@ class VNEdgeGraspNet(nn.Module):
         self.frame_1 = VNLinearReLU(channels, channels // 2)
         self.frame_2 = VNLinearReLU(channels // 2, channels // 4)
         self.frame_3 = nn.Linear(channels // 4, 3, bias=False)
-        self.classifier = mlp((3 * channels, *config.classifier_widths, 1))
+        self.classifier = layers.mlp((3 * channels, *config.classifier_widths, 1))
 
     def forward(self, batch: BallBatch) -> Tensor:
         """Scores the edge grasps of a batch: logits (E,) of success."""
@@ -64,10 +52,11 @@ class VNEdgeGraspNet(nn.Module):
         ball = self.ball_feature(torch.cat((f1, f2, f3), dim=2), batch)  # (B, 3, 381)
         named = (batch.approach, batch.points[contact], batch.normals[contact])
         grasp = torch.cat((torch.stack(named, dim=2), f3[contact]), dim=2)  # (E, 3, 131)
-        join = shared_product(self.frame_1.weights, None, ball)
-        frame_2, frame_3 = packed_linear(self.frame_2.weights), packed_linear(self.frame_3.weight)
-        classifier, logits = packed(self.classifier), []
-        for own, ball_of_edge in in_chunks(EDGE_ROWS, grasp, batch.ball_of_edge):
+        join = layers.shared_product(self.frame_1.weights, None, ball)
+        frame_2 = layers.packed_linear(self.frame_2.weights)
+        frame_3 = layers.packed_linear(self.frame_3.weight)
+        classifier, logits = layers.packed(self.classifier), []
+        for own, ball_of_edge in layers.in_chunks(layers.EDGE_ROWS, grasp, batch.ball_of_edge):
             # Three learned vectors rotate with the grasp, so coordinates along them are invariant.
             frame = frame_3(relu(frame_2(relu(join(own, ball_of_edge)))))  # (e, 3, 3)
             vectors = torch.cat((own, ball.index_select(0, ball_of_edge)), dim=2)  # (e, 3, 512)
@@ -92,15 +81,15 @@ class VNPointNetConv(nn.Module):
         # W [f_j, p_j - p_i] = W [f_j, p_j] - w p_i, w the last column: the product runs per point.
         weight, direction = self.hidden.weight, self.hidden_relu.direction.weight
         weight = torch.cat((weight, direction @ weight))
-        output = packed_linear(_with_reach(self.output, self.reach))
+        output = layers.packed_linear(_with_reach(self.output, self.reach))
         u = torch.cat((features, batch.points.unsqueeze(2)), dim=2)
-        u = by_chunks(packed_linear(weight), u, VN_ROWS)  # (P, 3, 2 width)
-        if float32_inference(u):
+        u = layers.by_chunks(layers.packed_linear(weight), u, VN_ROWS)  # (P, 3, 2 width)
+        if layers.float32_inference(u):
             vectors = _convolved(u, weight[:, -1].contiguous(), output, batch)
         else:
             here, pooled = batch.points.unsqueeze(2) * weight[:, -1], []  # (P, 3, 2 width)
-            for neighbors, own in in_chunks(VN_CONVOLVED, batch.neighbors, here):
-                both = gather_rows(u, neighbors) - own.unsqueeze(1)  # (p, k, 3, 2 width)
+            for neighbors, own in layers.in_chunks(VN_CONVOLVED, batch.neighbors, here):
+                both = layers.gather_rows(u, neighbors) - own.unsqueeze(1)  # (p, k, 3, 2 width)
                 messages = output(relu(both.flatten(0, 1))).view(both.shape)
                 pooled.append(_furthest(messages, dim=1))  # (p, 3, width)
             vectors = torch.cat(pooled)[: len(features)]
@@ -123,15 +112,17 @@ class VNGlobalFeature(nn.Module):
 
     def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 3, 224) to ball features (B, 3, 381)."""
-        vn_1, vn_2 = packed_linear(self.vn_1.weights), packed_linear(self.vn_2.weights)
-        vn_3 = packed_linear(_with_reach(self.vn_3, self.maximum_1.reach))
-        vn_5 = packed_linear(_with_reach(self.vn_5, self.maximum_2.reach))
-        chunks = ball_chunks(local, batch, VN_ROWS)
+        vn_1 = layers.packed_linear(self.vn_1.weights)
+        vn_2 = layers.packed_linear(self.vn_2.weights)
+        vn_3 = layers.packed_linear(_with_reach(self.vn_3, self.maximum_1.reach))
+        vn_5 = layers.packed_linear(_with_reach(self.vn_5, self.maximum_2.reach))
+        chunks = layers.ball_chunks(local, batch, VN_ROWS)
         furthest_1 = Furthest(batch.num_balls, self.vn_3.out_features)
         for chunk in chunks:
             both = vn_3(relu(vn_2(relu(vn_1(chunk.values)))))  # (p, 3, 2 x 128)
             furthest_1.add(both, chunk.balls, chunk.sizes)
-        join = shared_product(self.join.weights, None, self.maximum_1.relu(furthest_1.vectors))
+        first = self.maximum_1.relu(furthest_1.vectors)  # (B, 3, 128)
+        join = layers.shared_product(self.join.weights, None, first)
         furthest_2 = Furthest(batch.num_balls, self.vn_5.out_features)
         for chunk in chunks:
             both = vn_5(relu(join(chunk.values, chunk.ball_of_point)))  # (p, 3, 2 x 381)
@@ -172,8 +163,10 @@ class VNReLU(nn.Module):
 
     def forward(self, vectors: Tensor) -> Tensor:
         """Maps (M, 3, width) to the same shape."""
-        directions = packed_linear(self.direction.weight)
-        return by_chunks(lambda v: relu(torch.cat((v, directions(v)), dim=2)), vectors, VN_ROWS)
+        directions = layers.packed_linear(self.direction.weight)
+        return layers.by_chunks(
+            lambda v: relu(torch.cat((v, directions(v)), dim=2)), vectors, VN_ROWS
+        )
 
 
 def _with_reach(layer: nn.Linear, reach: nn.Linear) -> Tensor:
@@ -187,7 +180,7 @@ def _with_reach(layer: nn.Linear, reach: nn.Linear) -> Tensor:
 
 def relu(both: Tensor) -> Tensor:
     """Removes from each vector its part against its direction, if any: (M, 3, 2C) to (M, 3, C)."""
-    if float32_inference(both):
+    if layers.float32_inference(both):
         result, alone = torch.empty(len(both), 3, both.shape[2] // 2), np.arange(len(both))[:, None]
         nowhere, offset = np.zeros((len(both), 3), np.float32), np.zeros(both.shape[2], np.float32)
         _gathered_relu_rows(both.numpy(), nowhere, offset, alone, result.numpy())
@@ -198,7 +191,7 @@ def relu(both: Tensor) -> Tensor:
     return torch.addcmul(vectors, along / (length_squared + _TINY), directions, value=-1.0)
 
 
-def _convolved(u: Tensor, offset: Tensor, output: Layer, batch: BallBatch) -> Tensor:
+def _convolved(u: Tensor, offset: Tensor, output: layers.Layer, batch: BallBatch) -> Tensor:
     """The furthest (P, 3, C) of the messages of each point's neighbours, in a reused buffer."""
     (count, k), width = batch.neighbors.shape, len(offset) // 2
     points, neighbors = batch.points.numpy(), batch.neighbors.numpy()
@@ -224,7 +217,7 @@ class Furthest:
 
     def add(self, both: Tensor, groups: list[int], sizes: list[int]) -> None:
         """Add vectors and directions (p, 3, 2 width), and the number of rows of each group."""
-        if float32_inference(both):
+        if layers.float32_inference(both):
             bounds = np.cumsum([0, *sizes[: len(groups)]])
             these = slice(groups[0], groups[-1] + 1)
             best, vectors = self._best[these], self.vectors[these]
