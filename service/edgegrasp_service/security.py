@@ -45,14 +45,11 @@ class Tokens:
 
     def check(self, authorization: str | None) -> Token:
         """The token in the header `authorization`; raises Unauthenticated if it is not known."""
-        if authorization is None:
-            raise Unauthenticated(HEADER, "nothing", TOKEN_FIX)
-        scheme, _, text = authorization.strip().partition(" ")
-        if scheme.lower() != "bearer":
-            raise Unauthenticated(HEADER, "another scheme than Bearer", TOKEN_FIX)
+        scheme, _, text = (authorization or "").strip().partition(" ")
         found = self.known.get(_digest(text.strip()))
-        if found is None:
-            raise Unauthenticated(HEADER, "a token that this server does not know", TOKEN_FIX)
+        if found is None or scheme.lower() != "bearer":
+            value = "a token that this server does not know" if authorization else "nothing"
+            raise Unauthenticated(HEADER, value, TOKEN_FIX)
         return found
 
 
