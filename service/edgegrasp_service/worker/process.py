@@ -350,16 +350,9 @@ class Nursery:
                 return await self._crashed[pid]
         return False
 
-    def fork(self) -> socket.socket:
-        """Fork a worker; returns the socket to it."""
-        ours, theirs = socket.socketpair()
-        with theirs:
-            try:
-                socket.send_fds(self._control, [b"w"], [theirs.fileno()])
-            except OSError:
-                ours.close()
-                raise
-        return ours
+    def fork(self, its_end: socket.socket) -> None:
+        """Fork a worker that talks over a socket."""
+        socket.send_fds(self._control, [b"w"], [its_end.fileno()])
 
     def kill(self) -> None:
         """Kill the nursery, even if it is stopped; `watch` notices."""
@@ -386,8 +379,10 @@ class _Worker:
 
     async def start(self) -> None:
         """Fork the worker and wait until it is ready; raises InvalidSettings if it cannot load."""
-        ours = self.nursery.fork()
-        self.reader, self._writer = await asyncio.open_unix_connection(sock=ours)
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self.reader, self._writer = await asyncio.open_unix_connection(sock=ours)
+            self.nursery.fork(theirs)
         self.ready = await _ready(self.reader)
         self.pid = self.ready.pid
 
