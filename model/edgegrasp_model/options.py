@@ -89,11 +89,7 @@ Pixel = Annotated[
 ]
 Matrix = Annotated[tuple[Finite, ...], Field(min_length=16, max_length=16)]  # row by row
 Places = Annotated[tuple[Finite, ...], Field(max_length=3 * MAX_SURFACE)]  # x, y, z of each
-Quaternion = Annotated[
-    tuple[Finite, Finite, Finite, Finite],
-    AfterValidator(_of_length_one),
-    Field(description="x, y, z, w; length 1"),
-]
+Quaternion = Annotated[tuple[Finite, Finite, Finite, Finite], AfterValidator(_of_length_one)]
 
 
 def _in_one_line(schema: dict[str, Any]) -> None:
@@ -148,10 +144,8 @@ class OrientedBox(Strict):
     center: Vector = Field(description="centre, metres")
     half_extents: tuple[Length, Length, Length]
     """half lengths along the box's axes, metres"""
-    quaternion: Quaternion = Field(
-        default=(0.0, 0.0, 0.0, 1.0),
-        description="x, y, z, w: turns the box's axes into the cloud's (T_cloud_box)",
-    )
+    quaternion: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    """x, y, z, w: turns the box's axes into the cloud's (T_cloud_box)"""
 
 
 class Sphere(Strict):
@@ -575,12 +569,32 @@ def _kind_as_object(value: object) -> object:
     return {"kind": value} if isinstance(value, str) else value
 
 
-SupportKind = Literal["auto", "ransac", "none"]
-SupportRequest = Annotated[
+GripperChoice = Annotated[
+    Annotated[str, Tag("name")] | Annotated[GripperGeometry, Tag("inline")],
+    Discriminator(lambda value: "name" if isinstance(value, str) else "inline"),
+]
+Viewpoint = Annotated[
+    Annotated[Vector, Tag("one")]
+    | Annotated[tuple[Vector, ...], Field(min_length=2, max_length=MAX_VIEWS), Tag("several")],
+    Discriminator(_viewpoints),
+    BeforeValidator(_one_of_one),
+]
+Plane = Annotated[
     Annotated[SupportPlane, Tag("plane")]
     | Annotated[RansacPlane, Tag("ransac")]
     | Annotated[AutoPlane, Tag("auto")],
     Discriminator(_support_kind),
+]
+PlaneOrKind = Literal["auto", "ransac", "none"] | Plane | None
+SupportChoice = Annotated[
+    Plane | None, BeforeValidator(_kind_as_object, json_schema_input_type=PlaneOrKind)
+]
+CollisionChoice = Annotated[
+    Collision,
+    BeforeValidator(
+        lambda value: {"mode": value} if isinstance(value, str) else value,
+        json_schema_input_type=CollisionMode | Collision,
+    ),
 ]
 
 
@@ -589,13 +603,7 @@ class DetectOptions(Strict):
 
     model: str = ""
     """weights to use; empty: the server's default"""
-    gripper: (
-        Annotated[
-            Annotated[str, Tag("name")] | Annotated[GripperGeometry, Tag("inline")],
-            Discriminator(lambda value: "name" if isinstance(value, str) else "inline"),
-        ]
-        | None
-    ) = None
+    gripper: GripperChoice | None = None
     """gripper, by name or geometry; null: the one the weights were trained for"""
     num_approach_points: ApproachPoints | None = None
     """approach points sampled, spread over the objects; null: as many as they need"""
@@ -605,28 +613,13 @@ class DetectOptions(Strict):
     """how approach points are sampled"""
     seed: Integer = Field(default=0, ge=0, lt=2**63)
     """seed of every random choice"""
-    viewpoint: (
-        Annotated[
-            Annotated[Vector, Tag("one")]
-            | Annotated[
-                tuple[Vector, ...], Field(min_length=2, max_length=MAX_VIEWS), Tag("several")
-            ],
-            Discriminator(_viewpoints),
-            BeforeValidator(_one_of_one),
-        ]
-        | None
-    ) = None
+    viewpoint: Viewpoint | None = None
     """camera position, metres; normals are oriented towards it. If there are several, `view_ids`
     beside the cloud says which one saw each point"""
     up: Direction | None = None
     """direction away from gravity; any length but zero; null: the support plane's normal, else
     +z"""
-    support: Annotated[
-        SupportRequest | None,
-        BeforeValidator(
-            _kind_as_object, json_schema_input_type=SupportKind | SupportRequest | None
-        ),
-    ] = AutoPlane()
+    support: SupportChoice = AutoPlane()
     """plane that the objects rest on and the hand stays above; a kind alone is allowed; null:
     none"""
     objects: Literal["auto", "off"] | ObjectChoice = "auto"
@@ -647,13 +640,7 @@ class DetectOptions(Strict):
     """where contact points may lie; null: everywhere"""
     approach_direction: ApproachDirection | None = None
     """directions in which the hand may move; null: all but from below"""
-    collision: Annotated[
-        Collision,
-        BeforeValidator(
-            lambda value: {"mode": value} if isinstance(value, str) else value,
-            json_schema_input_type=CollisionMode | Collision,
-        ),
-    ] = Collision()
+    collision: CollisionChoice = Collision()
     """collision checks of the hand; a mode alone is allowed"""
     robot: RobotArm | None = None
     """arm that executes the grasp; grasps within its reach come first; null: no arm"""
