@@ -133,10 +133,8 @@ def signed_distance_to_boxes(hands: InHands, boxes: Float64) -> Float32:
             block = columns[:, k * BLOCK : (k + 1) * BLOCK]
             for b in range(len(extents)):
                 middle = sphere[k : k + 1, :3].T
-                if (
-                    _nearest_to_box(middle, turn[e], shift[e], extents[b]) - sphere[k, 3]
-                    < nearest[e]
-                ):
+                least = _nearest_to_box(middle, turn[e], shift[e], extents[b]) - sphere[k, 3]
+                if least < nearest[e]:
                     here = _nearest_to_box(block, turn[e], shift[e], extents[b])
                     nearest[e] = min(nearest[e], here)
     return nearest

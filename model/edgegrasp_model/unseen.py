@@ -153,10 +153,8 @@ def _palm_ways(gripper: Gripper) -> list[Float32]:
     """Points of the space that slices of the hand sweep, from end to end: each (S, 3)."""
     slices = []
     for low, high in gripper.hand.boxes:
-        x, z = (
-            0.6 * np.array([low[0], high[0]]),
-            np.linspace(low[2] - APPROACH_LENGTH, high[2], 7)[:-1],
-        )
+        x = 0.6 * np.array([low[0], high[0]])
+        z = np.linspace(low[2] - APPROACH_LENGTH, high[2], 7)[:-1]
         slices += [_grid(x, [y], z) for y in np.linspace(low[1], high[1], SLICES)]
     return slices
 

@@ -86,11 +86,8 @@ class HandBatch:
         description = rng.normal(size=(32, config.description_size))
         points = rng.normal(size=(32, config.hand_points, 6)) * (0.02, 0.02, 0.02, 1.0, 1.0, 1.0)
         count = rng.integers(0, config.hand_points + 1, 32)
-        return cls(
-            torch.from_numpy(description.astype(np.float32)),
-            torch.from_numpy(points.astype(np.float32)),
-            torch.from_numpy(count),
-        )
+        arrays = description.astype(np.float32), points.astype(np.float32), count
+        return cls(*map(torch.from_numpy, arrays))
 
     def to(self, device: torch.device | str) -> "HandBatch":
         """Moves every tensor to a device."""
