@@ -386,10 +386,9 @@ class ModelCatalogue:
 
     def get(self, name: str = "") -> GraspDetector:
         """The detector of that name, or the default for an empty name; raises UnknownModel."""
-        try:
-            return self._detectors[name or self.default]
-        except KeyError:
-            raise UnknownModel(name or self.default, self._detectors) from None
+        if (name := name or self.default) not in self._detectors:
+            raise UnknownModel(name, self._detectors)
+        return self._detectors[name]
 
     def describe(self) -> list[dict[str, Any]]:
         """A description of each model, as plain JSON values."""
@@ -440,10 +439,8 @@ class ModelCatalogue:
             seconds.append(time.process_time() - start)
             voxels.append(counts["voxels"])
         small, dense, wide = seconds
-        return Pace(
-            max(dense - small, 0.0) / (sizes[1] - sizes[0]),
-            max(wide - small, 0.0) / (voxels[2] - voxels[0]),
-        )
+        point = max(dense - small, 0.0) / (sizes[1] - sizes[0])
+        return Pace(point, voxel=max(wide - small, 0.0) / (voxels[2] - voxels[0]))
 
 
 def choose_device(name: str) -> torch.device:

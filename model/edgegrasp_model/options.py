@@ -533,12 +533,10 @@ class Previous(Strict):
 
     @model_validator(mode="after")
     def _distinct(self) -> Self:
-        for name, numbers in (
-            ("grasps", [grasp.id for grasp in self.grasps]),
-            ("objects", [one.number for one in self.objects]),
-        ):
-            if len(set(numbers)) < len(numbers):
-                twice = next(one for one in numbers if numbers.count(one) > 1)
+        ids, numbers = [grasp.id for grasp in self.grasps], [one.number for one in self.objects]
+        for name, used in (("grasps", ids), ("objects", numbers)):
+            if len(set(used)) < len(used):
+                twice = next(one for one in used if used.count(one) > 1)
                 raise ValueError(f"{name} must differ: {twice} is the id of two of them")
         return self
 
