@@ -234,14 +234,17 @@ class _Work:
 
 
 def _given(fields: Mapping[str, Any], options: DetectOptions, max_points: int) -> dict[str, Array]:
-    """The edges or hand poses to score; raises InvalidRequest if there are none."""
+    """The edges or hand poses to score; raises InvalidRequest unless there is one of the two."""
     if options.robot is not None:
         fix = "Leave it out, or detect: reach is planned for detected grasps."
         raise InvalidRequest("options.robot", "a robot beside given grasps", fix)
     names = [name for name in GIVEN if fields.get(name) is not None]
     if not names:
         raise InvalidRequest("edges", "nothing", "Send edges or hand_poses.")
-    return {name: decode_array(name, fields[name], max_points) for name in names}
+    if len(names) == 2:
+        raise InvalidRequest("hand_poses", "poses beside edges", "Send one of the two.")
+    (name,) = names
+    return {name: decode_array(name, fields[name], max_points)}
 
 
 # Bodies
