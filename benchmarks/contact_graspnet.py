@@ -22,7 +22,7 @@ from torch import Tensor
 from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_lab.planners import request_options
 from edgegrasp_model.candidates.collision import collides
-from edgegrasp_model.candidates.edge_grasps import spread
+from edgegrasp_model.candidates.edge_grasps import spread_out
 from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import parse_options
@@ -81,7 +81,7 @@ class ContactGraspNet:
         places, feature = [points], [torch.empty(len(points), 0)]
         for level, (count, radii) in enumerate(LEVELS):
             here = places[-1]
-            centre = spread(here, count)
+            centre = spread_out(here, count)
             scales = []
             for scale, radius in enumerate(radii):
                 near = _near(here, here[centre], radius)

@@ -6,7 +6,7 @@ import numpy as np
 
 from edgegrasp_camera.arrays import Array, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import HandView, hand_views
-from edgegrasp_model.candidates.edge_grasps import MIN_EDGE, Candidates, edge_grasps, retract
+from edgegrasp_model.candidates.edge_grasps import MIN_EDGE_LENGTH, Candidates, edge_grasps, retract
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.options import MAX_CANDIDATES, are_rigid
@@ -128,7 +128,7 @@ def _approach_points(view: HandView, contact: Int64, crop_radius: float) -> Int6
     """Rows (M,) of the points nearest to the hands' axes, near the contacts (M,); else -1."""
     result = np.full(len(contact), -1, dtype=np.int64)
     apart = np.linalg.norm(view.position - view.position[:, contact[view.candidate]], axis=0)
-    near = np.flatnonzero((apart > MIN_EDGE) & (apart < 0.99 * crop_radius))
+    near = np.flatnonzero((apart > MIN_EDGE_LENGTH) & (apart < 0.99 * crop_radius))
     off_axis = (view.position[:2, near] ** 2).sum(axis=0)
     hands, best = _least(view.candidate[near], off_axis)
     result[hands] = view.row[near[best]]

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_camera.arrays import Array, Bools, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import clearances, hand_views
 from edgegrasp_model.candidates.edge_grasps import Candidates
-from edgegrasp_model.candidates.sample import CODE, Sample
+from edgegrasp_model.candidates.sample import OUTCOME_CODE, Sample
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import mean_of_alike, non_max_suppression
 from edgegrasp_model.options import DetectOptions
@@ -81,9 +81,9 @@ def select(
     order, worth = ranked(
         scene, contact, hands, rating, sample.collision_free, gripper, options, clearance
     )
-    outcome = np.full(len(score), CODE[Outcome.BEYOND_TOP_K])
+    outcome = np.full(len(score), OUTCOME_CODE[Outcome.BEYOND_TOP_K])
     good = score[order] >= options.min_score
-    outcome[order[~good]] = CODE[Outcome.LOW_SCORE]
+    outcome[order[~good]] = OUTCOME_CODE[Outcome.LOW_SCORE]
     order, dropped = order[good], order[:0]
     counts["above_min_score"] = len(order)
     if options.order == "score":
@@ -93,7 +93,8 @@ def select(
         near = rule.translation, rule.rotation
         order, dropped = non_max_suppression(T_cloud_tcp, order, *near, options.top_k)
     order = order[: options.top_k]
-    outcome[dropped], outcome[order] = CODE[Outcome.SUPPRESSED], CODE[Outcome.RETURNED]
+    outcome[dropped] = OUTCOME_CODE[Outcome.SUPPRESSED]
+    outcome[order] = OUTCOME_CODE[Outcome.RETURNED]
     counts["suppressed"], counts["returned"] = len(dropped), len(order)
     return order, outcome
 
@@ -270,11 +271,12 @@ def _why(
     if size[:2].min() > gripper.max_opening:
         return Ungraspable.TOO_WIDE
     outcome = sample.outcome[drawn]
-    out_of_reach = np.isin(outcome, (CODE[Outcome.SUPPORT], CODE[Outcome.DIRECTION]))
+    codes = OUTCOME_CODE[Outcome.SUPPORT], OUTCOME_CODE[Outcome.DIRECTION]
+    out_of_reach = np.isin(outcome, codes)
     if size[2] < FLAT and out_of_reach.sum() >= len(outcome) / 2:
         return Ungraspable.TOO_FLAT
     if not sample.collision_free[scored].any():
-        allowed = outcome != CODE[Outcome.DIRECTION]
+        allowed = outcome != OUTCOME_CODE[Outcome.DIRECTION]
         return Ungraspable.BLOCKED if allowed.any() else None
     hands = sample.candidates.T_cloud_hand[scored]
     _, hidden = _touched_first(scene, hands, gripper)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
-from edgegrasp_model.candidates.edge_grasps import spread
+from edgegrasp_model.candidates.edge_grasps import spread_out
 from edgegrasp_model.candidates.sample import allowed_directions
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
@@ -29,9 +29,9 @@ from edgegrasp_model.options import (
 )
 from edgegrasp_model.ranking import COLLIDING, objects_first, ranked
 from edgegrasp_model.results import OBSTACLE, Following
-from edgegrasp_model.scene.cloud import pose_of, thinned, unit
+from edgegrasp_model.scene.cloud import pose_matrix, subsample, unit
 from edgegrasp_model.scene.scene import Scene, numbers_chosen
-from edgegrasp_model.scene.segment import FIXED, UNKNOWN
+from edgegrasp_model.scene.segment import BACKGROUND, UNDECIDED
 from edgegrasp_results import Evaluation, Grasp, Tracking
 
 MARGIN = 0.1  # of the score, by which another grasp must be better
@@ -80,7 +80,7 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
     places += [place for one in previous.objects for place in np.reshape(one.surface, (-1, 3))]
     if not places:
         return options
-    some = thinned(points, 2000)
+    some = subsample(points, 2000)
     apart = np.asarray(cKDTree(some).query(np.array(places))[0])
     if options.viewpoint is not None:  # what is out of view may be anywhere near the camera
         eye = np.reshape(options.viewpoint, (-1, 3)).mean(axis=0)
@@ -109,14 +109,14 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
     is left must not be taken for those.
     """
     points, number = scene.points_in_cloud, scene.object_of_point
-    seen = np.flatnonzero((number >= 0) | (chosen & (number == FIXED)))
+    seen = np.flatnonzero((number >= 0) | (chosen & (number == BACKGROUND)))
     normals = scene.frame.directions_in_cloud(scene.cloud.normals[seen])
     cloud = Surface(points[seen], normals, cKDTree(points[seen]))
     moved: dict[int | None, tuple[Float64, int | None]] = {None: (np.eye(4), None)}
     surface: dict[int, Float32] = {}
     found = np.unique(number[number >= 0])
     named = {int(one): int(one) for one in found} if given else {}
-    renamed = number.copy() if given or previous.search else np.full_like(number, UNKNOWN)
+    renamed = number.copy() if given or previous.search else np.full_like(number, UNDECIDED)
     taken = np.zeros(len(number), dtype=bool)
     places = [np.reshape(one.surface, (-1, 3)).astype(np.float64) for one in previous.objects]
     matches = [(*registered(before, cloud), row) for row, before in enumerate(places)]
@@ -164,7 +164,7 @@ def only_chosen(
     moved = {was: now for was, now in followed.moved.items() if now[1] is None or now[1] in wanted}
     scene = replace(
         scene,
-        object_of_point=np.where((number >= 0) & ~held, FIXED, number),
+        object_of_point=np.where((number >= 0) & ~held, BACKGROUND, number),
         approach_allowed=scene.approach_allowed & held,
         contact_allowed=scene.contact_allowed & held,
     )
@@ -301,7 +301,7 @@ def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
         step = np.linalg.solve(system, target)
         total += step
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
-        T = pose_of(turn, middle + step[3:] - turn @ middle) @ T
+        T = pose_matrix(turn, middle + step[3:] - turn @ middle) @ T
     now = before @ T[:3, :3].T + T[:3, 3]
     apart, _ = cloud.tree.query(now, distance_upper_bound=STEPS[-1])
     return T, float(np.isfinite(apart).mean())
@@ -309,7 +309,7 @@ def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
 
 def sampled(points: Float32) -> Float32:
     """Up to MAX_SURFACE of points (N, 3), spread over them."""
-    return points[spread(points, MAX_SURFACE)]
+    return points[spread_out(points, MAX_SURFACE)]
 
 
 def relabelled(labels: Int64, named: Mapping[int, int]) -> Int64:

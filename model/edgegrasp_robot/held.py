@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_camera.arrays import Float64
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.options import Collision, Place
-from edgegrasp_model.scene.cloud import pose_of
+from edgegrasp_model.scene.cloud import pose_matrix
 from edgegrasp_model.scene.obstacles import box_pose
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_results import DetectedObject, Grasp
@@ -93,12 +93,12 @@ def load_of(
     if not len(held.points):
         return None
     if seen is not None:
-        T_cloud_box = pose_of(Rotation.from_quat(seen.quaternion).as_matrix(), seen.center)
+        T_cloud_box = pose_matrix(Rotation.from_quat(seen.quaternion).as_matrix(), seen.center)
         half = seen.half_extents.astype(np.float64)
     else:
         upright = scene.frame.points(held.points)
         low, high = upright.min(axis=0), upright.max(axis=0)
-        T_scene_box, half = pose_of(np.eye(3), (low + high) / 2), (high - low) / 2
+        T_scene_box, half = pose_matrix(np.eye(3), (low + high) / 2), (high - low) / 2
         T_cloud_box = np.linalg.inv(scene.frame.T_canonical_cloud) @ T_scene_box
     foot = _lowest(scene, (T_cloud_box[:3, 3] - half[2] * T_cloud_box[:3, 2])[None])
     below = foot if scene.support is not None and 0.0 < foot < HIDDEN else 0.0

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_camera.arrays import Bools, Float64, Floats
 from edgegrasp_model.errors import InvalidRequest, StartCollision
 from edgegrasp_model.options import Box, OrientedBox, RobotArm
-from edgegrasp_model.scene.cloud import pose_of, unit
+from edgegrasp_model.scene.cloud import pose_matrix, unit
 from edgegrasp_model.scene.obstacles import box_pose
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_robot.robot import HAND, Robot, touching
@@ -123,7 +123,7 @@ def surrounded(
         normal, base = np.array(scene.support.normal), np.linalg.inv(T_base_scene)[:3, 3]
         upright = Rotation.align_vectors(normal[None], [[0.0, 0.0, 1.0]])[0].as_matrix()
         middle = base - (scene.support.heights(base) + SLAB[2] / 2) * normal
-        T_scene_slab = pose_of(upright, middle)
+        T_scene_slab = pose_matrix(upright, middle)
         known.append(("the support", core.Box(*SLAB), T_base_scene @ T_scene_slab))
     voxels = _voxels(robot, joints, scene, points, T_base_scene)
     if asked.avoid_unseen:

@@ -20,7 +20,7 @@ from torch.optim import swa_utils
 from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_camera.depth import Intrinsics, unproject
 from edgegrasp_model.scene.network import VOTE_UNIT, SceneNet, SceneOutput, scene_features
-from edgegrasp_model.scene.segment import group, look
+from edgegrasp_model.scene.segment import group_pixels, run_network
 from edgegrasp_training.scene_images import DEPTH_UNIT, SceneImage
 from edgegrasp_training.scene_layouts import OBJECT
 
@@ -190,8 +190,8 @@ def fit_confidence(network: SceneNet, images: Sequence[SceneImage]) -> list[floa
     means, right = [], []
     for row, image in enumerate(images):
         known = image.up.astype(np.float64) if row % 2 else None
-        pixels, _ = look(network, image_points(image), known, 1.0 / float(image.camera[0]))
-        number, mean = group(pixels)
+        pixels, _ = run_network(network, image_points(image), known, 1.0 / float(image.camera[0]))
+        number, mean = group_pixels(pixels)
         size = np.bincount(number[number >= 0])
         on_object = (number >= 0) & (image.label[::2, ::2] >= OBJECT)
         means.append(mean)

@@ -9,8 +9,8 @@ from tests.checks import refusal
 from tests.many_options import OWN_GRIPPER
 
 from edgegrasp_model.candidates.edge_grasps import (
-    CLOSED_FURTHER,
-    MARGIN,
+    CLOSING_ALLOWANCE,
+    FIT_MARGIN,
     MAX_INSERTION,
     support_clearance,
 )
@@ -40,7 +40,7 @@ def test_a_gripper_stays_clear_of_the_support_as_it_closes(gripper: Gripper) -> 
     floor = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.0)
     for opening in (0.0, 0.03, 0.06, 0.085):
         clearance = support_clearance(down, np.float32([opening]), floor, gripper)[0]
-        closed = np.linspace(max(opening - CLOSED_FURTHER, 0.0), gripper.max_opening, 80)
+        closed = np.linspace(max(opening - CLOSING_ALLOWANCE, 0.0), gripper.max_opening, 80)
         lowest = min(0.5 - gripper.boxes(w)[:, 1, 2].max() for w in closed)
         assert clearance == pytest.approx(lowest, abs=2e-5)
 
@@ -122,7 +122,7 @@ def test_grasps_fit_the_gripper_that_was_asked_for(gripper: Gripper) -> None:
         np.testing.assert_allclose(T_hand_tcp, gripper.T_hand_tcp, atol=1e-5)
         contact = (grasp.contact_point - grasp.T_cloud_hand[:3, 3]) @ grasp.T_cloud_hand[:3, :3]
         further_in = gripper.contact_z_at(2 * abs(contact[1])) - contact[2]
-        shallowest = gripper.contact_z - gripper.tip_z + MARGIN
+        shallowest = gripper.contact_z - gripper.tip_z + FIT_MARGIN
         assert shallowest - 1e-3 < further_in < MAX_INSERTION + 2e-3
         assert grasp.width <= np.float32(gripper.max_opening)
     warned = any("trained for the gripper 'panda'" in warning for warning in found.warnings)

@@ -13,8 +13,8 @@ from edgegrasp_model.options import parse_options
 from edgegrasp_model.results import SUPPORT
 from edgegrasp_model.scene.cloud import CloudInput, check_cloud
 from edgegrasp_model.scene.scene import build_scene, select_points
-from edgegrasp_model.scene.segment import FIXED, Segmentation
-from edgegrasp_model.scene.support import Seen, choose_support
+from edgegrasp_model.scene.segment import BACKGROUND, Segmentation
+from edgegrasp_model.scene.support import ViewedPoints, find_support
 from edgegrasp_results import Detection
 
 from .rendered import SolidBox, box, boxes_on_table, camera, render, seen_box, table, to_world
@@ -22,7 +22,7 @@ from .scenes import SEED, detector
 
 AROUND = ["floor", "wall", "carton", "edge"]  # of the table, near the objects
 ABOVE = camera(0.8, -1.5, 0.7)
-BACKGROUND = {
+FURNISHINGS = {
     "floor": [box((0, 0, -0.75), (4, 4, 0.05))],
     "wall": [box((0, 0.5, 0.4), (3, 0.05, 1.6))],
     "monitor": [box((-0.38, 0.05, 0.2), (0.03, 0.25, 0.2))],
@@ -93,7 +93,7 @@ def contents(seed: int, reach: tuple[float, float]) -> list[SolidBox]:
 def test_background_around_them_makes_no_other_objects(seed: int, around: set[str]) -> None:
     rng = np.random.default_rng(seed)
     boxes, T_world_camera = boxes_on_table(seed), view(rng)
-    background = [one for name in sorted(around - {"edge"}) for one in BACKGROUND[name]]
+    background = [one for name in sorted(around - {"edge"}) for one in FURNISHINGS[name]]
     top = table(0.3, 0.24) if "edge" in around else table()
     plain = detect(render([table(), *boxes], T_world_camera))
     crowded = detect(render([top, *boxes, *background], T_world_camera))
@@ -140,7 +140,7 @@ def test_the_rest_of_a_table_that_was_cut_off_is_no_object(noise: float, height:
 def test_a_table_that_lies_over_the_plane_is_not_cut_off(given: bool) -> None:
     """What else is in view is no object: a plane that is given is never exact, nor a table flat."""
     one, T_world_camera = box((0, 0, 0.03), (0.02, 0.03, 0.03)), camera(0.7, -1.5, 0.7)
-    points = seen_in_world([table(), one, *BACKGROUND["monitor"]], T_world_camera)
+    points = seen_in_world([table(), one, *FURNISHINGS["monitor"]], T_world_camera)
     close = (np.abs(points[:, :2]) < 0.12).all(axis=1) & (points[:, 2] < 0.005)
     points[close, 2] -= 0.0 if given else 0.0015
     asked = {"support": {"normal": (0, 0, 1), "offset": -0.003}} if given else {}
@@ -306,7 +306,7 @@ def test_a_support_is_assumed_under_a_cloud_that_was_cut_off_above_it(frame: str
 @pytest.mark.parametrize("count", [20_000, 8_000])
 def test_a_sparse_cloud_of_the_whole_view_shows_the_same_objects(count: int) -> None:
     boxes, T_world_camera = boxes_on_table(2), camera(0.8, -1.5, 0.6)
-    points = seen_in_world([table(), *boxes, *BACKGROUND["floor"]], T_world_camera)
+    points = seen_in_world([table(), *boxes, *FURNISHINGS["floor"]], T_world_camera)
     dense = detect(points, T_world_camera)
     some = np.random.default_rng(0).choice(len(points), count, replace=False)
     sparse = detect(points[some], T_world_camera)
@@ -331,7 +331,7 @@ def test_a_plane_far_from_the_sent_up_is_no_support() -> None:
     assert any("no support plane" in warning for warning in found.warnings)
 
 
-@pytest.mark.parametrize("around", [[], [*BACKGROUND["monitor"], *BACKGROUND["floor"]]])
+@pytest.mark.parametrize("around", [[], [*FURNISHINGS["monitor"], *FURNISHINGS["floor"]]])
 def test_a_table_without_objects_is_a_support_and_has_no_grasps(around: list[SolidBox]) -> None:
     found = detect(render([table(), *around], camera(0.7, -1.5, 0.8)))
     assert found.support is not None
@@ -406,7 +406,7 @@ def test_a_camera_turned_about_its_axis_sees_the_same_objects(roll: float) -> No
 
 
 def test_new_noise_leaves_the_number_of_objects_and_thinning_most_of_them() -> None:
-    scene, pose = [table(), *BACKGROUND["wall"], *boxes_on_table(5)], camera(0.7, -1.3, 0.9)
+    scene, pose = [table(), *FURNISHINGS["wall"], *boxes_on_table(5)], camera(0.7, -1.3, 0.9)
     assert {len(detect(render(scene, pose, seed)).objects) for seed in range(4)} == {4}
     cloud = render([table(), *boxes_on_table(6)], camera(0.6, -1.2, 0.9)).reshape(-1, 3)
     some = np.random.default_rng(0).choice(np.flatnonzero(np.isfinite(cloud[:, 0])), 20_000, False)
@@ -476,12 +476,13 @@ def chosen_support(background: np.ndarray, objects: np.ndarray, camera: object) 
     """The support where all background is classified as such, and the warnings."""
     points = np.concatenate([background, objects])
     points += np.random.default_rng(0).normal(0, 0.001, points.shape)
-    number = np.repeat([FIXED, 0], [len(background), len(objects)])
+    number = np.repeat([BACKGROUND, 0], [len(background), len(objects)])
     up, of_object = np.array([0.0, 0.0, 1.0]), (number == 0).astype(np.float32)
     shown = Segmentation(number, of_object, 1 - of_object, np.ones(1), up)
-    seen, inside = Seen(points.astype(np.float32), np.array(camera)), np.ones(len(points), bool)
+    seen = ViewedPoints(points.astype(np.float32), np.array(camera))
+    inside = np.ones(len(points), bool)
     warnings: list[str] = []
-    return choose_support(seen, inside, shown, number == 0, parse_options({}), warnings), warnings
+    return find_support(seen, inside, shown, number == 0, parse_options({}), warnings), warnings
 
 
 @pytest.mark.parametrize("seed", range(4))

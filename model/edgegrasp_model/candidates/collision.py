@@ -19,11 +19,11 @@ from edgegrasp_model.options import Collision
 from edgegrasp_model.scene.cloud import UP, Cloud
 from edgegrasp_model.scene.obstacles import SolidBoxes, near_pairs, separation, signed_distance
 from edgegrasp_model.scene.scene import Scene
-from edgegrasp_model.scene.segment import FIXED
+from edgegrasp_model.scene.segment import BACKGROUND
 from edgegrasp_model.unseen import enters_unseen
 
-NEAR = 0.006  # metres around a finger that count as near it
-MIN_FIXED = 8  # voxels of background between the fingers that keep them from closing
+FINGER_SURROUNDINGS = 0.006  # metres around a finger that count as near it
+MIN_BACKGROUND_VOXELS = 8  # voxels of background between the fingers that keep them from closing
 
 
 def collides(
@@ -68,11 +68,13 @@ def collides(
                 hit[near[overlap] // len(boxes)] = True
     if request.margin >= 0.0:
         free = np.flatnonzero(~hit)
-        fixed = in_hands(scene.cloud.points[scene.object_of_point == FIXED], T_cloud_hand[free])
+        background = scene.cloud.points[scene.object_of_point == BACKGROUND]
         side, inner = gripper.pad_half_width, gripper.max_opening / 2
         low, high = (-side, -inner, gripper.palm_z), (side, inner, gripper.tip_z)
-        between, _, _ = points_in_hand_boxes(fixed, *np.array([low, high], dtype=np.float32))
-        hit[free] = np.bincount(between, minlength=len(free)) >= MIN_FIXED
+        between, _, _ = points_in_hand_boxes(
+            in_hands(background, T_cloud_hand[free]), *np.array([low, high], dtype=np.float32)
+        )
+        hit[free] = np.bincount(between, minlength=len(free)) >= MIN_BACKGROUND_VOXELS
         hit[free] |= enters_unseen(scene.depths, T_cloud_hand[free], gripper)
     return hit
 
@@ -106,8 +108,9 @@ class HandView(NamedTuple):
 def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandView:
     """The points of a cloud that open hands (E, 4, 4) meet on a straight approach, or nearly."""
     boxes = gripper.open_boxes
-    low = boxes[:, 0].min(axis=0) - np.array([NEAR, NEAR, APPROACH_LENGTH])
-    high = boxes[:, 1].max(axis=0) + np.array([NEAR, NEAR, 2 * NEAR])
+    near = FINGER_SURROUNDINGS
+    low = boxes[:, 0].min(axis=0) - np.array([near, near, APPROACH_LENGTH])
+    high = boxes[:, 1].max(axis=0) + np.array([near, near, 2 * near])
     high[2] += gripper.max_tip_z - gripper.tip_z
     reach = low.astype(np.float32), high.astype(np.float32)
     hand, row, position = points_in_hand_boxes(in_hands(cloud.points, T_cloud_hand), *reach)

@@ -18,21 +18,22 @@ from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
 from edgegrasp_model.kernels import compiled, extents_between, free_way, in_hands
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.results import NoGrasp
-from edgegrasp_model.scene.cloud import UP, Cloud, pose_of, unit
+from edgegrasp_model.scene.cloud import UP, Cloud, pose_matrix, unit
 
-MIN_EDGE = 0.003  # metres between approach and contact point
+MIN_EDGE_LENGTH = 0.003  # metres between approach and contact point
 # Metres that an edge stays below half the opening, a contact inside the fingertips, and a hand
 # behind what is ahead of it.
-MARGIN = 0.002
-MIN_DEPTH = 1e-4  # metres; a shallower edge has no approach direction
-CLOSED_FURTHER = 0.01  # metres by which an object may be narrower than it seems
-WIDE = 0.75  # share of the opening from which an object counts as wide
-BESIDE_PADS = 0.004  # metres beside the finger pads in which points count
-CELLS = tuple(0.04 * 0.7**level for level in range(8))  # metres, of grids over points
-NODES, SPREAD = 2**14, 2654435761  # nodes along a grid; its multiples modulo 2^32 look random
+FIT_MARGIN = 0.002
+MIN_EDGE_DEPTH = 1e-4  # metres; a shallower edge has no approach direction
+CLOSING_ALLOWANCE = 0.01  # metres by which an object may be narrower than it looks
+WIDE_SHARE = 0.75  # of the opening, from which an object counts as wide
+PAD_ALLOWANCE = 0.004  # metres beside the finger pads in which points count
+GRID_CELLS = tuple(0.04 * 0.7**level for level in range(8))  # metres, of grids over points
+GRID_NODES = 2**14  # along each side of a grid
+HASH_FACTOR = 2654435761  # Knuth's multiplicative hash, modulo 2^32
 
 
-def spread(
+def spread_out(
     points: Float32,  # (N, 3)
     count: int,
     before: Sequence[int] | Int64 = (),  # (B,) rows chosen earlier, which are excluded
@@ -45,16 +46,16 @@ def spread(
     chosen, total = np.asarray(before, dtype=np.int64), min(len(before) + count, len(points))
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     offset = (points - middle).astype(np.float64)
-    for cell in CELLS:
+    for cell in GRID_CELLS:
         if len(chosen) == total:
             break
         place = offset / cell
         node = np.rint(place)
-        number = (node + NODES // 2) @ (NODES**2, NODES, 1.0)
+        number = (node + GRID_NODES // 2) @ (GRID_NODES**2, GRID_NODES, 1.0)
         order = np.argsort(number + np.square(place - node).sum(axis=1))
         nearest = order[np.diff(number[order], prepend=-1.0) > 0]
         free = nearest[~np.isin(number[nearest], number[chosen])]
-        mixed = number[free].astype(np.uint64) * np.uint64(SPREAD) % np.uint64(2**32)
+        mixed = number[free].astype(np.uint64) * np.uint64(HASH_FACTOR) % np.uint64(2**32)
         chosen = np.append(chosen, free[np.argsort(mixed)][: total - len(chosen)])
     rest = np.delete(np.arange(len(points)), chosen)[: total - len(chosen)]
     return np.append(chosen[len(before) :], rest)
@@ -136,9 +137,9 @@ def edge_grasps(
     ahead = edge - along[:, None] * normal  # (M, 3) r_perp
     length, depth = np.linalg.norm(edge, axis=1), np.linalg.norm(ahead, axis=1)
     faults = {
-        NoGrasp.TOO_SHORT: length <= MIN_EDGE,
-        NoGrasp.TOO_LONG: length >= min(gripper.max_opening / 2 - MARGIN, reach),
-        NoGrasp.NO_DIRECTION: depth <= MIN_DEPTH,
+        NoGrasp.TOO_SHORT: length <= MIN_EDGE_LENGTH,
+        NoGrasp.TOO_LONG: length >= min(gripper.max_opening / 2 - FIT_MARGIN, reach),
+        NoGrasp.NO_DIRECTION: depth <= MIN_EDGE_DEPTH,
         NoGrasp.TOO_DEEP: depth >= gripper.contact_z - gripper.palm_z,
     }
     pair = np.flatnonzero(~np.any(list(faults.values()), axis=0))
@@ -148,7 +149,7 @@ def edge_grasps(
     y = normal - np.einsum("ed,ed->e", normal, z)[:, None] * z
     y = y / np.linalg.norm(y, axis=1, keepdims=True)
     place = cloud.points[approach_index] + (depth - gripper.contact_z_at(opening))[:, None] * z
-    pose = pose_of(np.stack([np.cross(y, z), y, z], axis=2), place).astype(np.float32)
+    pose = pose_matrix(np.stack([np.cross(y, z), y, z], axis=2), place).astype(np.float32)
     return Candidates(pair, approach_index, contact_index, depth, opening, pose), faults
 
 
@@ -157,7 +158,7 @@ def retract(
 ) -> tuple[Candidates, Bools]:
     """Move hands that cut into the support plane back along their approach, if that frees them.
 
-    The contact may move from contact_z to at most MARGIN inside the fingertips, so flat objects
+    The contact may move from contact_z to at most FIT_MARGIN inside the fingertips, so flat objects
     on a table are held by the tips. Returns the candidates, and a mask (E,) of those whose hand is
     `margin` metres above the plane now; the other hands are unchanged.
     """
@@ -166,7 +167,7 @@ def retract(
     rise = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
         back = np.where(clearance >= 0, 0.0, -clearance / rise)
-    clear = (back >= 0) & (back <= gripper.tip_z - gripper.contact_z - MARGIN)
+    clear = (back >= 0) & (back <= gripper.tip_z - gripper.contact_z - FIT_MARGIN)
     pose = pose.copy()
     pose[clear, :3, 3] += back[clear, None] * candidates.approach[clear]
     return replace(candidates, T_cloud_hand=pose), clear
@@ -180,7 +181,7 @@ def support_clearance(
 ) -> Float32:
     """Height (E,), metres, of each hand's lowest corner over the support as it closes.
 
-    Fingers that swing forward are assumed to close CLOSED_FURTHER metres beyond that opening.
+    Fingers that swing forward are assumed to close CLOSING_ALLOWANCE metres beyond that opening.
     """
     boxes = gripper.open_boxes
     middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2  # (B, 3) each
@@ -189,7 +190,7 @@ def support_clearance(
     along = x * rows[:, 0] + y * rows[:, 1] + z * rows[:, 2]  # (E, 4): of the axes, the origin
     normal_in_hand, origin_height = along[:, :3], along[:, 3] - support.offset
     corners = normal_in_hand @ middle.T - np.abs(normal_in_hand) @ half.T  # (E, B)
-    ahead = gripper.furthest_advance(opening - CLOSED_FURTHER)
+    ahead = gripper.furthest_advance(opening - CLOSING_ALLOWANCE)
     corners[:, len(gripper.hand.boxes) :] += (normal_in_hand[:, 2] * ahead)[:, None]
     clearance: Float32 = origin_height + np.min(list(corners.T), axis=0)
     return clearance.astype(np.float32)
@@ -212,15 +213,15 @@ def centred_grasps(
     """
     axes, origin = candidates.T_cloud_hand[:, :3, :3], candidates.T_cloud_hand[:, :3, 3]
     outward = np.einsum("ed,ed->e", points[candidates.contact_index] - origin, axes[:, :, 1])
-    least = WIDE * gripper.max_opening / 2 - MAX_SHIFT  # from the hand's axis to a contact
+    least = WIDE_SHARE * gripper.max_opening / 2 - MAX_SHIFT  # from the hand's axis to a contact
     wide = np.flatnonzero(np.abs(outward) > least)
     ball = crop.ball_of_point[candidates.pair[wide]]
-    half = gripper.pad_half_width + BESIDE_PADS
+    half = gripper.pad_half_width + PAD_ALLOWANCE
     pads = np.array([[-half, gripper.palm_z], [half, gripper.max_tip_z]], dtype=np.float32)
     hands = in_hands(points[crop.ball_rows], candidates.T_cloud_hand[wide])
     low, high = extents_between(hands, crop.start[ball], crop.start[ball + 1], pads).T
     middle, width = (low + high) / 2, high - low
-    moved = (width > WIDE * gripper.max_opening) & (width < gripper.max_opening)
+    moved = (width > WIDE_SHARE * gripper.max_opening) & (width < gripper.max_opening)
     moved &= (np.abs(middle) > MIN_SHIFT) & (np.abs(middle) < MAX_SHIFT)
     further = replace(candidates.take(wide[moved]), opening=width[moved])
     further.T_cloud_hand[:, :3, 3] += middle[moved, None] * further.T_cloud_hand[:, :3, 1]
@@ -230,14 +231,13 @@ def centred_grasps(
 # Grasps across an outline
 
 OUTLINE_RADIUS = 0.016  # metres of surface from which the outline's direction is estimated
-MIN_OUTWARD = 0.002  # metres from a neighbourhood's mean to a point on the outline
-THIN = 0.003  # metres of standard deviation across a rim, all of which counts as outline
-LEAN = np.radians(30.0)  # off vertical
-DROP = 0.006  # metres below an edge from which a surface counts as another one
-GAP = 0.007  # metres without a point in which a surface ends
-ONE_VIEW = np.cos(LEAN / 2)  # directions closer than that to up show the same outline
+MIN_OUTLINE_OFFSET = 0.002  # metres from a neighbourhood's mean to a point on the outline
+MAX_RIM_DEVIATION = 0.003  # metres, standard deviation across a rim, all of which is outline
+LEAN_ANGLE = np.radians(30.0)  # from vertical
+SURFACE_DROP = 0.006  # metres below an edge from which a surface counts as another one
+SURFACE_GAP = 0.007  # metres without a point, from which a surface counts as ended
 MAX_INSERTION = 0.020  # metres deeper than an edge grasp; more does not hold better
-STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it
+CELLS_PER_GAP = 4  # cells of a strip's histogram in the gap that ends it
 
 
 class Outline(NamedTuple):
@@ -253,14 +253,15 @@ def outlines(
     viewpoints: Float32 | None,  # (W, 3); None where they are unknown
     rows: Int64,  # (M,) of the points to look at
     *,
-    leaning: bool = False,  # also from four sides, LEAN off above
+    leaning: bool = False,  # also from four sides, LEAN_ANGLE off above
 ) -> list[Outline]:
     """The outlines of a cloud from above and, if that is another direction, from each camera."""
     toward = [np.broadcast_to(UP, points.shape)]
     toward += [unit(eye - points) for eye in ([] if viewpoints is None else viewpoints)]
     if leaning:
         for turn in np.linspace(0.0, 2 * np.pi, 4, endpoint=False):
-            way = np.array([np.sin(LEAN) * np.cos(turn), np.sin(LEAN) * np.sin(turn), np.cos(LEAN)])
+            level = np.sin(LEAN_ANGLE) * np.array([np.cos(turn), np.sin(turn)])
+            way = np.array([*level, np.cos(LEAN_ANGLE)])
             toward.append(np.broadcast_to(way.astype(np.float32), points.shape))
     ways = np.stack([each[rows] for each in toward])
     cells = (
@@ -268,7 +269,8 @@ def outlines(
     )
     sizes = cells.max(axis=0) + 2
     key = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
-    order, reach = np.argsort(key, kind="stable"), np.array([OUTLINE_RADIUS, DROP], np.float32)
+    order = np.argsort(key, kind="stable")
+    reach = np.array([OUTLINE_RADIUS, SURFACE_DROP], np.float32)
     columns = np.ascontiguousarray(points[order].T)
     spreads = _level_spread(columns, key[order], points[rows], key[rows], sizes, ways, reach)
     found: list[Outline] = []
@@ -276,9 +278,10 @@ def outlines(
         heading, is_edge = np.zeros_like(points), np.zeros(len(points), dtype=bool)
         # A point is on the outline if its neighbours at its height or above lie on one side.
         heading[rows] = least
-        is_edge[rows] = (outward > MIN_OUTWARD) | (deviation < THIN)
+        is_edge[rows] = (outward > MIN_OUTLINE_OFFSET) | (deviation < MAX_RIM_DEVIATION)
         if found:
-            is_edge[rows] &= way @ UP < ONE_VIEW
+            # Directions closer than that to up show the same outline.
+            is_edge[rows] &= way @ UP < np.cos(LEAN_ANGLE / 2)
         found.append(Outline(each, heading, is_edge))
     return found
 
@@ -305,16 +308,18 @@ def outline_grasps(
     contact, approach = crop.ball_rows[pair], approach_index[crop.ball_of_point[pair]]
     apart = points[contact] - points[approach]
     edge = np.einsum("md,mkd->km", apart, frame[contact, 1:])
-    between = (np.abs(edge[0]) < gripper.pad_half_width) & (edge[2] > -DROP)
-    row = np.flatnonzero(between & (edge[1] > MIN_EDGE) & (edge[1] < gripper.max_opening))
+    between = (np.abs(edge[0]) < gripper.pad_half_width) & (edge[2] > -SURFACE_DROP)
+    row = np.flatnonzero(between & (edge[1] > MIN_EDGE_LENGTH) & (edge[1] < gripper.max_opening))
     ball = crop.ball_of_point[pair[row]]
     first, last = crop.start[ball], crop.start[ball + 1]
-    strip = np.array([gripper.pad_half_width, gripper.max_opening, DROP, GAP], dtype=np.float32)
+    size = gripper.pad_half_width, gripper.max_opening
+    strip = np.array([*size, SURFACE_DROP, SURFACE_GAP], dtype=np.float32)
     # How far the surface extends between the pads from each contact, outward and inward: (M, 2).
     extent = extents_across(points, crop.ball_rows, first, last, frame[contact[row]], strip)
     width = extent[:, 1] - extent[:, 0]
-    held = (extent[:, 0] > -MIN_EDGE) & (width < gripper.max_opening - 2 * MARGIN)
-    held &= edge[1][row] < extent[:, 1] + MIN_EDGE  # the approach point lies on the same surface
+    held = (extent[:, 0] > -MIN_EDGE_LENGTH) & (width < gripper.max_opening - 2 * FIT_MARGIN)
+    # The approach point lies on the same surface.
+    held &= edge[1][row] < extent[:, 1] + MIN_EDGE_LENGTH
     off_axis = np.hypot(edge[0][row], edge[1][row] - extent.mean(axis=1))
     nearest = np.lexsort((off_axis, contact[row], ~held))[: held.sum()]
     chosen = nearest[np.unique(contact[row[nearest]], return_index=True)[1]]
@@ -322,7 +327,7 @@ def outline_grasps(
     contact, z = contact[row], z[contact[row]]
     middle = points[contact] - extent.mean(axis=1, keepdims=True) * y[contact]
     place = middle - gripper.contact_z_at(width)[:, None] * z
-    pose = pose_of(frame[contact, 1:].transpose(0, 2, 1), place).astype(np.float32)
+    pose = pose_matrix(frame[contact, 1:].transpose(0, 2, 1), place).astype(np.float32)
     depth = np.maximum(edge[2][row], 0.0)
     hands = Candidates(pair[row], approach[row], contact, depth, width, pose)
     return _inserted(points, hands, support, gripper, margin)
@@ -336,7 +341,7 @@ def _inserted(
     margin: float,
 ) -> Candidates:
     """The hands moved in until something is right ahead, without those that stop early."""
-    least = gripper.contact_z + MARGIN - gripper.tip_z  # metres of way that it takes
+    least = gripper.contact_z + FIT_MARGIN - gripper.tip_z  # metres of way that it takes
     room = np.full(len(candidates), np.inf, dtype=np.float32)  # metres of way above the support
     if support is not None:
         fall = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
@@ -347,7 +352,7 @@ def _inserted(
     enough = np.flatnonzero(room >= least)
     candidates = candidates.take(enough)
     boxes = gripper.open_boxes + margin * np.array([[-1.0], [1.0]])
-    way = free_way(in_hands(points, candidates.T_cloud_hand), boxes, APPROACH_LENGTH) - MARGIN
+    way = free_way(in_hands(points, candidates.T_cloud_hand), boxes, APPROACH_LENGTH) - FIT_MARGIN
     way = np.minimum(way, room[enough])
     row = np.flatnonzero(way >= least)
     hands = candidates.take(row)
@@ -371,7 +376,7 @@ def extents_across(
     """Least and greatest metres (M, 2) that the surface extends into the object, across an edge."""
     columns, extent = np.ascontiguousarray(points[rows].T), np.zeros((len(frame), 2), np.float32)
     length, gap = strip[1], strip[3]
-    cell = gap / STRIP_CELLS
+    cell = gap / CELLS_PER_GAP
     cells = int(np.ceil((length + gap) / cell)) + 1
     reached = np.empty(cells, np.float32)
     depth = np.empty(np.max(last - first) if len(first) else 0, np.float32)

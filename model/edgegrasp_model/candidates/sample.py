@@ -19,7 +19,7 @@ from edgegrasp_model.candidates.edge_grasps import (
     outline_grasps,
     outlines,
     retract,
-    spread,
+    spread_out,
 )
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import non_max_suppression
@@ -35,11 +35,11 @@ from edgegrasp_model.scene.scene import Scene
 
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
 MIN_APPROACH_POINTS, MAX_APPROACH_POINTS = 32, 64  # of a scene, for each view
-MOST_VIEWS = 4  # of further approach points
-FEWEST_EACH = 4  # of an object, however many there are; twice as many if there is room
+MAX_VIEWS_SAMPLED = 4  # for which there are further approach points
+MIN_PER_OBJECT = 4  # of an object, however many there are; twice as many if there is room
 OVERSAMPLING = 4  # hands checked for collision, in multiples of num_candidates
-NEAR, TURNED = 0.004, math.radians(10)  # within which hands share one score
-CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
+SAME_TRANSLATION, SAME_ROTATION = 0.004, math.radians(10)  # within which hands share one score
+OUTCOME_CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
 PRESET_ANGLE = math.radians(30)  # between a hand's direction and straight down, or the horizontal
 MIN_APPROACH_UP = -0.1  # where nothing is asked for: cosine of the outward approach and up
 
@@ -51,7 +51,7 @@ class Sample:
     candidates: Candidates  # E of them
     collision_free: Bools  # (E,)
     drawn: Candidates  # all of them, C
-    outcome: NDArray[np.int8]  # (C,) CODE of each one's outcome; RETURNED: it is to be scored
+    outcome: NDArray[np.int8]  # (C,) each one's OUTCOME_CODE; RETURNED: it is to be scored
     row: Int64  # (E,) indices of the candidates among them
     logits: Float32 = field(default_factory=lambda: np.empty(0, np.float32))  # (E,) once scored
 
@@ -88,11 +88,11 @@ class Sampler:
         self._objects, size = np.unique(scene.object_of_point[self._rows], return_counts=True)
         most = options.num_approach_points
         if most is None and len(size) <= MAX_APPROACH_POINTS:
-            wanted = np.clip(size // POINTS_PER_APPROACH, 2 * FEWEST_EACH, MAX_APPROACH_POINTS)
+            wanted = np.clip(size // POINTS_PER_APPROACH, 2 * MIN_PER_OBJECT, MAX_APPROACH_POINTS)
             wanted = np.maximum(wanted, MIN_APPROACH_POINTS // len(size))
             wanted = np.floor(wanted * min(MAX_APPROACH_POINTS / wanted.sum(), 1.0))
-            views = 1 if scene.viewpoints is None else min(len(scene.viewpoints), MOST_VIEWS)
-            wanted = np.maximum(wanted.astype(np.int64), FEWEST_EACH) * views
+            views = 1 if scene.viewpoints is None else min(len(scene.viewpoints), MAX_VIEWS_SAMPLED)
+            wanted = np.maximum(wanted.astype(np.int64), MIN_PER_OBJECT) * views
         else:  # the largest objects first where there are fewer approach points than objects
             total = most or MAX_APPROACH_POINTS
             share = np.sqrt(size) / np.sqrt(size).sum() * total
@@ -122,25 +122,26 @@ class Sampler:
             return None
         options, mode = self.options, self.options.collision.mode
         drawn, outcome = self._constrained(more, last_resort=last_resort)
-        passed = np.flatnonzero(outcome == CODE[Outcome.RETURNED])
-        row = some_of(passed, OVERSAMPLING * options.num_candidates, self._rng)
+        passed = np.flatnonzero(outcome == OUTCOME_CODE[Outcome.RETURNED])
+        row = random_rows(passed, OVERSAMPLING * options.num_candidates, self._rng)
         checked = drawn.take(row)
         hands = checked.T_cloud_hand, checked.opening
         free = ~collides(self.scene, *hands, self.gripper, options.collision)
-        outcome[passed], outcome[row] = CODE[Outcome.NOT_CHECKED], CODE[Outcome.NOT_SCORED]
+        outcome[passed] = OUTCOME_CODE[Outcome.NOT_CHECKED]
+        outcome[row] = OUTCOME_CODE[Outcome.NOT_SCORED]
         if mode != "ignore":
-            outcome[row[~free]] = CODE[Outcome.COLLISION]
+            outcome[row[~free]] = OUTCOME_CODE[Outcome.COLLISION]
         self.counts["checked"] += len(row)
         self.counts["collision_free"] += int(free.sum())
         new = free | (mode != "avoid")
-        new[new] = different(checked.T_cloud_hand[new], free[new], self.gripper, options)
+        new[new] = distinct_hands(checked.T_cloud_hand[new], free[new], self.gripper, options)
         most = options.num_candidates - self.counts["scored"]
-        scored = some_of(np.flatnonzero(new & (free | (mode == "ignore"))), most, self._rng)
+        scored = random_rows(np.flatnonzero(new & (free | (mode == "ignore"))), most, self._rng)
         if mode == "penalise":  # then those that collide
-            rest = some_of(np.flatnonzero(new & ~free), most - len(scored), self._rng)
+            rest = random_rows(np.flatnonzero(new & ~free), most - len(scored), self._rng)
             scored = np.sort(np.concatenate([scored, rest]))
         row, free = row[scored], free[scored]
-        outcome[row] = CODE[Outcome.RETURNED]
+        outcome[row] = OUTCOME_CODE[Outcome.RETURNED]
         self.counts["scored"] += len(row)
         return Sample(drawn.take(row), free, drawn, outcome, row)
 
@@ -181,15 +182,15 @@ class Sampler:
             ]
             candidates = Candidates.concatenate([candidates, *across])
         self.counts["candidates"] += len(candidates)
-        outcome = np.full(len(candidates), CODE[Outcome.RETURNED])
+        outcome = np.full(len(candidates), OUTCOME_CODE[Outcome.RETURNED])
         if scene.support is not None:
             candidates, clear = retract(candidates, scene.support, gripper, margin)
-            outcome[~clear] = CODE[Outcome.SUPPORT]
+            outcome[~clear] = OUTCOME_CODE[Outcome.SUPPORT]
         asked, in_frame = options.approach_direction, scene.frame.directions
         allowed = allowed_directions(-candidates.approach, asked, in_frame)
-        outcome[~allowed] = CODE[Outcome.DIRECTION]
+        outcome[~allowed] = OUTCOME_CODE[Outcome.DIRECTION]
         self.counts["in_direction"] += int(allowed.sum())
-        self.counts["clear_of_support"] += int((outcome == CODE[Outcome.RETURNED]).sum())
+        self.counts["clear_of_support"] += int((outcome == OUTCOME_CODE[Outcome.RETURNED]).sum())
         return candidates, outcome
 
     def _spread(self, counts: Int64) -> Int64:
@@ -204,24 +205,24 @@ class Sampler:
                 chosen.append(self._rng_approach.choice(left, count, replace=False))
             else:
                 points = self.scene.cloud.points[mine]
-                chosen.append(mine[spread(points, count, np.flatnonzero(used))])
+                chosen.append(mine[spread_out(points, count, np.flatnonzero(used))])
         return np.concatenate(chosen)
 
 
-def different(
+def distinct_hands(
     T_cloud_hand: Float32, first: Bools, gripper: Gripper, options: DetectOptions
 ) -> Bools:
     """Hands (E,) that non-maximum suppression keeps whatever their scores; `first` come first."""
     rule = options.suppression
-    near = 0.0 if rule is None else min(NEAR, rule.translation)
-    turned = 0.0 if rule is None else min(TURNED, rule.rotation)
+    near = 0.0 if rule is None else min(SAME_TRANSLATION, rule.translation)
+    turned = 0.0 if rule is None else min(SAME_ROTATION, rule.rotation)
     kept, T_cloud_tcp = np.zeros(len(first), dtype=bool), T_cloud_hand @ gripper.T_hand_tcp
     order = np.argsort(~first, kind="stable")
     kept[non_max_suppression(T_cloud_tcp, order, near, turned, len(order))[0]] = True
     return kept
 
 
-def some_of(rows: Int64, limit: int, rng: np.random.Generator) -> Int64:
+def random_rows(rows: Int64, limit: int, rng: np.random.Generator) -> Int64:
     """At most `limit` of ascending rows, at random."""
     return rows if len(rows) <= limit else np.sort(rng.choice(rows, limit, replace=False))
 

@@ -18,8 +18,8 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from edgegrasp_camera.arrays import Bools, Float32, Int64
-from edgegrasp_model.candidates.collision import NEAR, HandView, hand_views
-from edgegrasp_model.candidates.edge_grasps import GAP, Candidates, support_clearance
+from edgegrasp_model.candidates.collision import FINGER_SURROUNDINGS, HandView, hand_views
+from edgegrasp_model.candidates.edge_grasps import SURFACE_GAP, Candidates, support_clearance
 from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks import layers
@@ -253,7 +253,8 @@ def _look_from_each(
         x = side[e] * x
         _count_hits(x, y, z, hand, seen[e, :7])
         across, ahead = np.abs(y) < hand.inner, z > hand.palm
-        pads = across & ahead & (np.abs(x) < hand.half + NEAR) & (z < hand.tip + NEAR)
+        beside = np.abs(x) < hand.half + FINGER_SURROUNDINGS
+        pads = across & ahead & beside & (z < hand.tip + FINGER_SURROUNDINGS)
         wide = np.flatnonzero(across & ahead & (np.abs(x) < 3 * hand.half) & (z < hand.end))
         points, facing = np.empty((2, 3, len(wide)), dtype=np.float32)
         points[0], points[1], points[2] = x[wide], y[wide], z[wide] - hand.palm
@@ -275,7 +276,7 @@ def _count_hits(x: Float32, y: Float32, z: Float32, hand: _Hand, hits: Float32) 
         outward = y if finger == 0 else -y
         on_way |= _in_any(hand.fingers, x, outward, z, 0.0, APPROACH_LENGTH)
         hits[finger] = np.sum(_in_any(hand.fingers, x, outward, z, 0.0, 0.0))
-        hits[3 + finger] = np.sum(_in_any(hand.fingers, x, outward, z, NEAR, 0.0))
+        hits[3 + finger] = np.sum(_in_any(hand.fingers, x, outward, z, FINGER_SURROUNDINGS, 0.0))
     hits[2] = np.sum(_in_any(hand.boxes, x, y, z, 0.0, 0.0))
     hits[5] = np.sum(on_way)
     hits[6] = np.sum((np.abs(x) < hand.half) & (np.abs(y) < hand.inner) & (z >= hand.tip))
@@ -364,7 +365,7 @@ def _runs_along(y: Float32, ends: Float32, runs: Float32) -> None:
     for i in range(1, len(along)):
         apart = along[i] - along[i - 1]
         runs[0] = max(runs[0], apart)
-        if apart > GAP:
+        if apart > SURFACE_GAP:
             runs[1] = high - along[i]
             if whole:
                 runs[2] = along[i - 1] - low

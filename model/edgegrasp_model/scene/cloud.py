@@ -14,22 +14,22 @@ from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import Workspace
 
-MAX_EXTENT = 20.0  # metres; if most of a cloud is wider, it is probably in millimetres
+MAX_CLOUD_EXTENT = 20.0  # metres; if most of a cloud is wider, it is probably in millimetres
 MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
 OUTLIER_NEIGHBORS = 8
 OUTLIER_DEVIATIONS = 2.5
 NORMAL_NEIGHBORS = 20
 JACOBI_SWEEPS = 6  # rounds of Jacobi's method for a symmetric 3 x 3 matrix; more change nothing
-DIAGONAL = 1e-12  # off-diagonal sum, as a share of the trace, at which Jacobi's method stops
+JACOBI_TOLERANCE = 1e-12  # off-diagonal sum at which it stops, as a share of the trace
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
-CUBE = 8  # voxels along the edge of a cube; points are stored cube by cube
-WIDEST_VIEW = 1.2  # tangent of half the angle that a depth camera sees
-MAX_UPWARD = 0.5  # sine of the angle from the level at which a camera looks up
-SHORTEST = 1e-3  # a shorter horizontal offset (metres) or mean normal has no direction
-ENOUGH = 6000  # points that stand for a whole cloud where a fit, a mean or a view is asked for
-LARGE = 704, 960  # pixels of an image of which every second row and column may be enough
-FINE = 0.00125  # metres between its neighbouring pixels, at most, if they are
-STRAY = 0.5  # percent of the points that may lie beyond the end of a range
+CUBE_VOXELS = 8  # along the edge of a cube; points are stored cube by cube
+MAX_VIEW_TANGENT = 1.2  # of half a depth camera's field of view
+MAX_UPWARD_SINE = 0.5  # of the angle from the horizontal at which a camera looks up
+MIN_LENGTH = 1e-3  # of a horizontal offset (metres) or mean normal that has a direction
+SUBSAMPLE_SIZE = 6000  # points that represent a cloud in fits, means and views
+LARGE_IMAGE = 704, 960  # pixels of an image of which every second row and column may be enough
+FINE_SPACING = 0.00125  # metres between neighbouring pixels of such an image, at most
+OUTLIER_PERCENT = 0.5  # of the points, beyond each end of a range
 
 Vectors = TypeVar("Vectors", bound=Floats)
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -99,11 +99,11 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
     low, high = (np.array([end(axis) for axis in points.T]) for end in (np.min, np.max))
     if not np.isfinite([low, high]).all():
         raise _not_finite(points)
-    if (high - low).max() > MAX_EXTENT:
-        near = _near_points(points)
+    if (high - low).max() > MAX_CLOUD_EXTENT:
+        near = _without_far_points(points)
         said += (
             f"{len(points) - len(near)} points are left out that lie more than "
-            f"{MAX_EXTENT / 2:g} m from the middle of the cloud.",
+            f"{MAX_CLOUD_EXTENT / 2:g} m from the middle of the cloud.",
         )
         points, row = points[near], row[near]
         low, high = points.min(axis=0), points.max(axis=0)
@@ -116,9 +116,9 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
         fix = "Send more points or lower options.num_approach_points."
         raise InvalidRequest("cloud", value, fix)
     if sent.colors is not None:
-        _beside("colors", sent.colors, size, row[:0])  # checked, though no grasp depends on them
+        _checked_array("colors", sent.colors, size, row[:0])  # no grasp depends on them
     arrays = {
-        name: _beside(name, array, size, row)
+        name: _checked_array(name, array, size, row)
         for name in ("normals", "segment_ids", "view_ids")
         if (array := getattr(sent, name)) is not None
     }
@@ -130,20 +130,20 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
 
 def _is_fine(image: Floats) -> bool:
     """Whether an image (H, W, 3) is large and its neighbouring pixels lie close together."""
-    if image.shape[0] < LARGE[0] or image.shape[1] < LARGE[1]:
+    if image.shape[0] < LARGE_IMAGE[0] or image.shape[1] < LARGE_IMAGE[1]:
         return False
     with np.errstate(invalid="ignore"):  # holes may be infinite
         apart = np.linalg.norm(image[::16, 1::8] - image[::16, :-1:8], axis=-1)
     apart = apart[np.isfinite(apart)]
-    return len(apart) > 0 and bool(np.median(apart) <= FINE)
+    return len(apart) > 0 and bool(np.median(apart) <= FINE_SPACING)
 
 
-def thinned(rows: NDArray[Scalar], most: int = ENOUGH) -> NDArray[Scalar]:
+def subsample(rows: NDArray[Scalar], most: int = SUBSAMPLE_SIZE) -> NDArray[Scalar]:
     """Rows spread evenly over all of an array, `most` of them or a few more."""
     return rows[:: max(len(rows) // most, 1)]
 
 
-def cells_of(points: Floats, side: float) -> tuple[Int64, Int64]:
+def grid_cells(points: Floats, side: float) -> tuple[Int64, Int64]:
     """The cell (N,), from 0, in which each point (N, D) lies, and the points (C,) in each cell.
 
     They are `side` metres wide.
@@ -169,7 +169,7 @@ def unit(vectors: Vectors) -> Vectors:
     return cast("Vectors", vectors / np.maximum(length, 1e-9))
 
 
-def pose_of(turn: Floats, place: ArrayLike) -> Float64:
+def pose_matrix(turn: Floats, place: ArrayLike) -> Float64:
     """The pose T (..., 4, 4) of a rotation (..., 3, 3) and a translation (..., 3)."""
     T = np.zeros((*turn.shape[:-2], 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = turn, place, 1.0
@@ -182,14 +182,14 @@ def seen_from_origin(points: Float32, up: ArrayLike | None) -> bool:
     If `up` (3,) is known, such a camera must not look steeply upward.
     """
     x, y, z = points.T
-    if len(points) == 0 or z.min() <= 0 or np.quantile(np.hypot(x, y) / z, 0.99) > WIDEST_VIEW:
+    if len(points) == 0 or z.min() <= 0 or np.quantile(np.hypot(x, y) / z, 0.99) > MAX_VIEW_TANGENT:
         return False
     middle = points.mean(axis=0, dtype=np.float64)
     upward = 0.0 if up is None else np.dot(up, middle) / np.linalg.norm(up)
-    return bool(upward <= MAX_UPWARD * np.linalg.norm(middle))
+    return bool(upward <= MAX_UPWARD_SINE * np.linalg.norm(middle))
 
 
-def _beside(field: str, array: object, size: int, row: Int64) -> Array:
+def _checked_array(field: str, array: object, size: int, row: Int64) -> Array:
     """The given rows of an array beside the cloud, of one integer or of three floats a point."""
     width = 1 if field.endswith("_ids") else 3
     kinds, kind = ("iu", "one integer") if width == 1 else ("fui", "three numbers")
@@ -236,17 +236,17 @@ def _not_finite(points: Floats) -> InvalidRequest:
     return InvalidRequest("cloud", value, "Remove points without a finite x, y, z.")
 
 
-def _near_points(points: Floats) -> Int64:
+def _without_far_points(points: Floats) -> Int64:
     """Rows of the points (N, 3) without stray readings far away."""
     distance = np.abs(points.astype(np.float64) - np.median(points, axis=0)).max(axis=1)
     bulk = 2 * float(np.median(distance))
-    if bulk > MAX_EXTENT:
+    if bulk > MAX_CLOUD_EXTENT:
         raise InvalidRequest(
             "cloud",
             f"an extent of {bulk:.4g} m, which suggests millimetres",
             "Send metres: divide by 1000, or send a depth image with depth_scale 0.001.",
         )
-    return np.flatnonzero(distance <= MAX_EXTENT / 2)
+    return np.flatnonzero(distance <= MAX_CLOUD_EXTENT / 2)
 
 
 class Voxels(NamedTuple):
@@ -280,14 +280,14 @@ def voxelise(points: Floats, voxel_size: float) -> Voxels:
     # Stored cube by cube, so that loops over hands skip many distant points at a time.
     keys = np.zeros(len(points), dtype=np.int64)
     for cell in cells:
-        keys = keys * (cell.max() // CUBE + 1) + cell // CUBE
+        keys = keys * (cell.max() // CUBE_VOXELS + 1) + cell // CUBE_VOXELS
     for cell in cells:
-        keys = keys * CUBE + cell % CUBE
+        keys = keys * CUBE_VOXELS + cell % CUBE_VOXELS
     _, voxel, count = np.unique(keys, return_inverse=True, return_counts=True)
     return Voxels(voxel, count)
 
 
-def neighbourhoods(points: Float32) -> tuple[Bools, Int64]:
+def inliers_and_neighbours(points: Float32) -> tuple[Bools, Int64]:
     """Which of points (N, 3) are no outliers, (N,), and rows (N, K) of the nearest to each.
 
     The mean distance of an outlier to those next to it is unusual for the cloud. The first of the
@@ -304,7 +304,7 @@ def neighbourhoods(points: Float32) -> tuple[Bools, Int64]:
 
 
 @compiled("contract")
-def least_spread(points: Float32, rows: Int64) -> Float32:
+def smallest_variance_directions(points: Float32, rows: Int64) -> Float32:
     """Unit direction (M, 3), either sign, in which points (N, 3) of rows (M, K) spread least."""
     count, direction = rows.shape[1], np.empty((len(rows), 3), np.float32)
     around, spread, axes = np.empty((count, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -324,9 +324,9 @@ def least_spread(points: Float32, rows: Int64) -> Float32:
                     spread[i, j] += around[k, i] * around[k, j]
         for _ in range(JACOBI_SWEEPS):
             for turn in range(3):
-                _rotate_away(spread, axes, turn % 2, 1 if turn == 0 else 2)
+                _jacobi_rotation(spread, axes, turn % 2, 1 if turn == 0 else 2)
             off = abs(spread[0, 1]) + abs(spread[0, 2]) + abs(spread[1, 2])
-            if off <= DIAGONAL * (spread[0, 0] + spread[1, 1] + spread[2, 2]):
+            if off <= JACOBI_TOLERANCE * (spread[0, 0] + spread[1, 1] + spread[2, 2]):
                 break
         least = 0
         for d in range(1, 3):
@@ -337,7 +337,7 @@ def least_spread(points: Float32, rows: Int64) -> Float32:
 
 
 @compiled("contract")
-def _rotate_away(matrix: Float64, axes: Float64, p: int, q: int) -> None:
+def _jacobi_rotation(matrix: Float64, axes: Float64, p: int, q: int) -> None:
     """One rotation of Jacobi's method: makes element (p, q) of a symmetric matrix 0."""
     if matrix[p, q] == 0.0:
         return
@@ -379,11 +379,11 @@ class CanonicalFrame:
         for offsets in (eyes - origin, points - origin, np.eye(3)):
             level = offsets - (offsets @ z)[:, None] * z  # as seen from above
             length = np.linalg.norm(level, axis=1)
-            if length.max(initial=0.0) >= SHORTEST:
+            if length.max(initial=0.0) >= MIN_LENGTH:
                 x = level[length.argmax()] / length.max()
                 break
         turn = np.stack([x, np.cross(z, x), z])
-        return cls(pose_of(turn, -turn @ origin))
+        return cls(pose_matrix(turn, -turn @ origin))
 
     def points(self, points: ArrayLike) -> Float64:
         """Points (..., 3) of the cloud's frame in this one."""

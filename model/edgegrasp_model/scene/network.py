@@ -17,22 +17,29 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.kernels import compiled
-from edgegrasp_model.scene.cloud import LARGE, STRAY, WIDEST_VIEW, pose_of, thinned, unit
+from edgegrasp_model.scene.cloud import (
+    LARGE_IMAGE,
+    MAX_VIEW_TANGENT,
+    OUTLIER_PERCENT,
+    pose_matrix,
+    subsample,
+    unit,
+)
 
-MULTIPLE = 32  # its sides are multiples of
+SIDE_MULTIPLE = 32  # pixels; the sides of its images are multiples of this
 CLASSES = ("other", "support", "object")
-CHANNELS = 12  # of `scene_features`
-WIDTHS = (16, 32, 48, 64, 96, 128)  # channels at each resolution, the output's first
-STRIDE = 2  # pixels of the input between neighbours whose difference gives the normal
+INPUT_CHANNELS = 12  # of `scene_features`
+LAYER_WIDTHS = (16, 32, 48, 64, 96, 128)  # channels at each resolution, the output's first
+NORMAL_STRIDE = 2  # pixels from each pixel to the neighbours that give its normal
 VOTE_UNIT = 0.05  # metres
 # Of range images:
-NEAREST = 0.05  # metres from the viewpoint
-COARSE = 40  # cells across the view in which the density of points is measured
-SPACING = 1.25  # side of a pixel, in distances of sparser points, so that few stay empty
-FILLED = 1.6  # pixels between neighbouring points up to which holes are filled from around them
-COARSEST = 0.003  # metres, of a pixel at the median depth; those of sparser clouds are divided
-DENSE = 2  # points per pixel; more add nothing
-SURFACE = 0.02  # metres; a point nearer by this much hides another of the same pixel
+NEAREST_DEPTH = 0.05  # metres from the viewpoint
+DENSITY_CELLS = 40  # cells across the view in which the density of points is measured
+PIXEL_SPACING = 1.25  # side of a pixel, in distances of sparse points, so that few stay empty
+MAX_HOLE_SPACING = 1.6  # pixels between points up to which holes are filled by interpolation
+MAX_PIXEL_SIZE = 0.003  # metres at the median depth; larger pixels are divided
+MAX_POINTS_PER_PIXEL = 2  # more add nothing
+SURFACE_DEPTH = 0.02  # metres; a point nearer by this much hides another of the same pixel
 
 
 class SceneOutput(NamedTuple):
@@ -49,8 +56,8 @@ class SceneNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        first, last, pairs = WIDTHS[0], WIDTHS[-1], list(pairwise(WIDTHS))
-        self.stem = _layer(CHANNELS, first, kernel=4, stride=2)
+        first, last, pairs = LAYER_WIDTHS[0], LAYER_WIDTHS[-1], list(pairwise(LAYER_WIDTHS))
+        self.stem = _layer(INPUT_CHANNELS, first, kernel=4, stride=2)
         self.fine = _layer(first, first)
         self.down = nn.ModuleList(
             [nn.Sequential(_layer(a, b, stride=2), _Block(b)) for a, b in pairs]
@@ -61,7 +68,7 @@ class SceneNet(nn.Module):
         self.head = nn.Conv2d(first, len(CLASSES) + 3 + 2 + 3, 1)  # as in SceneOutput
 
     def forward(self, features: Tensor) -> SceneOutput:
-        """Maps features (B, CHANNELS, H, W); H and W are multiples of 32."""
+        """Maps features (B, INPUT_CHANNELS, H, W); H and W are multiples of 32."""
         x = self.fine(self.stem(features))
         kept = []
         for layer in self.down:
@@ -114,9 +121,9 @@ def scene_features(
     up: Float64 | None,  # (3,) unit, away from gravity, camera frame; None: unknown
     footprint: float,  # width of a pixel at a depth of one metre, metres
 ) -> Float32:
-    """The network's input (CHANNELS, H, W) for a range image; zero where there is no reading."""
+    """The network's input (INPUT_CHANNELS, H, W) for a range image; 0 where nothing was read."""
     known = np.zeros(3) if up is None else np.asarray(up, dtype=np.float64)
-    features = np.zeros((*points.shape[:2], CHANNELS), dtype=np.float32)
+    features = np.zeros((*points.shape[:2], INPUT_CHANNELS), dtype=np.float32)
     _fill_features(
         np.ascontiguousarray(points), known, up is not None, np.log(footprint) + 6.0, features
     )
@@ -134,7 +141,7 @@ def _fill_features(points: Float32, up: Float64, known: bool, offset: float, out
                 for d in range(3):
                     middle[d] += points[i, j, d]
     middle /= max(count, 1)
-    s = STRIDE
+    s = NORMAL_STRIDE
     for i in range(height):
         for j in range(width):
             x, y, z = points[i, j, 0], points[i, j, 1], points[i, j, 2]
@@ -185,7 +192,7 @@ def range_image(
 ) -> RangeImage:
     """Render points as seen from a viewpoint."""
     downward = [way for way in (None if up is None else -up, down) if way is not None]
-    apart = thinned(points).astype(np.float64) - viewpoint
+    apart = subsample(points).astype(np.float64) - viewpoint
     sight = unit(apart)
     # Rounded, so that the image is independent of the order of the points.
     turn = _camera_axes(sight.mean(axis=0).round(9), downward)
@@ -195,23 +202,25 @@ def range_image(
     in_view = apart @ turn.T
     low, high = _view(in_view)
     # As many pixels as a large image has with half of its rows and columns.
-    finest = float(np.sqrt(4 * (high - low).prod() / np.prod(LARGE)))
+    finest = float(np.sqrt(4 * (high - low).prod() / np.prod(LARGE_IMAGE)))
     # Distance at a depth of one metre between neighbours, from the area that points cover.
-    ahead, cell = in_view[in_view[:, 2] > NEAREST], max(float((high - low).max()) / COARSE, 1e-6)
+    ahead = in_view[in_view[:, 2] > NEAREST_DEPTH]
+    cell = max(float((high - low).max()) / DENSITY_CELLS, 1e-6)
     place = ((ahead[:, :2] / ahead[:, 2:] - low) / cell).astype(np.int64)
     occupied = len(np.unique(place[:, 0] * 4096 + place[:, 1])) * cell * cell
     spacing = float(np.sqrt(occupied / len(points)))
-    pixel_size = finest if spacing < FILLED * finest else SPACING * spacing
-    width, height = (int(np.ceil(side / MULTIPLE)) * MULTIPLE for side in (high - low) / pixel_size)
+    pixel_size = finest if spacing < MAX_HOLE_SPACING * finest else PIXEL_SPACING * spacing
+    pixels = (high - low) / pixel_size
+    width, height = (int(np.ceil(side / SIDE_MULTIPLE)) * SIDE_MULTIPLE for side in pixels)
     middle = (low + high) / 2
     corner = middle - pixel_size * np.array([width, height]) / 2
-    some = thinned(points, DENSE * width * height)
+    some = subsample(points, MAX_POINTS_PER_PIXEL * width * height)
     filled = _fill_holes(_render(some, viewpoint, turn, corner, pixel_size, (height, width)))
-    coarse = float(np.median(in_view[:, 2])) * pixel_size / COARSEST
+    coarse = float(np.median(in_view[:, 2])) * pixel_size / MAX_PIXEL_SIZE
     if (times := min(round(pixel_size / finest), int(np.ceil(coarse)))) > 1:
         pixel_size /= times
         filled = _enlarged(filled[..., 2], times, corner, pixel_size)
-    return RangeImage(filled, pixel_size, pose_of(turn.T, viewpoint), corner)
+    return RangeImage(filled, pixel_size, pose_matrix(turn.T, viewpoint), corner)
 
 
 def _camera_axes(sight: Float64, downward: list[Float64]) -> Float64:
@@ -231,12 +240,13 @@ def _camera_axes(sight: Float64, downward: list[Float64]) -> Float64:
 
 def _view(points: Float64) -> tuple[Float64, Float64]:
     """Lowest and highest x / z and y / z (2,) that an image of points (N, 3) covers."""
-    ahead = points[points[:, 2] > NEAREST]
+    ahead = points[points[:, 2] > NEAREST_DEPTH]
     if len(ahead) == 0:
         return np.full(2, -0.1), np.full(2, 0.1)
-    low, high = np.percentile(ahead[:, :2] / ahead[:, 2:], (STRAY, 100 - STRAY), axis=0)
+    ends = OUTLIER_PERCENT, 100 - OUTLIER_PERCENT
+    low, high = np.percentile(ahead[:, :2] / ahead[:, 2:], ends, axis=0)
     edge = 0.02 * (high - low) + 1e-3
-    low, high = np.maximum(low - edge, -WIDEST_VIEW), np.minimum(high + edge, WIDEST_VIEW)
+    low, high = np.maximum(low - edge, -MAX_VIEW_TANGENT), np.minimum(high + edge, MAX_VIEW_TANGENT)
     return low.round(9), high.round(9)
 
 
@@ -247,7 +257,7 @@ def _enlarged(depth: Float32, times: int, corner: Float64, pixel_size: float) ->
     """
     nearest = depth.repeat(times, axis=0).repeat(times, axis=1)
     between = ndimage.zoom(depth, times, order=1, mode="nearest", grid_mode=True)
-    smooth = np.abs(between - nearest) < SURFACE  # false for NaN
+    smooth = np.abs(between - nearest) < SURFACE_DEPTH  # false for NaN
     z = np.where(smooth, between, nearest)
     y, x = (np.indices(z.shape) + 0.5) * pixel_size + corner[::-1, None, None]
     return np.stack([x * z, y * z, z], axis=-1).astype(np.float32)
@@ -270,7 +280,7 @@ def _render(
     depth, off = np.empty((2, len(points)), dtype=np.float32)
     for n in range(len(points)):
         x, y, z = _in_view(points[n], viewpoint, turn)
-        if z < NEAREST:
+        if z < NEAREST_DEPTH:
             continue
         u = (x / z - corner[0]) / pixel_size
         v = (y / z - corner[1]) / pixel_size
@@ -282,7 +292,7 @@ def _render(
         nearest[p] = min(nearest[p], depth[n])
     for n in range(len(points)):
         p = pixel[n]
-        if p >= 0 and depth[n] < nearest[p] + SURFACE and off[n] < best[p]:
+        if p >= 0 and depth[n] < nearest[p] + SURFACE_DEPTH and off[n] < best[p]:
             best[p] = off[n]
             pixels[p, 0], pixels[p, 1], pixels[p, 2] = _in_view(points[n], viewpoint, turn)
     return pixels.reshape(height, width, 3)
@@ -318,6 +328,6 @@ def _fill_holes(image: Float32) -> Float32:
                         x += image[i + k, j + m, 0]
                         y += image[i + k, j + m, 1]
                         z += depth
-            if count >= 4 and high - low < SURFACE + 0.01 * high:
+            if count >= 4 and high - low < SURFACE_DEPTH + 0.01 * high:
                 out[i, j, 0], out[i, j, 1], out[i, j, 2] = x / count, y / count, z / count
     return out

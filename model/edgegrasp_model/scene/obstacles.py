@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float32, Float64, Floats, Int64
 from edgegrasp_model.options import Box, OrientedBox
-from edgegrasp_model.scene.cloud import CanonicalFrame, pose_of
+from edgegrasp_model.scene.cloud import CanonicalFrame, pose_matrix
 
-CHUNK = 20_000  # pairs of boxes at a time
-THINNEST = 1e-6  # metres, half a box of a request at least, so that its axes have a direction
+PAIRS_AT_A_TIME = 20_000  # of boxes
+MIN_HALF_EXTENT = 1e-6  # metres, so that the axes of flat boxes have a direction
 _SIGNS = np.array(list(product((-1, 1), repeat=3)))  # (8, 3) of the corners
 _EDGES = np.argwhere(np.triu(_SIGNS @ _SIGNS.T == 1))  # (12, 2) corners that differ in one sign
 
@@ -32,7 +32,7 @@ class SolidBoxes:
         centers, halves = np.empty((len(shapes), 3)), np.empty((len(shapes), 3, 3))
         for row, shape in enumerate(shapes):
             T_cloud_box, half = box_pose(shape)
-            half = np.maximum(half, THINNEST)
+            half = np.maximum(half, MIN_HALF_EXTENT)
             centers[row], halves[row] = T_cloud_box[:3, 3], np.diag(half) @ T_cloud_box[:3, :3].T
         return cls(frame.points(centers), frame.directions(halves))
 
@@ -66,9 +66,9 @@ def box_pose(box: Box | OrientedBox) -> tuple[Float64, Float64]:
     """Pose T_cloud_box (4, 4) and half extents (3,) of a box."""
     if isinstance(box, OrientedBox):
         turn = Rotation.from_quat(box.quaternion).as_matrix()
-        return pose_of(turn, box.center), np.array(box.half_extents)
+        return pose_matrix(turn, box.center), np.array(box.half_extents)
     low, high = np.array(box.min), np.array(box.max)
-    return pose_of(np.eye(3), (low + high) / 2), (high - low) / 2
+    return pose_matrix(np.eye(3), (low + high) / 2), (high - low) / 2
 
 
 def near_pairs(
@@ -113,8 +113,8 @@ def signed_distance(ours: SolidBoxes, theirs: SolidBoxes) -> Float64:
     """Metres (M,) between boxes, row by row; negative: what they would have to move apart."""
     distance = separation(ours, theirs)
     apart = np.flatnonzero(distance > 0)
-    for start in range(0, len(apart), CHUNK):
-        rows = apart[start : start + CHUNK]
+    for start in range(0, len(apart), PAIRS_AT_A_TIME):
+        rows = apart[start : start + PAIRS_AT_A_TIME]
         one, other = ours.take(rows), theirs.take(rows)
         # A corner of a box is nearest to the other box, or two edges are to each other.
         p, q = one.corners(), other.corners()

@@ -30,45 +30,45 @@ from edgegrasp_model.options import (
 )
 from edgegrasp_model.results import OBSTACLE, SUPPORT, UNLABELLED
 from edgegrasp_model.scene.cloud import (
-    SHORTEST,
+    MIN_LENGTH,
     UP,
     CanonicalFrame,
     CheckedCloud,
     Cloud,
     Voxels,
+    inliers_and_neighbours,
     inside_workspace,
-    least_spread,
-    neighbourhoods,
-    thinned,
+    smallest_variance_directions,
+    subsample,
     unit,
     voxelise,
 )
 from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.segment import (
-    FIXED,
-    LIKELY,
-    UNKNOWN,
+    BACKGROUND,
+    MIN_CONFIDENCE,
+    UNDECIDED,
     Segmentation,
     confidences,
     segment,
     segment_views,
     with_clusters,
-    with_risen,
+    with_raised_points,
     without_long,
 )
-from edgegrasp_model.scene.support import Seen, Support, choose_support, correct_depth_scale
+from edgegrasp_model.scene.support import Support, ViewedPoints, correct_depth_scale, find_support
 from edgegrasp_model.unseen import DepthMap
 
-MIN_POINTS = 4  # fewer are too few for a surface
+MIN_VOXELS = 4  # of a surface
 SIDE_DEPTH = 0.006  # metres from a side of the workspace within which an object may be cut off
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
-REACH = 0.25  # metres around an object in which a hand at it may collide
+HAND_REACH = 0.25  # metres around an object in which a hand at it may collide
 FOLLOWED_REACH = 0.16  # the same if only known grasps are checked
-CLOSE = 0.06  # metres; no camera measures closer
-SPARE = 0.0015  # metres that hands stay above a support plane that was found, not given
-CUT_OUT = 0.95  # confidence of clusters where a cloud was cut off above its support
-NEAR_POINT = 0.1  # most metres from a position to the object it names
-NEAR_PIXEL = 0.02  # the same from a pixel, as a share of the image's width
+MIN_CAMERA_DISTANCE = 0.06  # metres; no camera measures closer
+FOUND_PLANE_CLEARANCE = 0.0015  # metres that hands stay above a plane that was not given
+CROPPED_CONFIDENCE = 0.95  # of clusters in a cloud that was cropped above its support
+MAX_NEAR_DISTANCE = 0.1  # metres from `near` to the object that it names
+MAX_AT_DISTANCE = 0.02  # from `at` to its object, as a share of the image's width
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Surroundings:
     support: SupportPlane | None
     viewpoints: Float32 | None  # (W, 3) the cameras, if known
     at_side: Bools  # (N,) where a side of the workspace cuts the cloud off
-    object_of_point: Int64  # (N,) number of each point's object; FIXED; UNKNOWN
+    object_of_point: Int64  # (N,) number of each point's object, or BACKGROUND or UNDECIDED
 
     @cached_property
     def depths(self) -> list[DepthMap]:
@@ -111,7 +111,7 @@ class SelectedPoints:
     """The selected points of a cloud: M points of objects and their surroundings."""
 
     sent: CheckedCloud  # M points
-    number: Int64  # (M,) each one's object; FIXED: background; UNKNOWN: undecided
+    number: Int64  # (M,) number of each one's object, or BACKGROUND or UNDECIDED
     support: Support | None
     up: Float64  # (3,) unit, away from gravity, cloud frame
     viewpoints: Float64 | None  # (W, 3) the cameras
@@ -136,18 +136,18 @@ def select_points(
         sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
         corrected = sent.points
     if options.workspace is not None:
-        reach = FOLLOWED_REACH if options.follows_only else REACH
+        reach = FOLLOWED_REACH if options.follows_only else HAND_REACH
         sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
-    seen = Seen(sent.points, None if viewpoints is None else viewpoints.mean(axis=0))
+    seen = ViewedPoints(sent.points, None if viewpoints is None else viewpoints.mean(axis=0))
     shown = _segmentation(sent, viewpoints, options)
     # The caller's segments, 0 and below meaning none; else all points are one object.
     number = np.zeros(len(sent.points), dtype=np.int64)
     if sent.segment_ids is not None:
-        number = np.where(sent.segment_ids > 0, sent.segment_ids, UNKNOWN)
+        number = np.where(sent.segment_ids > 0, sent.segment_ids, UNDECIDED)
     named = number if sent.segment_ids is not None or shown is None else shown.number
-    support = choose_support(seen, inside, shown, named >= 0, options, warnings)
+    support = find_support(seen, inside, shown, named >= 0, options, warnings)
     up = _up(options, support, None if viewpoints is None else shown)
     above_all = np.ones(len(inside), np.float32), np.zeros(len(inside), np.float32)
     height, margin = above_all if support is None else support.heights(seen)
@@ -164,15 +164,16 @@ def select_points(
         if support is None and (viewpoints is None or not (number >= 0).any()):
             # A single object without its support, although no camera separates an object from what
             # touches it.
-            close = viewpoints is not None and seen.distance().max(initial=0.0) < CLOSE
-            number, confidence = np.full_like(number, FIXED if close else 0), {}
+            farthest = np.inf if viewpoints is None else seen.distance().max(initial=0.0)
+            whole = BACKGROUND if farthest < MIN_CAMERA_DISTANCE else 0
+            number, confidence = np.full_like(number, whole), {}
         number = without_long(number, sent.points, options.max_object_size)
         if counts["above_support"] and not (inside & (number >= 0)).any():
             warnings.append(
                 "no object was recognised above the support plane. Send objects: off to look for "
                 "grasps on everything above it."
             )
-    number = np.where(inside | (number == FIXED), number, UNKNOWN)
+    number = np.where(inside | (number == BACKGROUND), number, UNDECIDED)
     labels[sent.row] = np.where(number >= 0, number, OBSTACLE)
     labels = sent.of_all_pixels(labels) if options.debug else labels
     if options.at or options.near or isinstance(options.objects, ObjectChoice):
@@ -208,8 +209,8 @@ def _segmentation(
         assert sent.view_ids is not None
         return segment_views(points, viewpoints, sent.view_ids, up)
     if sent.image_size is not None:
-        row = thinned(sent.row, 5000) // sent.image_size[1]
-        sight = unit(thinned(points, 5000) - viewpoints[0])
+        row = subsample(sent.row, 5000) // sent.image_size[1]
+        sight = unit(subsample(points, 5000) - viewpoints[0])
         down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
         down = unit(down) if down.any() else None
     return segment(points, viewpoints[0], up, down)
@@ -226,8 +227,8 @@ def _recognised(
     """The object (M,) of each point above the support, and the confidence of each object."""
     number, confidence = shown.number[above], dict(enumerate(shown.confidence.tolist()))
     if support is not None:
-        likely = (shown.object + shown.support)[above] > LIKELY
-        number = with_risen(number, plan, height[above], margin[above], likely)
+        likely = (shown.object + shown.support)[above] > MIN_CONFIDENCE
+        number = with_raised_points(number, plan, height[above], margin[above], likely)
         cut_off = math.isnan(support.growth)
         if cut_off or not (number >= 0).any():
             first = len(confidence)
@@ -235,9 +236,9 @@ def _recognised(
             new = np.flatnonzero(number >= first)
             which = number[new] - first
             mean = np.bincount(which, shown.object[above[new]]) / np.bincount(which)
-            certain = np.full(len(mean), CUT_OUT) if cut_off else confidences(mean)
+            certain = np.full(len(mean), CROPPED_CONFIDENCE) if cut_off else confidences(mean)
             confidence |= enumerate(certain.tolist(), first)
-            number[new[certain[which] <= LIKELY]] = FIXED
+            number[new[certain[which] <= MIN_CONFIDENCE]] = BACKGROUND
     return number, confidence
 
 
@@ -262,7 +263,7 @@ def build_scene(
     voxels = voxelise(canonical := frame.points(sent.points), voxel_size)
     counts["voxels"] = len(voxels.size)
     if counts["voxels"] > max_voxels:
-        raise _too_wide(counts["voxels"], max_voxels, voxel_size, sent, options)
+        raise _too_many_voxels(counts["voxels"], max_voxels, voxel_size, sent, options)
     middles = voxels.mean(canonical)
     eyes = None if viewpoints is None else frame.points(viewpoints)
     cloud, kept = _clean_cloud(sent, middles, voxels, frame, eyes)
@@ -279,7 +280,7 @@ def build_scene(
     counts["in_approach_region"] = int(approach.sum())
     point_of_row = np.full(sent.rows_sent, -1, dtype=np.int64)
     point_of_row[sent.row] = np.where(kept, np.cumsum(kept) - 1, -1)[voxels.voxel]
-    spare = 0.0 if isinstance(options.support, SupportPlane) else SPARE
+    spare = 0.0 if isinstance(options.support, SupportPlane) else FOUND_PLANE_CLEARANCE
     return Scene(
         cloud=cloud,
         up=UP,
@@ -318,10 +319,10 @@ def _projection(sent: CheckedCloud, eyes: Float64 | None, frame: CanonicalFrame)
     """
     if sent.image_size is None or eyes is None or len(eyes) > 1:
         return None
-    row, (height, width) = thinned(sent.row, 1000), sent.image_size
+    row, (height, width) = subsample(sent.row, 1000), sent.image_size
     x = (2 * (row % width) + 1)[:, None] / width - 1
     y = (2 * (row // width) + 1)[:, None] / height - 1
-    sight = unit(frame.points(thinned(sent.points, 1000)) - eyes)
+    sight = unit(frame.points(subsample(sent.points, 1000)) - eyes)
     none = np.zeros_like(sight)
     equations = np.block([[sight, none, -x * sight], [none, sight, -y * sight]])
     P = np.linalg.eigh(equations.T @ equations)[1][:, 0].reshape(3, 3)
@@ -341,10 +342,10 @@ def _clean_cloud(
     Normals are as given, else estimated and turned to the camera: without one, to a place one metre
     above the middle.
     """
-    kept, near = neighbourhoods(middles)
-    if kept.sum() < MIN_POINTS:
+    kept, near = inliers_and_neighbours(middles)
+    if kept.sum() < MIN_VOXELS:
         return None, kept
-    points, normals = middles[kept], least_spread(middles, near)[kept]
+    points, normals = middles[kept], smallest_variance_directions(middles, near)[kept]
     seen_from = (points.min(axis=0) + points.max(axis=0)) / 2 + UP
     if eyes is not None:
         seen_from = eyes.astype(np.float32)
@@ -354,12 +355,12 @@ def _clean_cloud(
     normals = np.where(away[:, None], -normals, normals)
     if sent.normals is not None:
         given = frame.directions(voxels.mean(unit(sent.normals))[kept])
-        none = np.linalg.norm(given, axis=1) < SHORTEST  # opposite ones in a voxel
+        none = np.linalg.norm(given, axis=1) < MIN_LENGTH  # opposite ones in a voxel
         normals = np.where(none[:, None], normals, unit(given)).astype(np.float32)
     return Cloud(points, normals), kept
 
 
-def _too_wide(
+def _too_many_voxels(
     count: int, most: int, voxel_size: float, sent: CheckedCloud, options: DetectOptions
 ) -> InvalidRequest:
     size = " x ".join(f"{length:.2g}" for length in np.ptp(sent.points, axis=0))
@@ -388,7 +389,7 @@ def near_objects_along(plan: Float64, number: Int64) -> Bools:
     """Which points (M,), at (M, 2) along the support, a hand at any object could reach."""
     if not (number >= 0).any():
         return np.zeros(len(plan), dtype=bool)
-    x, y = (((axis - axis.min()) / (REACH / 5)).astype(np.int64) for axis in plan.T)
+    x, y = (((axis - axis.min()) / (HAND_REACH / 5)).astype(np.int64) for axis in plan.T)
     held = np.zeros((x.max() + 1, y.max() + 1), dtype=bool)
     held[x[number >= 0], y[number >= 0]] = True
     square = np.ones((3, 3), dtype=bool)
@@ -454,7 +455,7 @@ def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
 def chosen_objects(
     number: Int64, cloud: CheckedCloud, options: DetectOptions, warnings: list[str]
 ) -> Int64:
-    """The object (N,) of each point if the request names that object; FIXED otherwise.
+    """The object (N,) of each point if the request names that object; BACKGROUND otherwise.
 
     `number` (N,) is the object of each point, negative: none. `warnings` gets objects that are
     named but not there.
@@ -467,11 +468,11 @@ def chosen_objects(
         if target is None:
             continue
         place: Floats = cloud.points
-        most = NEAR_POINT
+        most = MAX_NEAR_DISTANCE
         if name == "at":
             width = _image_width(target, cloud)
             place = np.stack([cloud.row % width, cloud.row // width], axis=1)
-            most = max(NEAR_PIXEL * width, 1.0)
+            most = max(MAX_AT_DISTANCE * width, 1.0)
         on = np.flatnonzero(np.isin(number, wanted))
         distance = np.linalg.norm(place[on] - np.asarray(target), axis=1)
         if distance.min(initial=np.inf) <= most:
@@ -480,7 +481,7 @@ def chosen_objects(
             wanted = wanted[:0]
             shown = ", ".join(f"{value:g}" for value in target)
             warnings.append(f"{name}: there is no object to grasp at {shown}.")
-    return np.where((number >= 0) & ~np.isin(number, wanted), FIXED, number)
+    return np.where((number >= 0) & ~np.isin(number, wanted), BACKGROUND, number)
 
 
 def _image_width(pixel: tuple[float, ...], cloud: CheckedCloud) -> int:

@@ -19,32 +19,31 @@ from torch.nn import functional
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.kernels import compiled
-from edgegrasp_model.scene.cloud import cells_of, thinned, unit
-from edgegrasp_model.scene.network import NEAREST, SceneNet, range_image, scene_features
+from edgegrasp_model.scene.cloud import grid_cells, subsample, unit
+from edgegrasp_model.scene.network import NEAREST_DEPTH, SceneNet, range_image, scene_features
 
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 
 
-# In place of an object's number: background, or possibly part of an object.
-FIXED, UNKNOWN = -1, -2
+# In place of an object's number. An undecided point may be part of an object.
+BACKGROUND, UNDECIDED = -1, -2
 
 # When pixels show the same object.
-APART = 0.035  # metres of depth between neighbours; and between the mean votes of its parts
-SMALLEST = 45  # pixels of an object, in the network's output
-SMALLEST_AREA = 5e-4  # square metres of it, as seen
+MAX_DEPTH_STEP = 0.035  # metres between neighbours, and between the mean votes of two parts
+MIN_PIXELS = 45  # pixels of an object, in the network's output
+MIN_AREA = 5e-4  # square metres of it, as seen
 VIEW_CELL = 0.01  # metres, in which the views of one object lie in the same place
-VIEW_SHARE = 0.25  # of the smaller one's cells that two views of one object share
-BESIDE = 0.012  # metres from an object within which missed points may belong to it
-REACH = 0.012  # metres from a point to its pixel, and as much more for each metre of depth
-STANDS_OUT = 0.004  # least metres that such points rise above the support's margin
-FEWEST_CELLS, FEWEST_EACH = 5, 4  # cells of a cluster, each BESIDE wide; points per cell
-LIKELY = 0.5  # confidence from which an instance is an object, not background
+MIN_VIEW_OVERLAP = 0.25  # of the smaller one's cells that two views of one object share
+POINT_REACH = 0.012  # metres from a point to an object, or to its pixel at a depth of 0
+MIN_RISE = 0.004  # metres above the support's margin, of points that are added to an object
+MIN_CLUSTER_CELLS, MIN_CELL_POINTS = 5, 4  # of cells POINT_REACH wide
+MIN_CONFIDENCE = 0.5  # of an object; below, it is background
 
 
 class Segmentation(NamedTuple):
     """The segmentation of N points."""
 
-    number: Int64  # (N,) each point's object, from 0; FIXED; UNKNOWN
+    number: Int64  # (N,) each point's object, from 0, or BACKGROUND or UNDECIDED
     object: Float32  # (N,) probability of an object
     support: Float32  # (N,) probability of a support
     confidence: Float64  # (O,) confidence of each object
@@ -91,17 +90,17 @@ def segment(
     image = range_image(points, viewpoint, up, down)
     turn, (network, _) = image.T_cloud_camera[:3, :3], shipped()
     up_in_view = None if up is None else up @ turn
-    pixels, seen_up = look(network, image.points, up_in_view, image.footprint)
-    of_pixel, mean = group(pixels)
+    pixels, seen_up = run_network(network, image.points, up_in_view, image.footprint)
+    of_pixel, mean = group_pixels(pixels)
     confidence = confidences(mean)
-    likely = confidence > LIKELY
-    new = np.append(np.where(likely, np.cumsum(likely) - 1, FIXED), [UNKNOWN, FIXED])
+    likely = confidence > MIN_CONFIDENCE
+    new = np.append(np.where(likely, np.cumsum(likely) - 1, BACKGROUND), [UNDECIDED, BACKGROUND])
     of_pixel = new[of_pixel]
-    number = np.full(len(points), UNKNOWN)
+    number = np.full(len(points), UNDECIDED)
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
     T_camera_cloud = np.linalg.inv(image.T_cloud_camera).astype(np.float64)
     arrays = pixels.points, of_pixel, pixels.classes, number, objects, support
-    _look_up(points, T_camera_cloud, image.corner, 2 * image.footprint, *arrays)
+    _label_points(points, T_camera_cloud, image.corner, 2 * image.footprint, *arrays)
     return Segmentation(number, objects, support, confidence[likely], turn @ seen_up)
 
 
@@ -112,7 +111,7 @@ def segment_views(
     up: Float64 | None,  # (3,) unit, away from gravity; None: unknown
 ) -> Segmentation:
     """Segment points view by view; an object seen in several views gets one number."""
-    number, seen_up = np.full(len(points), UNKNOWN), np.zeros(3)
+    number, seen_up = np.full(len(points), UNDECIDED), np.zeros(3)
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
     confidence = np.empty(0)
     for view in np.unique(view_ids):
@@ -122,14 +121,14 @@ def segment_views(
         objects[rows], support[rows] = own.object, own.support
         confidence = np.concatenate([confidence, own.confidence])
         seen_up += own.up * len(rows)
-    merged = joined(points, number, len(confidence))
+    merged = merge_views(points, number, len(confidence))
     best = np.zeros(int(merged.max(initial=-1)) + 1)
     np.maximum.at(best, merged, confidence)
     number = np.where(number >= 0, merged[np.maximum(number, 0)], number) if len(merged) else number
     return Segmentation(number, objects, support, best, unit(seen_up))
 
 
-def look(
+def run_network(
     network: SceneNet,  # in evaluation mode
     points: Float32,  # (H, W, 3) camera frame, metres; NaN where nothing was seen
     up: Float64 | None,  # (3,) unit; None: unknown
@@ -161,39 +160,39 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def group(pixels: Pixels) -> tuple[Int64, Float64]:
-    """The object (H, W) of each pixel, from 0; FIXED: background; UNKNOWN: undecided.
+def group_pixels(pixels: Pixels) -> tuple[Int64, Float64]:
+    """The object (H, W) of each pixel, from 0, or BACKGROUND or UNDECIDED.
 
     And the mean probability (O,) of an object over the pixels of each.
     """
     points, classes, votes, links, footprint = pixels
     seen = ~np.isnan(points[..., 2])
     held = seen & (classes.argmax(axis=0) == 2)
-    number = np.where(held, UNKNOWN, FIXED)
+    number = np.where(held, UNDECIDED, BACKGROUND)
     if not held.any():
         return number, np.empty(0)
     index, pairs, strength = np.arange(held.size).reshape(held.shape), [], []
     right, lower = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])  # neighbours
     for link, (first, second) in zip(links, (right, lower), strict=True):
-        near = np.abs(points[first][..., 2] - points[second][..., 2]) < APART
+        near = np.abs(points[first][..., 2] - points[second][..., 2]) < MAX_DEPTH_STEP
         joined = held[first] & held[second] & (link[first] > 0.5) & near
         pairs.append(np.stack([index[first][joined], index[second][joined]], axis=1))
         strength.append(link[first][joined])
     order = np.argsort(-np.concatenate(strength), kind="stable")
     component = np.arange(held.size)
     centre = np.nan_to_num(points + votes).reshape(-1, 3).astype(np.float64)
-    _join(np.concatenate(pairs)[order], component, centre, SMALLEST, APART)
+    _join_pixels(np.concatenate(pairs)[order], component, centre, MIN_PIXELS, MAX_DEPTH_STEP)
     rows = np.flatnonzero(held)
     _, part, count = np.unique(component[rows], return_inverse=True, return_counts=True)
     area = np.bincount(part, (points[..., 2].reshape(-1)[rows] * footprint) ** 2)
-    large = (count >= SMALLEST) & (area >= SMALLEST_AREA)
-    number.reshape(-1)[rows] = np.where(large, np.cumsum(large) - 1, UNKNOWN)[part]
+    large = (count >= MIN_PIXELS) & (area >= MIN_AREA)
+    number.reshape(-1)[rows] = np.where(large, np.cumsum(large) - 1, UNDECIDED)[part]
     held = number >= 0
     return number, np.bincount(number[held], classes[2][held]) / np.bincount(number[held])
 
 
 @compiled()
-def _join(
+def _join_pixels(
     pairs: Int64,  # (P, 2) the most probable first
     component: Int64,  # (N,) overwritten with the part of each pixel
     centre: Float64,  # (N, 3) metres, the vote of each pixel; overwritten by sums
@@ -234,23 +233,23 @@ def _join(
         component[n] = root
 
 
-def joined(points: Float32, number: Int64, count: int) -> Int64:
+def merge_views(points: Float32, number: Int64, count: int) -> Int64:
     """The new number (O,) of each object: those in the same place are joined."""
     held = np.flatnonzero(number >= 0)
     if len(held) == 0:
         return np.arange(count)
-    cell, points_in = cells_of(points[held], VIEW_CELL)
+    cell, points_in = grid_cells(points[held], VIEW_CELL)
     shape = count, len(points_in)
     lies = coo_array((np.ones(len(held), dtype=np.int32), (number[held], cell)), shape).tocsr()
     lies.data[:] = 1
     shared = (lies @ lies.T).toarray()
     cells = np.diag(shared)
-    same = shared >= VIEW_SHARE * np.maximum(np.minimum.outer(cells, cells), 1)
+    same = shared >= MIN_VIEW_OVERLAP * np.maximum(np.minimum.outer(cells, cells), 1)
     same &= shared > 0
     return np.asarray(connected_components(same, directed=False)[1])
 
 
-def with_risen(
+def with_raised_points(
     number: Int64,
     plan: Float64,  # (N, 2) metres along the support
     height: Float32,  # (N,) metres over it
@@ -261,13 +260,13 @@ def with_risen(
 
     The network misses thin parts such as handles and edges.
     """
-    rows = np.flatnonzero((number < 0) & (height > margin + STANDS_OUT) & likely)
+    rows = np.flatnonzero((number < 0) & (height > margin + MIN_RISE) & likely)
     held = np.flatnonzero((number >= 0) & (height > margin))
     if len(rows) == 0 or len(held) == 0:
         return number
-    held = thinned(held)
+    held = subsample(held)
     places = np.column_stack([plan, height])
-    apart, nearest = cKDTree(places[held]).query(places[rows], distance_upper_bound=BESIDE)
+    apart, nearest = cKDTree(places[held]).query(places[rows], distance_upper_bound=POINT_REACH)
     near, number = np.isfinite(apart), number.copy()
     number[rows[near]] = number[held[np.asarray(nearest)[near]]]
     return number
@@ -283,14 +282,14 @@ def with_clusters(number: Int64, plan: Float64, among: Bools, first: int) -> Int
     rows = np.flatnonzero((number < 0) & among)
     if len(rows) == 0:
         return number
-    cell = np.floor((plan[rows] - plan[rows].min(axis=0)) / BESIDE).astype(np.int64)
+    cell = np.floor((plan[rows] - plan[rows].min(axis=0)) / POINT_REACH).astype(np.int64)
     points = np.zeros(cell.max(axis=0) + 1)
     np.add.at(points, tuple(cell.T), 1)
     cluster, count = ndimage.label(points > 0, np.ones((3, 3)))
     which = np.arange(1, count + 1)
-    large = ndimage.sum_labels(points > 0, cluster, which) >= FEWEST_CELLS
-    large &= ndimage.mean(points, cluster, which) >= FEWEST_EACH
-    new = np.full(count + 1, UNKNOWN)
+    large = ndimage.sum_labels(points > 0, cluster, which) >= MIN_CLUSTER_CELLS
+    large &= ndimage.mean(points, cluster, which) >= MIN_CELL_POINTS
+    new = np.full(count + 1, UNDECIDED)
     new[1:][large] = first + np.arange(large.sum())
     number = number.copy()
     number[rows] = new[cluster[tuple(cell.T)]]
@@ -306,17 +305,17 @@ def without_long(number: Int64, points: Float32, max_size: float) -> Int64:
     starts = np.flatnonzero(np.diff(number[order], prepend=-1))
     number = number.copy()
     for rows in np.split(order, starts[1:]):
-        some = points[thinned(rows, 500)].astype(np.float64)
+        some = points[subsample(rows, 500)].astype(np.float64)
         around = some - some.mean(axis=0)
         _, axes = np.linalg.eigh(around.T @ around)
         low, high = np.percentile(around @ axes, (1, 99), axis=0)
         if (high - low).max() > max_size:
-            number[rows] = FIXED
+            number[rows] = BACKGROUND
     return number
 
 
 @compiled("contract")
-def _look_up(
+def _label_points(
     points: Float32,
     T_camera_cloud: Float64,
     corner: Float64,
@@ -332,11 +331,11 @@ def _look_up(
     rows, columns, _ = seen.shape
     T, per_pixel = T_camera_cloud.astype(np.float32), np.float32(1.0 / pixel_size)
     left, top = np.float32(corner[0]) * per_pixel, np.float32(corner[1]) * per_pixel
-    reach = np.float32(REACH)
+    reach = np.float32(POINT_REACH)
     for n in range(len(points)):
         a, b, c = points[n, 0], points[n, 1], points[n, 2]
         z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
-        if z < NEAREST:
+        if z < NEAREST_DEPTH:
             continue
         x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
         y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]

@@ -13,43 +13,53 @@ from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import SUPPORT_STREAM, DetectOptions, RansacPlane, SupportPlane
 from edgegrasp_model.scene.cloud import (
     MAX_DISTANCE,
-    STRAY,
+    OUTLIER_PERCENT,
     CanonicalFrame,
     CheckedCloud,
-    cells_of,
+    grid_cells,
     inside_workspace,
-    thinned,
+    subsample,
 )
 from edgegrasp_model.scene.segment import Segmentation
 
-THICK, GROWTH = 0.004, 0.006  # metres from a plane, plus this per squared metre of distance
-MOST_MARGIN = 0.02  # metres over it that belong to it at most; THICK do at least
-GIVEN_MARGIN = 0.005  # metres over a plane that is given
-DEVIATIONS = 4.0  # of its own points that still belong to it
-BOW = 0.025  # metres by which a bowed support may rise over its plane
-TILT = math.radians(30)  # between the plane and a given `up`
-MOST_BELOW = 0.1  # share of the objects' points that may lie below their support
-NEAR_OBJECTS, FAR_WEIGHT = 0.15, 0.1  # metres around an object; what points count elsewhere
-CLOSE, CLOSER = 0.08, (0.008, 0.005, 0.004)  # metres around an object; from the plane there
-FEWEST = 60  # points that a plane is fitted to, and by which its residual is measured
-CELL = 0.02  # metres, in which surfaces are counted
-CUT_OFF = 0.2  # share of points classified as support under which a cloud was cut off above it
-ALL_OBJECTS = 0.8  # share of points of objects above which nothing else is left of a cloud
-LOOKS_DOWN = 0.17  # least sine of the angle at which a camera looks down on a cloud that was cut
-TOUCHED, CANDIDATES = 0.006, 40  # metres from a plane that touches a cloud; such planes compared
-UPRIGHT = 0.9  # how much more a plane counts that is level in an upright image
-UNDER = 0.003  # metres that an assumed support lies under the lowest points
-LEAST_AREA = 0.008  # square metres of a support that are seen; the top of an object is smaller
-USUAL_DISTANCE = 0.7  # metres to a camera that is not known
-BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
-TRIES, SAMPLE = 150, 1200  # planes tried, and points that judge them
-REFINEMENTS = 4  # least squares over the plane's points
-STIFF = 1e-6 * np.eye(6)  # keeps a support flat if little of it is seen
-# Of depths that a known plane corrects:
-NEAR = 0.01  # metres from the plane within which points belong to it
-FLAT = 0.35  # of NEAR: largest median distance of a plane's points (a wall's is 0.5)
-MIN_SHARE = 0.1  # of the points that the plane must hold
-LEAST_SCALED_AREA = 0.035  # square metres of it that must be seen; flat tops of objects are smaller
+# Noise of depth cameras: metres from a plane, and as much more per squared metre of distance.
+PLANE_NOISE, NOISE_GROWTH = 0.004, 0.006
+DEFAULT_CAMERA_DISTANCE = 0.7  # metres to a camera whose position is not known
+
+# The margin above a plane, up to which points belong to it.
+MARGIN_DEVIATIONS = 4.0  # standard deviations of its own points; PLANE_NOISE metres at least
+MAX_MARGIN = 0.02  # metres
+GIVEN_PLANE_MARGIN = 0.005  # metres, of a plane that the caller gives
+MAX_BOW = 0.025  # metres by which a bowed support rises or sinks from its plane
+BOW_FITS = 4  # least-squares fits of the bow
+BOW_RIDGE = 1e-6 * np.eye(6)  # keeps the bow small where little of the support is seen
+
+# The fit to points classified as support.
+MIN_PLANE_POINTS = 60
+RANSAC_PLANES, RANSAC_POINTS = 150, 1200  # planes tried, and points that judge them
+MAX_TILT = math.radians(30)  # between the plane's normal and a given `up`
+NEAR_DISTANCE, FAR_WEIGHT = 0.15, 0.1  # metres to an object; weight of points farther away
+MAX_SHARE_BELOW = 0.1  # of the objects' points, below the plane
+REFINE_DISTANCE = 0.08  # metres to an object, of points that refine the plane
+REFINE_HEIGHTS = (0.008, 0.005, 0.004)  # metres from the plane, of these points, fit by fit
+AREA_CELL = 0.02  # metres, side of the cells that measure areas
+MIN_SUPPORT_AREA = 0.008  # square metres; the top of an object is smaller
+MAX_WORKSPACE_GAP = 0.05  # metres from a given plane up to a workspace that starts above it
+
+# A cloud that was cropped above its support.
+MIN_SUPPORT_SHARE = 0.2  # of points classified as support, otherwise
+CROPPED_OBJECT_SHARE = 0.8  # of points of objects, from which nothing else is left
+MIN_DOWNWARD_SINE = 0.17  # of the angle at which the camera looks down
+TOUCH_DISTANCE = 0.006  # metres from a plane that the cloud touches
+MAX_TOUCHING_PLANES = 40  # that are compared
+UPRIGHT_WEIGHT = 0.9  # additional weight of a plane that is level in an upright image
+ASSUMED_PLANE_GAP = 0.003  # metres from the lowest points down to the assumed plane
+
+# Depths that a given plane corrects.
+INLIER_DISTANCE = 0.01  # metres from the plane
+MIN_INLIER_SHARE = 0.1  # of the points
+MAX_INLIER_SPREAD = 0.35  # median, as a share of INLIER_DISTANCE; a wall's is 0.5
+MIN_CORRECTED_AREA = 0.035  # square metres; flat tops of objects are smaller
 
 
 @dataclass(frozen=True)
@@ -65,7 +75,7 @@ class Support:
     # Rise over the plane at (x, y): of 1, x, y, x^2, x y, y^2.
     bow: Float64 = field(default_factory=lambda: np.zeros(6))
 
-    def heights(self, seen: "Seen") -> tuple[Float32, Float32]:
+    def heights(self, seen: "ViewedPoints") -> tuple[Float32, Float32]:
         """Heights (N,) over the support, which may be bowed, and up to which points belong to it.
 
         The noise of depth cameras grows with the square of the distance.
@@ -76,12 +86,12 @@ class Support:
         if math.isnan(self.growth):
             return height, np.full_like(height, self.least)
         if seen.viewpoint is None:
-            squared[:] = USUAL_DISTANCE**2
-        squared *= np.float32(DEVIATIONS * self.growth)
-        return height, np.clip(squared, self.least, max(MOST_MARGIN, self.least), out=squared)
+            squared[:] = DEFAULT_CAMERA_DISTANCE**2
+        squared *= np.float32(MARGIN_DEVIATIONS * self.growth)
+        return height, np.clip(squared, self.least, max(MAX_MARGIN, self.least), out=squared)
 
 
-class Seen(NamedTuple):
+class ViewedPoints(NamedTuple):
     """N points and their viewpoint."""
 
     points: Float32  # (N, 3) metres
@@ -90,13 +100,13 @@ class Seen(NamedTuple):
     def distance(self) -> Float64:
         """Metres (N,) from the camera."""
         if self.viewpoint is None:
-            return np.full(len(self.points), USUAL_DISTANCE)
+            return np.full(len(self.points), DEFAULT_CAMERA_DISTANCE)
         apart = self.points - self.viewpoint
         return np.asarray(np.sqrt(np.einsum("nd,nd->n", apart, apart)))
 
 
-def choose_support(
-    seen: Seen,  # N points
+def find_support(
+    seen: ViewedPoints,  # N points
     inside: Bools,  # (N,) which of them lie in the workspace
     shown: Segmentation | None,  # the network's output, where it was asked
     objects: Bools,  # (N,) which of them are of an object
@@ -112,9 +122,9 @@ def choose_support(
     if isinstance(request, SupportPlane):
         # A bin's floor is not measured by the table around it; a followed object's workspace is
         # no bin.
-        around = np.inf if options.follows_only else BELOW_WORKSPACE * np.abs(request.normal)
+        around = np.inf if options.follows_only else MAX_WORKSPACE_GAP * np.abs(request.normal)
         over = np.flatnonzero(inside_workspace(seen.points, options.workspace, around))
-        some = thinned(over)
+        some = subsample(over)
         below = float(request.heights(seen.points[some]).min(initial=np.inf))
         if options.max_object_size < below < np.inf:
             warnings.append(
@@ -122,25 +132,28 @@ def choose_support(
                 "its frame, normal, and offset in metres."
             )
         on = np.empty(0, np.int64) if shown is None else np.flatnonzero(shown.support > 0.5)
-        part = seen.points[thinned(on)]
+        part = seen.points[subsample(on)]
         # Where a support was cut off, only flat tops may be classified as support.
-        whole = len(on) > CUT_OFF * len(seen.points) and _wide(part, request)
-        found = measured(Seen(seen.points[some], seen.viewpoint), request, GIVEN_MARGIN, whole)
+        whole = len(on) > MIN_SUPPORT_SHARE * len(seen.points) and _wider_than_object(part, request)
+        sample = ViewedPoints(seen.points[some], seen.viewpoint)
+        found = measure_support(sample, request, GIVEN_PLANE_MARGIN, whole)
     else:
         rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
         if isinstance(request, RansacPlane):
-            cell, count = cells_of(seen.points, CELL)  # equal areas count alike
+            cell, count = grid_cells(seen.points, AREA_CELL)  # equal areas count alike
             plane = fit_plane(seen, inside / count[cell], rng, up, request.max_tilt)
-            found = None if plane is None else measured(seen, plane, request.distance, True)
+            found = None if plane is None else measure_support(seen, plane, request.distance, True)
             found = None if found is None or found.share < request.min_share else found
         else:
             assert shown is not None
-            found = _fitted(seen, shown, objects, up, rng)
-            if found is None and (found := _assumed(seen, shown, objects, options)) is not None:
-                warnings.append(
-                    "no support plane is seen: one is assumed under the lowest points. Send "
-                    "support (null if there is none)."
-                )
+            found = _fit_support(seen, shown, objects, up, rng)
+            if found is None:
+                found = _assume_support(seen, shown, objects, options)
+                if found is not None:
+                    warnings.append(
+                        "no support plane is seen: one is assumed under the lowest points. Send "
+                        "support (null if there is none)."
+                    )
         if found is None:
             warnings.append(
                 "no support plane is seen: objects are returned without one, and hands may reach "
@@ -153,97 +166,102 @@ def choose_support(
     return found
 
 
-def _fitted(
-    seen: Seen, shown: Segmentation, objects: Bools, up: Float64 | None, rng: np.random.Generator
+def _fit_support(
+    seen: ViewedPoints,
+    shown: Segmentation,
+    objects: Bools,
+    up: Float64 | None,
+    rng: np.random.Generator,
 ) -> Support | None:
     """The plane of the points classified as support, weighted toward those near objects."""
     on, held = np.flatnonzero(shown.support > 0.5), np.flatnonzero(objects)
-    part = Seen(seen.points[thinned(on)], seen.viewpoint)
-    around = seen.points[thinned(held, 500)]
-    # Metres to the nearest object; infinity beyond NEAR_OBJECTS, or where there is no object.
-    apart = np.asarray(cKDTree(around).query(part.points, distance_upper_bound=NEAR_OBJECTS)[0])
+    part = ViewedPoints(seen.points[subsample(on)], seen.viewpoint)
+    around = seen.points[subsample(held, 500)]
+    # Metres to the nearest object; infinity beyond NEAR_DISTANCE, or where there is no object.
+    apart = np.asarray(cKDTree(around).query(part.points, distance_upper_bound=NEAR_DISTANCE)[0])
     weight = np.where(np.isfinite(apart), 1.0, FAR_WEIGHT)
     up = shown.up if up is None else up
     for _ in range(2):
         plane = fit_plane(part, weight, rng, up)
         if plane is None:
             return None
-        below = plane.heights(around) < -MOST_MARGIN
-        if len(below) == 0 or below.mean() <= MOST_BELOW:
+        below = plane.heights(around) < -MAX_MARGIN
+        if len(below) == 0 or below.mean() <= MAX_SHARE_BELOW:
             break
         # This plane is the top of something larger, and the objects stand below it.
-        weight[plane.heights(part.points) > -MOST_MARGIN] = 0.0
+        weight[plane.heights(part.points) > -MAX_MARGIN] = 0.0
     else:
         return None
     # Of the points close to objects: the plane of a bin's floor, not the table's.
-    close = part.points[apart < CLOSE]
-    near = close[np.abs(plane.heights(close)) < MOST_MARGIN].astype(np.float64)
-    for within in CLOSER:
-        if len(near) < FEWEST:
+    close = part.points[apart < REFINE_DISTANCE]
+    near = close[np.abs(plane.heights(close)) < MAX_MARGIN].astype(np.float64)
+    for within in REFINE_HEIGHTS:
+        if len(near) < MIN_PLANE_POINTS:
             break
         height = plane.heights(near)
         near = near[np.abs(height - np.median(height)) < within]
-        plane = _least_squares(near, plane) if len(near) >= FEWEST else plane
-    found = measured(part, plane, THICK, True)
+        plane = _fit_least_squares(near, plane) if len(near) >= MIN_PLANE_POINTS else plane
+    found = measure_support(part, plane, PLANE_NOISE, True)
     places = found.frame.points(part.points)
-    _, count = cells_of(places[np.abs(places[:, 2]) < MOST_MARGIN, :2], CELL)
-    if len(count) * CELL**2 <= LEAST_AREA:
+    _, count = grid_cells(places[np.abs(places[:, 2]) < MAX_MARGIN, :2], AREA_CELL)
+    if len(count) * AREA_CELL**2 <= MIN_SUPPORT_AREA:
         return None
     return replace(found, share=found.share * len(on) / len(seen.points))  # of all that is seen
 
 
-def _assumed(
-    seen: Seen, shown: Segmentation, objects: Bools, options: DetectOptions
+def _assume_support(
+    seen: ViewedPoints, shown: Segmentation, objects: Bools, options: DetectOptions
 ) -> Support | None:
     """A support under the lowest points of a cloud that was cut off above it.
 
     Unless a camera is the origin, the frame is of a robot or a world, whose z is up.
     """
-    if (shown.support > 0.5).mean() > CUT_OFF:
+    if (shown.support > 0.5).mean() > MIN_SUPPORT_SHARE:
         return None
     up, cameras = options.known_up, options.viewpoint
     if up is None and (cameras is None or np.reshape(cameras, (-1, 3)).any(axis=1).all()):
         up = np.array([0.0, 0.0, 1.0]) if shown.up[2] > 0 else None
-    elif up is None and objects.mean() > ALL_OBJECTS:
+    elif up is None and objects.mean() > CROPPED_OBJECT_SHARE:
         assert seen.viewpoint is not None
-        up = _up_of_cut(seen.points[objects], seen.viewpoint)
+        up = _up_of_cropped(seen.points[objects], seen.viewpoint)
     if up is None:
         return None
-    offset = float(np.percentile(seen.points.astype(np.float64) @ up, STRAY)) - UNDER
-    return measured(
-        seen, SupportPlane.model_construct(normal=tuple(up.tolist()), offset=offset), 0.0, False
+    lowest = float(np.percentile(seen.points.astype(np.float64) @ up, OUTLIER_PERCENT))
+    plane = SupportPlane.model_construct(
+        normal=tuple(up.tolist()), offset=lowest - ASSUMED_PLANE_GAP
     )
+    return measure_support(seen, plane, 0.0, False)
 
 
-def _up_of_cut(cloud: Float32, viewpoint: Float64) -> Float64 | None:
+def _up_of_cropped(cloud: Float32, viewpoint: Float64) -> Float64 | None:
     """Up (3,) of a cloud (N, 3) without its support: its lower edge lies in a plane.
 
     Of the planes that the cloud touches, on the side that the camera does not see, the one that it
     touches in the most places. None: the camera looks up, or it is a flat cloud.
     """
-    points = thinned(cloud).astype(np.float64)
-    if len(points) < FEWEST:
+    points = subsample(cloud).astype(np.float64)
+    if len(points) < MIN_PLANE_POINTS:
         return None
     toward = viewpoint - points.mean(axis=0)
     try:
         planes = ConvexHull(points).equations
     except QhullError:
         return None
-    behind = planes[:, :3] @ toward < -LOOKS_DOWN * np.linalg.norm(toward)
+    behind = planes[:, :3] @ toward < -MIN_DOWNWARD_SINE * np.linalg.norm(toward)
     behind &= planes[:, :3] @ viewpoint + planes[:, 3] < 0.0
     planes = planes[behind]
-    near = points @ planes[:, :3].T + planes[:, 3] > -TOUCHED
-    fullest = np.argsort(-near.sum(axis=0), kind="stable")[:CANDIDATES]
-    places = [len(cells_of(points[near[:, k]], TOUCHED)[1]) for k in fullest]
+    near = points @ planes[:, :3].T + planes[:, 3] > -TOUCH_DISTANCE
+    fullest = np.argsort(-near.sum(axis=0), kind="stable")[:MAX_TOUCHING_PLANES]
+    places = [len(grid_cells(points[near[:, k]], TOUCH_DISTANCE)[1]) for k in fullest]
     if not places:
         return None
     # Alone, the sides of a box are touched as often as what it stands on; most images are upright.
-    upright = 1.0 + UPRIGHT * planes[fullest, 1]
+    upright = 1.0 + UPRIGHT_WEIGHT * planes[fullest, 1]
     up: Float64 = -planes[fullest[np.argmax(places * upright)], :3]
     return up
 
 
-def _least_squares(points: Float64, like: SupportPlane) -> SupportPlane:
+def _fit_least_squares(points: Float64, like: SupportPlane) -> SupportPlane:
     """The plane through points (N, 3), facing the same way as another one."""
     middle = points.mean(axis=0)
     _, vectors = np.linalg.eigh(np.cov((points - middle).T))  # ascending
@@ -253,25 +271,26 @@ def _least_squares(points: Float64, like: SupportPlane) -> SupportPlane:
 
 
 def fit_plane(
-    seen: Seen,  # N points that may belong to it
+    seen: ViewedPoints,  # N points that may belong to it
     weight: Floats,  # (N,) what each counts
     rng: np.random.Generator,
     up: Float64 | None,  # (3,) unit; None: any tilt will do
-    max_tilt: float = TILT,  # radians from `up`
+    max_tilt: float = MAX_TILT,  # radians from `up`
 ) -> SupportPlane | None:
     """The plane that holds the most of weighted points, facing the camera (RANSAC).
 
     None: there are too few points, or none of it is level enough.
     """
     held = np.flatnonzero(weight > 0)
-    if len(held) < FEWEST:
+    if len(held) < MIN_PLANE_POINTS:
         return None
     chosen = rng.choice(
-        held, min(SAMPLE, len(held)), replace=False, p=weight[held] / weight[held].sum()
+        held, min(RANSAC_POINTS, len(held)), replace=False, p=weight[held] / weight[held].sum()
     )
-    sample = Seen(seen.points[chosen], seen.viewpoint)
-    points, thick = sample.points.astype(np.float64), THICK + GROWTH * sample.distance() ** 2
-    corners = points[rng.integers(len(points), size=(TRIES, 3))]
+    sample = ViewedPoints(seen.points[chosen], seen.viewpoint)
+    points = sample.points.astype(np.float64)
+    thick = PLANE_NOISE + NOISE_GROWTH * sample.distance() ** 2
+    corners = points[rng.integers(len(points), size=(RANSAC_PLANES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
     wide = length > 1e-6
@@ -292,33 +311,33 @@ def fit_plane(
     plane = SupportPlane.model_construct(normal=tuple(normals[best].tolist()), offset=offset)
     for within in (1.0, 0.7, 0.5):
         near = np.abs(plane.heights(points)) < within * thick
-        if near.sum() < FEWEST // 2:
+        if near.sum() < MIN_PLANE_POINTS // 2:
             break
-        plane = _least_squares(points[near], plane)
+        plane = _fit_least_squares(points[near], plane)
     level_enough = up is None or np.dot(up, plane.normal) >= math.cos(max_tilt + 1e-9)
     return plane if level_enough else None
 
 
-def measured(seen: Seen, plane: SupportPlane, least: float, whole: bool) -> Support:
+def measure_support(seen: ViewedPoints, plane: SupportPlane, least: float, whole: bool) -> Support:
     """The support of a plane, at least `least` metres thick, as the points show it.
 
     `whole`: the cloud was not cut off above the plane.
     """
-    sample = Seen(thinned(seen.points), seen.viewpoint)
+    sample = ViewedPoints(subsample(seen.points), seen.viewpoint)
     frame = CanonicalFrame.of_scene(sample.points, plane.normal, seen.viewpoint)
     frame.T_canonical_cloud[2, 3] = -plane.offset / np.linalg.norm(plane.normal)
     x, y, height = frame.points(sample.points).T
     distance = sample.distance()
-    thick = THICK + GROWTH * np.square(distance)
+    thick = PLANE_NOISE + NOISE_GROWTH * np.square(distance)
     near = np.abs(height) < thick
     # If the cloud was cut off above the plane, only objects on it are near.
-    if near.sum() < FEWEST or (not whole and (height[near] < 1e-4).mean() < 0.2):
+    if near.sum() < MIN_PLANE_POINTS or (not whole and (height[near] < 1e-4).mean() < 0.2):
         return Support(plane, frame, least)
     terms, bow = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y]), np.zeros(6)
-    for _ in range(REFINEMENTS):
+    for _ in range(BOW_FITS):
         near = np.abs(height - bow @ terms) < thick
         held = near * terms
-        bow = np.asarray(np.linalg.solve(held @ terms.T + STIFF, held @ height))
+        bow = np.asarray(np.linalg.solve(held @ terms.T + BOW_RIDGE, held @ height))
     off = np.abs(height - bow @ terms)[near]
     growth = 1.4826 * float(np.median(off / np.square(distance[near])))
     return Support(plane, frame, least, float(np.median(off)), float(near.mean()), growth, bow)
@@ -340,7 +359,7 @@ def _heights(
         x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
         y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
         rise = bow[0] + bow[1] * x + bow[2] * y + bow[3] * x * x + bow[4] * x * y + bow[5] * y * y
-        rise = min(max(rise, -BOW), BOW)
+        rise = min(max(rise, -MAX_BOW), MAX_BOW)
         height[i] = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3] - rise
         squared[i] = (a - eye[0]) ** 2 + (b - eye[1]) ** 2 + (c - eye[2]) ** 2
 
@@ -381,39 +400,40 @@ def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> floa
     """
     height = float(plane.heights(viewpoint))
     falls = height - plane.heights(points.astype(np.float64))
-    if not NEAR < height < MAX_DISTANCE:
+    if not INLIER_DISTANCE < height < MAX_DISTANCE:
         return None
     # A scaled point lies in the plane if it is as far below the camera as the plane.
     factors = np.sort(height / falls[falls > 0.5 * height])
-    reach = NEAR / height
+    reach = INLIER_DISTANCE / height
     tried = np.arange(1.0 - plane.max_depth_error, 1.0 + plane.max_depth_error, reach / 10)
     held = np.searchsorted(factors, tried + reach) - np.searchsorted(factors, tried - reach)
-    enough = max(MIN_SHARE * len(points), FEWEST)
+    enough = max(MIN_INLIER_SHARE * len(points), MIN_PLANE_POINTS)
     start, width = 0, 21  # number of factors from the rise of a peak to past it
     while start < len(tried):
         window = held[start : start + width]
         if window.max() >= enough:
-            scale = _middle(factors, float(tried[start + int(window.argmax())]), reach)
+            scale = _median_scale(factors, float(tried[start + int(window.argmax())]), reach)
             if scale is not None:
-                scaled = viewpoint + scale * (thinned(points) - viewpoint)
-                if _wide(scaled[np.abs(plane.heights(scaled)) < NEAR], plane):
+                scaled = viewpoint + scale * (subsample(points) - viewpoint)
+                inliers = scaled[np.abs(plane.heights(scaled)) < INLIER_DISTANCE]
+                if _wider_than_object(inliers, plane):
                     return scale
             start += width - 1
         start += 1
     return None
 
 
-def _wide(points: Floats, plane: SupportPlane) -> bool:
+def _wider_than_object(points: Floats, plane: SupportPlane) -> bool:
     """Whether points (N, 3) cover more of a plane than an object's flat top."""
     frame = CanonicalFrame.of_scene(points, plane.normal, None)
-    _, count = cells_of(frame.points(points)[:, :2], CELL)
-    return len(count) * CELL**2 > LEAST_SCALED_AREA
+    _, count = grid_cells(frame.points(points)[:, :2], AREA_CELL)
+    return len(count) * AREA_CELL**2 > MIN_CORRECTED_AREA
 
 
-def _middle(factors: Float64, scale: float, reach: float) -> float | None:
+def _median_scale(factors: Float64, scale: float, reach: float) -> float | None:
     """The median of the factors around one; None if they spread too much for a plane."""
     for _ in range(20):
         within = factors[np.abs(factors - scale) <= reach]
         scale = float(np.median(within))
     spread = float(np.median(np.abs(within - scale)))
-    return scale if spread <= FLAT * reach else None
+    return scale if spread <= MAX_INLIER_SPREAD * reach else None
