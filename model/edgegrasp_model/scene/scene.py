@@ -141,14 +141,16 @@ def select_points(
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
     seen = ViewedPoints(sent.points, None if viewpoints is None else viewpoints.mean(axis=0))
-    shown = _segmentation(sent, viewpoints, options)
+    segmentation = _segmentation(sent, viewpoints, options)
     # The caller's segments, 0 and below meaning none; else all points are one object.
     number = np.zeros(len(sent.points), dtype=np.int64)
     if sent.segment_ids is not None:
         number = np.where(sent.segment_ids > 0, sent.segment_ids, UNDECIDED)
-    named = number if sent.segment_ids is not None or shown is None else shown.number
-    support = find_support(seen, inside, shown, named >= 0, options, warnings)
-    up = _up(options, support, None if viewpoints is None else shown)
+    objects = number >= 0
+    if sent.segment_ids is None and segmentation is not None:
+        objects = segmentation.number >= 0
+    support = find_support(seen, inside, segmentation, objects, options, warnings)
+    up = _up(options, support, None if viewpoints is None else segmentation)
     above_all = np.ones(len(inside), np.float32), np.zeros(len(inside), np.float32)
     height, margin = above_all if support is None else support.heights(seen)
     labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
@@ -159,8 +161,8 @@ def select_points(
     plan = (support.frame.points(sent.points) if support else sent.points.astype(np.float64))[:, :2]
     number, confidence = number[above], dict[int, float]()
     if not _objects_given(sent, options):
-        if shown is not None:
-            number, confidence = _recognised(shown, support, above, plan, height, margin)
+        if segmentation is not None:
+            number, confidence = _objects_above(segmentation, support, above, plan, height, margin)
         if support is None and (viewpoints is None or not (number >= 0).any()):
             # A single object without its support, although no camera separates an object from what
             # touches it.
@@ -216,8 +218,8 @@ def _segmentation(
     return segment(points, viewpoints[0], up, down)
 
 
-def _recognised(
-    shown: Segmentation,  # of N points
+def _objects_above(
+    segmentation: Segmentation,  # of N points
     support: Support | None,
     above: Int64,  # (M,) which of them rise above the support
     plan: Float64,  # (M, 2) places along it, metres
@@ -225,9 +227,10 @@ def _recognised(
     margin: Float32,  # (N,) metres over it that belong to it
 ) -> tuple[Int64, dict[int, float]]:
     """The object (M,) of each point above the support, and the confidence of each object."""
-    number, confidence = shown.number[above], dict(enumerate(shown.confidence.tolist()))
+    number = segmentation.number[above]
+    confidence = dict(enumerate(segmentation.confidence.tolist()))
     if support is not None:
-        likely = (shown.object + shown.support)[above] > MIN_CONFIDENCE
+        likely = (segmentation.object + segmentation.support)[above] > MIN_CONFIDENCE
         number = with_raised_points(number, plan, height[above], margin[above], likely)
         cut_off = math.isnan(support.growth)
         if cut_off or not (number >= 0).any():
@@ -235,7 +238,7 @@ def _recognised(
             number = with_clusters(number, plan, likely | cut_off, first)
             new = np.flatnonzero(number >= first)
             which = number[new] - first
-            mean = np.bincount(which, shown.object[above[new]]) / np.bincount(which)
+            mean = np.bincount(which, segmentation.object[above[new]]) / np.bincount(which)
             certain = np.full(len(mean), CROPPED_CONFIDENCE) if cut_off else confidences(mean)
             confidence |= enumerate(certain.tolist(), first)
             number[new[certain[which] <= MIN_CONFIDENCE]] = BACKGROUND
@@ -373,7 +376,9 @@ def _too_many_voxels(
     )
 
 
-def _up(options: DetectOptions, support: Support | None, shown: Segmentation | None) -> Float64:
+def _up(
+    options: DetectOptions, support: Support | None, segmentation: Segmentation | None
+) -> Float64:
     """Unit vector (3,) away from gravity: as sent, else the support's normal, else estimated.
 
     +z if none of these is known, or there is no camera.
@@ -382,7 +387,7 @@ def _up(options: DetectOptions, support: Support | None, shown: Segmentation | N
         return unit(np.asarray(options.up, dtype=np.float64))
     if support is not None:
         return np.asarray(support.frame.T_canonical_cloud[2, :3])
-    return np.array([0.0, 0.0, 1.0]) if shown is None else shown.up
+    return np.array([0.0, 0.0, 1.0]) if segmentation is None else segmentation.up
 
 
 def near_objects_along(plan: Float64, number: Int64) -> Bools:
@@ -479,8 +484,8 @@ def chosen_objects(
             wanted = number[on[[distance.argmin()]]]
         else:
             wanted = wanted[:0]
-            shown = ", ".join(f"{value:g}" for value in target)
-            warnings.append(f"{name}: there is no object to grasp at {shown}.")
+            place_sent = ", ".join(f"{value:g}" for value in target)
+            warnings.append(f"{name}: there is no object to grasp at {place_sent}.")
     return np.where((number >= 0) & ~np.isin(number, wanted), BACKGROUND, number)
 
 

@@ -108,7 +108,7 @@ class ViewedPoints(NamedTuple):
 def find_support(
     seen: ViewedPoints,  # N points
     inside: Bools,  # (N,) which of them lie in the workspace
-    shown: Segmentation | None,  # the network's output, where it was asked
+    segmentation: Segmentation | None,  # the network's output, where it was asked
     objects: Bools,  # (N,) which of them are of an object
     options: DetectOptions,
     warnings: list[str],  # gets what is wrong with it, or that there is none
@@ -131,7 +131,9 @@ def find_support(
                 f"the given support plane lies {below:.3g} m below everything that is seen: check "
                 "its frame, normal, and offset in metres."
             )
-        on = np.empty(0, np.int64) if shown is None else np.flatnonzero(shown.support > 0.5)
+        on = np.empty(0, np.int64)
+        if segmentation is not None:
+            on = np.flatnonzero(segmentation.support > 0.5)
         part = seen.points[subsample(on)]
         # Where a support was cut off, only flat tops may be classified as support.
         whole = len(on) > MIN_SUPPORT_SHARE * len(seen.points) and _wider_than_object(part, request)
@@ -145,10 +147,10 @@ def find_support(
             found = None if plane is None else measure_support(seen, plane, request.distance, True)
             found = None if found is None or found.share < request.min_share else found
         else:
-            assert shown is not None
-            found = _fit_support(seen, shown, objects, up, rng)
+            assert segmentation is not None
+            found = _fit_support(seen, segmentation, objects, up, rng)
             if found is None:
-                found = _assume_support(seen, shown, objects, options)
+                found = _assume_support(seen, segmentation, objects, options)
                 if found is not None:
                     warnings.append(
                         "no support plane is seen: one is assumed under the lowest points. Send "
@@ -168,19 +170,19 @@ def find_support(
 
 def _fit_support(
     seen: ViewedPoints,
-    shown: Segmentation,
+    segmentation: Segmentation,
     objects: Bools,
     up: Float64 | None,
     rng: np.random.Generator,
 ) -> Support | None:
     """The plane of the points classified as support, weighted toward those near objects."""
-    on, held = np.flatnonzero(shown.support > 0.5), np.flatnonzero(objects)
+    on, held = np.flatnonzero(segmentation.support > 0.5), np.flatnonzero(objects)
     part = ViewedPoints(seen.points[subsample(on)], seen.viewpoint)
     around = seen.points[subsample(held, 500)]
     # Metres to the nearest object; infinity beyond NEAR_DISTANCE, or where there is no object.
     apart = np.asarray(cKDTree(around).query(part.points, distance_upper_bound=NEAR_DISTANCE)[0])
     weight = np.where(np.isfinite(apart), 1.0, FAR_WEIGHT)
-    up = shown.up if up is None else up
+    up = segmentation.up if up is None else up
     for _ in range(2):
         plane = fit_plane(part, weight, rng, up)
         if plane is None:
@@ -210,17 +212,17 @@ def _fit_support(
 
 
 def _assume_support(
-    seen: ViewedPoints, shown: Segmentation, objects: Bools, options: DetectOptions
+    seen: ViewedPoints, segmentation: Segmentation, objects: Bools, options: DetectOptions
 ) -> Support | None:
     """A support under the lowest points of a cloud that was cut off above it.
 
     Unless a camera is the origin, the frame is of a robot or a world, whose z is up.
     """
-    if (shown.support > 0.5).mean() > MIN_SUPPORT_SHARE:
+    if (segmentation.support > 0.5).mean() > MIN_SUPPORT_SHARE:
         return None
     up, cameras = options.known_up, options.viewpoint
     if up is None and (cameras is None or np.reshape(cameras, (-1, 3)).any(axis=1).all()):
-        up = np.array([0.0, 0.0, 1.0]) if shown.up[2] > 0 else None
+        up = np.array([0.0, 0.0, 1.0]) if segmentation.up[2] > 0 else None
     elif up is None and objects.mean() > CROPPED_OBJECT_SHARE:
         assert seen.viewpoint is not None
         up = _up_of_cropped(seen.points[objects], seen.viewpoint)
