@@ -112,7 +112,9 @@ def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandVie
     low = boxes[:, 0].min(axis=0) - np.array([near, near, APPROACH_LENGTH])
     high = boxes[:, 1].max(axis=0) + np.array([near, near, 2 * near])
     high[2] += gripper.max_tip_z - gripper.tip_z
-    reach = low.astype(np.float32), high.astype(np.float32)
-    hand, row, position = points_in_hand_boxes(in_hands(cloud.points, T_cloud_hand), *reach)
+    hands = in_hands(cloud.points, T_cloud_hand)
+    hand, row, position = points_in_hand_boxes(
+        hands, low.astype(np.float32), high.astype(np.float32)
+    )
     bounds = np.searchsorted(hand, np.arange(len(T_cloud_hand) + 1))
     return HandView(hand, row, position, bounds)

@@ -125,8 +125,9 @@ class Sampler:
         passed = np.flatnonzero(outcome == OUTCOME_CODE[Outcome.RETURNED])
         row = random_rows(passed, OVERSAMPLING * options.num_candidates, self._rng)
         checked = drawn.take(row)
-        hands = checked.T_cloud_hand, checked.opening
-        free = ~collides(self.scene, *hands, self.gripper, options.collision)
+        free = ~collides(
+            self.scene, checked.T_cloud_hand, checked.opening, self.gripper, options.collision
+        )
         outcome[passed] = OUTCOME_CODE[Outcome.NOT_CHECKED]
         outcome[row] = OUTCOME_CODE[Outcome.NOT_SCORED]
         if mode != "ignore":
@@ -165,14 +166,14 @@ class Sampler:
         self.counts["pairs"] += len(crop.ball_rows)
         pair = np.flatnonzero(scene.contact_allowed[crop.ball_rows])
         self.counts["in_contact_region"] += len(pair)
-        pairs = approach_index[crop.ball_of_point[pair]], crop.ball_rows[pair]
-        candidates, _ = edge_grasps(scene.cloud, *pairs, gripper)
+        approach, contact = approach_index[crop.ball_of_point[pair]], crop.ball_rows[pair]
+        candidates, _ = edge_grasps(scene.cloud, approach, contact, gripper)
         candidates = replace(candidates, pair=pair[candidates.pair])
         if self.sees_hands:
             centred = centred_grasps(points, crop, candidates, gripper)
             candidates = Candidates.concatenate([candidates, centred])
         if self.sees_hands or last_resort:
-            contacts = np.flatnonzero(np.bincount(pairs[1]))
+            contacts = np.flatnonzero(np.bincount(contact))
             leaning = self.sees_hands and last_resort
             across = [
                 outline_grasps(

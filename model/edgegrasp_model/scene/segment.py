@@ -99,8 +99,18 @@ def segment(
     number = np.full(len(points), UNDECIDED)
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
     T_camera_cloud = np.linalg.inv(image.T_cloud_camera).astype(np.float64)
-    arrays = pixels.points, of_pixel, pixels.classes, number, objects, support
-    _label_points(points, T_camera_cloud, image.corner, 2 * image.footprint, *arrays)
+    _label_points(
+        points,
+        T_camera_cloud,
+        image.corner,
+        2 * image.footprint,
+        pixels.points,
+        of_pixel,
+        pixels.classes,
+        number,
+        objects,
+        support,
+    )
     return Segmentation(number, objects, support, confidence[likely], turn @ seen_up)
 
 
