@@ -271,11 +271,6 @@ class SupportPlane(Strict):
     """greatest relative error of a camera's depths: each view is scaled about its viewpoint by up
     to this, so that its table lies in the plane; 0: no correction"""
 
-    def heights(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Heights (N,) of points (N, 3) over the plane, metres."""
-        heights: NDArray[np.floating] = points @ np.asarray(self.normal) - self.offset
-        return heights
-
 
 class RansacPlane(Strict):
     """The largest plane in the cloud that is nearly level.

@@ -14,6 +14,7 @@ from edgegrasp_model.options import Collision, Place
 from edgegrasp_model.scene.cloud import pose_matrix
 from edgegrasp_model.scene.obstacles import box_pose
 from edgegrasp_model.scene.scene import Scene
+from edgegrasp_model.scene.support import heights_over
 from edgegrasp_results import DetectedObject, Grasp
 from edgegrasp_robot.surroundings import CELL, Load, moved
 
@@ -83,7 +84,7 @@ def _lowest(scene: Scene, points: Float64) -> float:
     """Height of the lowest of points (N, 3), cloud frame, over the support; 0 without a support."""
     if scene.support is None:
         return 0.0
-    return float(scene.support.heights(scene.frame.points(points)).min())
+    return float(heights_over(scene.support, scene.frame.points(points)).min())
 
 
 def load_of(

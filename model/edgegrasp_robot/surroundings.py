@@ -17,6 +17,7 @@ from edgegrasp_model.options import Box, OrientedBox, RobotArm
 from edgegrasp_model.scene.cloud import pose_matrix, unit
 from edgegrasp_model.scene.obstacles import box_pose
 from edgegrasp_model.scene.scene import Scene
+from edgegrasp_model.scene.support import heights_over
 from edgegrasp_robot.robot import HAND, Robot, touching
 
 CELL = 0.01  # metres, side of a voxel
@@ -122,7 +123,7 @@ def surrounded(
         # A slab below the support plane, its middle below the arm's base.
         normal, base = np.array(scene.support.normal), np.linalg.inv(T_base_scene)[:3, 3]
         upright = Rotation.align_vectors(normal[None], [[0.0, 0.0, 1.0]])[0].as_matrix()
-        middle = base - (scene.support.heights(base) + SLAB[2] / 2) * normal
+        middle = base - (heights_over(scene.support, base) + SLAB[2] / 2) * normal
         T_scene_slab = pose_matrix(upright, middle)
         known.append(("the support", core.Box(*SLAB), T_base_scene @ T_scene_slab))
     voxels = _voxels(robot, joints, scene, points, T_base_scene)
@@ -225,7 +226,7 @@ def _hidden(scene: Scene, voxels: Float64, T_base_scene: Float64) -> Float64:
         places = (voxels + steps * unit(voxels - eye)).reshape(-1, 3)
         kept = np.einsum("ij,ij->i", places - base, places - base) < AROUND**2
         if scene.support is not None:
-            kept &= scene.support.heights(places) > CELL / 2
+            kept &= heights_over(scene.support, places) > CELL / 2
         hidden.append(places[kept] / CELL)
     return _centers(*hidden)
 

@@ -190,7 +190,9 @@ def fit_confidence(network: SceneNet, images: Sequence[SceneImage]) -> list[floa
     means, right = [], []
     for row, image in enumerate(images):
         known = image.up.astype(np.float64) if row % 2 else None
-        pixels, _ = run_network(network, image_points(image), known, 1.0 / float(image.camera[0]))
+        points, footprint = image_points(image), 1.0 / float(image.camera[0])
+        features = scene_features(points, known, footprint)
+        pixels, _ = run_network(network, features, points, footprint)
         number, mean = group_pixels(pixels)
         size = np.bincount(number[number >= 0])
         on_object = (number >= 0) & (image.label[::2, ::2] >= OBJECT)

@@ -24,7 +24,7 @@ from edgegrasp_model.request_cloud import (
     read_depth_images,
 )
 from edgegrasp_model.scene.cloud import CheckedCloud, check_cloud, seen_from_origin, voxelise
-from edgegrasp_model.scene.scene import check_region, inside_region
+from edgegrasp_model.scene.scene import check_region, inside_region, labels_of_all_pixels
 from edgegrasp_service.errors import PayloadTooLarge
 
 from .scenes import SEED, random_hands
@@ -162,7 +162,7 @@ def test_a_large_image_of_something_near_keeps_every_second_row(distance: float,
     np.testing.assert_array_equal(checked.row, np.setdiff1d(every[::step, ::step], every[4, 6]))
     np.testing.assert_allclose(checked.points, image.reshape(-1, 3)[checked.segment_ids])
     kept = every[row // step * step, column // step * step]
-    np.testing.assert_array_equal(checked.of_all_pixels(every.ravel()), kept.ravel())
+    np.testing.assert_array_equal(labels_of_all_pixels(checked, every.ravel()), kept.ravel())
     assert len(check_cloud(image).points) == row.size - 1
 
 

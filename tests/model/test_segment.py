@@ -14,7 +14,7 @@ from edgegrasp_model.results import SUPPORT
 from edgegrasp_model.scene.cloud import CloudInput, check_cloud
 from edgegrasp_model.scene.scene import build_scene, select_points
 from edgegrasp_model.scene.segment import BACKGROUND, Segmentation
-from edgegrasp_model.scene.support import ViewedPoints, find_support
+from edgegrasp_model.scene.support import ViewedPoints, find_support, heights_over
 from edgegrasp_results import Detection
 
 from .rendered import SolidBox, box, boxes_on_table, camera, render, seen_box, table, to_world
@@ -494,7 +494,7 @@ def test_the_floor_of_a_bin_counts_and_not_the_table_beside_it(seed: int) -> Non
     held = rng.uniform((-0.04, -0.04, 0.02), (0.04, 0.04, 0.06), (500, 3))
     found, _ = chosen_support(np.concatenate([floor, table]), held, (0.0, -0.5, 0.8))
     assert found is not None
-    assert np.abs(found.plane.heights(floor[np.abs(floor[:, 0]) < 0.1])).max() < 0.001
+    assert np.abs(heights_over(found.plane, floor[np.abs(floor[:, 0]) < 0.1])).max() < 0.001
     assert found.share == pytest.approx(8000 / 8500, abs=0.01)  # of all points
 
 

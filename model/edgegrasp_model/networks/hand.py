@@ -26,6 +26,7 @@ from edgegrasp_model.networks import layers
 from edgegrasp_model.networks.config import HAND_DESCRIPTION_SIZE, NetworkConfig
 from edgegrasp_model.scene.cloud import UP, unit
 from edgegrasp_model.scene.scene import Surroundings
+from edgegrasp_model.scene.support import heights_over
 from edgegrasp_model.unseen import unseen_space, visible_extents
 
 # The network
@@ -231,7 +232,7 @@ def _stance(around: Surroundings, candidates: Candidates, gripper: Gripper) -> l
         return columns + [np.full(len(pose), UNKNOWN_HEIGHT, dtype=np.float32)] * 3
     tips = pose[:, :3, 3] + gripper.tip_z * pose[:, :3, 2]
     clearance = support_clearance(pose, candidates.opening, support, gripper)
-    heights = support.heights(tips), support.heights(contact), clearance
+    heights = heights_over(support, tips), heights_over(support, contact), clearance
     return columns + [np.clip(h, -UNKNOWN_HEIGHT, UNKNOWN_HEIGHT) for h in heights]
 
 

@@ -57,15 +57,6 @@ class CheckedCloud:
         points = self.points.take(place, axis=0)  # many times faster than indexing
         return replace(self, points=points, row=self.row[place], **arrays)
 
-    def of_all_pixels(self, values: Int64) -> Int64:
-        """Values (R,) of the rows sent, with those of the nearest kept pixel at pixels left out."""
-        if self.image_size is None or self.step == 1:
-            return values
-        height, width = self.image_size
-        kept = values.reshape(height, width)[:: self.step, :: self.step]
-        wide = kept.repeat(self.step, axis=0).repeat(self.step, axis=1)
-        return np.ascontiguousarray(wide[:height, :width]).reshape(-1)
-
 
 def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False) -> CheckedCloud:
     """Check a caller's CloudInput or array of points, and drop the holes of an organised one.

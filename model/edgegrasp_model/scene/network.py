@@ -17,29 +17,12 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.kernels import compiled
-from edgegrasp_model.scene.cloud import (
-    LARGE_IMAGE,
-    MAX_VIEW_TANGENT,
-    OUTLIER_PERCENT,
-    pose_matrix,
-    subsample,
-    unit,
-)
+from edgegrasp_model.scene.cloud import LARGE_IMAGE, MAX_VIEW_TANGENT, OUTLIER_PERCENT, subsample
 
-SIDE_MULTIPLE = 32  # pixels; the sides of its images are multiples of this
 CLASSES = ("other", "support", "object")
 INPUT_CHANNELS = 12  # of `scene_features`
 LAYER_WIDTHS = (16, 32, 48, 64, 96, 128)  # channels at each resolution, the output's first
-NORMAL_STRIDE = 2  # pixels from each pixel to the neighbours that give its normal
 VOTE_UNIT = 0.05  # metres
-# Of range images:
-NEAREST_DEPTH = 0.05  # metres from the viewpoint
-DENSITY_CELLS = 40  # cells across the view in which the density of points is measured
-PIXEL_SPACING = 1.25  # side of a pixel, in distances of sparse points, so that few stay empty
-MAX_HOLE_SPACING = 1.6  # pixels between points up to which holes are filled by interpolation
-MAX_PIXEL_SIZE = 0.003  # metres at the median depth; larger pixels are divided
-MAX_POINTS_PER_PIXEL = 2  # more add nothing
-SURFACE_DEPTH = 0.02  # metres; a point nearer by this much hides another of the same pixel
 
 
 class SceneOutput(NamedTuple):
@@ -116,62 +99,17 @@ def _layer(
     )
 
 
-def scene_features(
-    points: Float32,  # (H, W, 3) camera frame, metres; NaN without a reading
-    up: Float64 | None,  # (3,) unit, away from gravity, camera frame; None: unknown
-    footprint: float,  # width of a pixel at a depth of one metre, metres
-) -> Float32:
-    """The network's input (INPUT_CHANNELS, H, W) for a range image; 0 where nothing was read."""
-    known = np.zeros(3) if up is None else np.asarray(up, dtype=np.float64)
-    features = np.zeros((*points.shape[:2], INPUT_CHANNELS), dtype=np.float32)
-    _fill_features(
-        np.ascontiguousarray(points), known, up is not None, np.log(footprint) + 6.0, features
-    )
-    return features.transpose(2, 0, 1)  # channels last in memory, as the network reads them
+# Range images
 
-
-@compiled("contract")
-def _fill_features(points: Float32, up: Float64, known: bool, offset: float, out: Float32) -> None:
-    height, width, _ = points.shape
-    middle, count = np.zeros(3), 0
-    for i in range(0, height, 2):
-        for j in range(0, width, 2):
-            if not np.isnan(points[i, j, 2]):
-                count += 1
-                for d in range(3):
-                    middle[d] += points[i, j, d]
-    middle /= max(count, 1)
-    s = NORMAL_STRIDE
-    for i in range(height):
-        for j in range(width):
-            x, y, z = points[i, j, 0], points[i, j, 1], points[i, j, 2]
-            if np.isnan(z):
-                continue
-            z = max(z, 0.05)
-            out[i, j, 0] = min(max(2.0 * (z - middle[2]), -3.0), 3.0)
-            out[i, j, 1] = log = np.log(z)
-            out[i, j, 2] = log + offset
-            out[i, j, 3] = x / z
-            out[i, j, 4] = y / z
-            if known:
-                level = up[0] * (x - middle[0]) + up[1] * (y - middle[1]) + up[2] * (z - middle[2])
-                out[i, j, 8] = min(max(2.0 * level, -3.0), 3.0)
-                out[i, j, 10] = 1.0
-            out[i, j, 11] = 1.0
-            if i < s or j < s or i >= height - s or j >= width - s:
-                continue
-            ax = points[i + s, j, 0] - points[i - s, j, 0]
-            ay = points[i + s, j, 1] - points[i - s, j, 1]
-            az = points[i + s, j, 2] - points[i - s, j, 2]
-            bx = points[i, j + s, 0] - points[i, j - s, 0]
-            by = points[i, j + s, 1] - points[i, j - s, 1]
-            bz = points[i, j + s, 2] - points[i, j - s, 2]
-            nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-            length = np.sqrt(nx * nx + ny * ny + nz * nz)
-            if length > 0.0:  # false for NaN as well
-                out[i, j, 5], out[i, j, 6], out[i, j, 7] = nx / length, ny / length, nz / length
-                if known:
-                    out[i, j, 9] = (up[0] * nx + up[1] * ny + up[2] * nz) / length
+SIDE_MULTIPLE = 32  # pixels; the sides of its images are multiples of this
+NEAREST_DEPTH = 0.05  # metres from the viewpoint
+DENSITY_CELLS = 40  # cells across the view in which the density of points is measured
+PIXEL_SPACING = 1.25  # side of a pixel, in distances of sparse points, so that few stay empty
+MAX_HOLE_SPACING = 1.6  # pixels between points up to which holes are filled by interpolation
+MAX_PIXEL_SIZE = 0.003  # metres at the median depth; larger pixels are divided
+MAX_POINTS_PER_PIXEL = 2  # more add nothing
+SURFACE_DEPTH = 0.02  # metres; a point nearer by this much hides another of the same pixel
+NORMAL_STRIDE = 2  # pixels from each pixel to the neighbours that give its normal
 
 
 class RangeImage(NamedTuple):
@@ -193,7 +131,7 @@ def range_image(
     """Render points as seen from a viewpoint."""
     downward = [way for way in (None if up is None else -up, down) if way is not None]
     apart = subsample(points).astype(np.float64) - viewpoint
-    sight = unit(apart)
+    sight = apart / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-9)
     # Rounded, so that the image is independent of the order of the points.
     turn = _camera_axes(sight.mean(axis=0).round(9), downward)
     for _ in range(2):
@@ -220,7 +158,9 @@ def range_image(
     if (times := min(round(pixel_size / finest), int(np.ceil(coarse)))) > 1:
         pixel_size /= times
         filled = _enlarged(filled[..., 2], times, corner, pixel_size)
-    return RangeImage(filled, pixel_size, pose_matrix(turn.T, viewpoint), corner)
+    T_cloud_camera = np.eye(4)
+    T_cloud_camera[:3, :3], T_cloud_camera[:3, 3] = turn.T, viewpoint
+    return RangeImage(filled, pixel_size, T_cloud_camera, corner)
 
 
 def _camera_axes(sight: Float64, downward: list[Float64]) -> Float64:
@@ -331,3 +271,61 @@ def _fill_holes(image: Float32) -> Float32:
             if count >= 4 and high - low < SURFACE_DEPTH + 0.01 * high:
                 out[i, j, 0], out[i, j, 1], out[i, j, 2] = x / count, y / count, z / count
     return out
+
+
+def scene_features(
+    points: Float32,  # (H, W, 3) camera frame, metres; NaN without a reading
+    up: Float64 | None,  # (3,) unit, away from gravity, camera frame; None: unknown
+    footprint: float,  # width of a pixel at a depth of one metre, metres
+) -> Float32:
+    """The network's input (INPUT_CHANNELS, H, W) for a range image; 0 where nothing was read."""
+    known = np.zeros(3) if up is None else np.asarray(up, dtype=np.float64)
+    features = np.zeros((*points.shape[:2], INPUT_CHANNELS), dtype=np.float32)
+    _fill_features(
+        np.ascontiguousarray(points), known, up is not None, np.log(footprint) + 6.0, features
+    )
+    return features.transpose(2, 0, 1)  # channels last in memory, as the network reads them
+
+
+@compiled("contract")
+def _fill_features(points: Float32, up: Float64, known: bool, offset: float, out: Float32) -> None:
+    height, width, _ = points.shape
+    middle, count = np.zeros(3), 0
+    for i in range(0, height, 2):
+        for j in range(0, width, 2):
+            if not np.isnan(points[i, j, 2]):
+                count += 1
+                for d in range(3):
+                    middle[d] += points[i, j, d]
+    middle /= max(count, 1)
+    s = NORMAL_STRIDE
+    for i in range(height):
+        for j in range(width):
+            x, y, z = points[i, j, 0], points[i, j, 1], points[i, j, 2]
+            if np.isnan(z):
+                continue
+            z = max(z, 0.05)
+            out[i, j, 0] = min(max(2.0 * (z - middle[2]), -3.0), 3.0)
+            out[i, j, 1] = log = np.log(z)
+            out[i, j, 2] = log + offset
+            out[i, j, 3] = x / z
+            out[i, j, 4] = y / z
+            if known:
+                level = up[0] * (x - middle[0]) + up[1] * (y - middle[1]) + up[2] * (z - middle[2])
+                out[i, j, 8] = min(max(2.0 * level, -3.0), 3.0)
+                out[i, j, 10] = 1.0
+            out[i, j, 11] = 1.0
+            if i < s or j < s or i >= height - s or j >= width - s:
+                continue
+            ax = points[i + s, j, 0] - points[i - s, j, 0]
+            ay = points[i + s, j, 1] - points[i - s, j, 1]
+            az = points[i + s, j, 2] - points[i - s, j, 2]
+            bx = points[i, j + s, 0] - points[i, j - s, 0]
+            by = points[i, j + s, 1] - points[i, j - s, 1]
+            bz = points[i, j + s, 2] - points[i, j - s, 2]
+            nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+            length = np.sqrt(nx * nx + ny * ny + nz * nz)
+            if length > 0.0:  # false for NaN as well
+                out[i, j, 5], out[i, j, 6], out[i, j, 7] = nx / length, ny / length, nz / length
+                if known:
+                    out[i, j, 9] = (up[0] * nx + up[1] * ny + up[2] * nz) / length

@@ -150,7 +150,6 @@ def select_points(
     if sent.segment_ids is None and segmentation is not None:
         objects = segmentation.number >= 0
     support = find_support(seen, inside, segmentation, objects, options, warnings)
-    up = _up(options, support, None if viewpoints is None else segmentation)
     above_all = np.ones(len(inside), np.float32), np.zeros(len(inside), np.float32)
     height, margin = above_all if support is None else support.heights(seen)
     labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
@@ -177,12 +176,23 @@ def select_points(
             )
     number = np.where(inside | (number == BACKGROUND), number, UNDECIDED)
     labels[sent.row] = np.where(number >= 0, number, OBSTACLE)
-    labels = sent.of_all_pixels(labels) if options.debug else labels
+    labels = labels_of_all_pixels(sent, labels) if options.debug else labels
     if options.at or options.near or isinstance(options.objects, ObjectChoice):
         number = chosen_objects(number, sent, options, warnings)
     kept = near_objects_along(plan, number)
     near, number = sent.take(kept), number[kept]
+    up = _up(options, support, None if viewpoints is None else segmentation)
     return SelectedPoints(near, number, support, up, viewpoints, labels, confidence, corrected)
+
+
+def labels_of_all_pixels(sent: CheckedCloud, labels: Int64) -> Int64:
+    """Labels (R,) of the rows sent, with those of the nearest kept pixel at pixels left out."""
+    if sent.image_size is None or sent.step == 1:
+        return labels
+    height, width = sent.image_size
+    kept = labels.reshape(height, width)[:: sent.step, :: sent.step]
+    wide = kept.repeat(sent.step, axis=0).repeat(sent.step, axis=1)
+    return np.ascontiguousarray(wide[:height, :width]).reshape(-1)
 
 
 def _objects_given(sent: CheckedCloud, options: DetectOptions) -> bool:
@@ -297,8 +307,8 @@ def build_scene(
         at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, sent.points),
         viewpoints=None if eyes is None else eyes.astype(np.float32),
         confidence=selected.confidence,
-        obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
         P_image_cloud=_projection(sent, eyes, frame),
+        obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
         corrected=selected.corrected,
     )
 
@@ -325,7 +335,8 @@ def _projection(sent: CheckedCloud, eyes: Float64 | None, frame: CanonicalFrame)
     row, (height, width) = subsample(sent.row, 1000), sent.image_size
     x = (2 * (row % width) + 1)[:, None] / width - 1
     y = (2 * (row // width) + 1)[:, None] / height - 1
-    sight = unit(frame.points(subsample(sent.points, 1000)) - eyes)
+    sight = frame.points(subsample(sent.points, 1000)) - eyes
+    sight /= np.maximum(np.linalg.norm(sight, axis=1, keepdims=True), 1e-9)
     none = np.zeros_like(sight)
     equations = np.block([[sight, none, -x * sight], [none, sight, -y * sight]])
     P = np.linalg.eigh(equations.T @ equations)[1][:, 0].reshape(3, 3)

@@ -90,7 +90,8 @@ def segment(
     image = range_image(points, viewpoint, up, down)
     turn, (network, _) = image.T_cloud_camera[:3, :3], shipped()
     up_in_view = None if up is None else up @ turn
-    pixels, seen_up = run_network(network, image.points, up_in_view, image.footprint)
+    features = scene_features(image.points, up_in_view, image.footprint)
+    pixels, seen_up = run_network(network, features, image.points, image.footprint)
     of_pixel, mean = group_pixels(pixels)
     confidence = confidences(mean)
     likely = confidence > MIN_CONFIDENCE
@@ -140,12 +141,11 @@ def segment_views(
 
 def run_network(
     network: SceneNet,  # in evaluation mode
+    features: Float32,  # (INPUT_CHANNELS, H, W) as of `scene_features`
     points: Float32,  # (H, W, 3) camera frame, metres; NaN where nothing was seen
-    up: Float64 | None,  # (3,) unit; None: unknown
     footprint: float,  # width of a pixel at a depth of one metre, metres
 ) -> tuple[Pixels, Float64]:
     """A network's output for a range image, and its estimate of up (3,); camera frame."""
-    features = scene_features(points, up, footprint)
     with torch.inference_mode(), one_thread():
         output = network(torch.from_numpy(features)[None])
         classes = output.classes[0].softmax(dim=0).contiguous().numpy()

@@ -105,6 +105,12 @@ class ViewedPoints(NamedTuple):
         return np.asarray(np.sqrt(np.einsum("nd,nd->n", apart, apart)))
 
 
+def heights_over(plane: SupportPlane, points: Floats) -> Floats:
+    """Heights (N,) of points (N, 3) over a plane, metres."""
+    heights: Floats = points @ np.asarray(plane.normal) - plane.offset
+    return heights
+
+
 def find_support(
     seen: ViewedPoints,  # N points
     inside: Bools,  # (N,) which of them lie in the workspace
@@ -125,7 +131,7 @@ def find_support(
         around = np.inf if options.follows_only else MAX_WORKSPACE_GAP * np.abs(request.normal)
         over = np.flatnonzero(inside_workspace(seen.points, options.workspace, around))
         some = subsample(over)
-        below = float(request.heights(seen.points[some]).min(initial=np.inf))
+        below = float(heights_over(request, seen.points[some]).min(initial=np.inf))
         if options.max_object_size < below < np.inf:
             warnings.append(
                 f"the given support plane lies {below:.3g} m below everything that is seen: check "
@@ -161,7 +167,8 @@ def find_support(
                 "no support plane is seen: objects are returned without one, and hands may reach "
                 "under them. Send support, or up in the cloud's frame."
             )
-    if found is not None and seen.viewpoint is not None and found.plane.heights(seen.viewpoint) < 0:
+    eye = seen.viewpoint
+    if found is not None and eye is not None and heights_over(found.plane, eye) < 0:
         warnings.append(
             "the viewpoint lies below the support plane: check viewpoint, up and support."
         )
@@ -187,20 +194,20 @@ def _fit_support(
         plane = fit_plane(part, weight, rng, up)
         if plane is None:
             return None
-        below = plane.heights(around) < -MAX_MARGIN
+        below = heights_over(plane, around) < -MAX_MARGIN
         if len(below) == 0 or below.mean() <= MAX_SHARE_BELOW:
             break
         # This plane is the top of something larger, and the objects stand below it.
-        weight[plane.heights(part.points) > -MAX_MARGIN] = 0.0
+        weight[heights_over(plane, part.points) > -MAX_MARGIN] = 0.0
     else:
         return None
     # Of the points close to objects: the plane of a bin's floor, not the table's.
     close = part.points[apart < REFINE_DISTANCE]
-    near = close[np.abs(plane.heights(close)) < MAX_MARGIN].astype(np.float64)
+    near = close[np.abs(heights_over(plane, close)) < MAX_MARGIN].astype(np.float64)
     for within in REFINE_HEIGHTS:
         if len(near) < MIN_PLANE_POINTS:
             break
-        height = plane.heights(near)
+        height = heights_over(plane, near)
         near = near[np.abs(height - np.median(height)) < within]
         plane = _fit_least_squares(near, plane) if len(near) >= MIN_PLANE_POINTS else plane
     found = measure_support(part, plane, PLANE_NOISE, True)
@@ -312,7 +319,7 @@ def fit_plane(
     offset = float(normals[best] @ origin[best])
     plane = SupportPlane.model_construct(normal=tuple(normals[best].tolist()), offset=offset)
     for within in (1.0, 0.7, 0.5):
-        near = np.abs(plane.heights(points)) < within * thick
+        near = np.abs(heights_over(plane, points)) < within * thick
         if near.sum() < MIN_PLANE_POINTS // 2:
             break
         plane = _fit_least_squares(points[near], plane)
@@ -400,8 +407,8 @@ def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> floa
     nothing is seen below the table. None if the camera is not above the plane, is too high, or sees
     too little. Points (N, 3) and viewpoint (3,) in metres.
     """
-    height = float(plane.heights(viewpoint))
-    falls = height - plane.heights(points.astype(np.float64))
+    height = float(heights_over(plane, viewpoint))
+    falls = height - heights_over(plane, points.astype(np.float64))
     if not INLIER_DISTANCE < height < MAX_DISTANCE:
         return None
     # A scaled point lies in the plane if it is as far below the camera as the plane.
@@ -417,7 +424,7 @@ def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> floa
             scale = _median_scale(factors, float(tried[start + int(window.argmax())]), reach)
             if scale is not None:
                 scaled = viewpoint + scale * (subsample(points) - viewpoint)
-                inliers = scaled[np.abs(plane.heights(scaled)) < INLIER_DISTANCE]
+                inliers = scaled[np.abs(heights_over(plane, scaled)) < INLIER_DISTANCE]
                 if _wider_than_object(inliers, plane):
                     return scale
             start += width - 1
