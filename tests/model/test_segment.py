@@ -303,6 +303,23 @@ def test_a_support_is_assumed_under_a_cloud_that_was_cut_off_above_it(frame: str
     assert max(grasp.approach_direction @ found.support.normal for grasp in found.grasps) < 0.11
 
 
+@pytest.mark.parametrize("support", ["auto", None])
+@pytest.mark.parametrize("half", [(0.03, 0.05, 0.02), (0.02, 0.03, 0.07), (0.025, 0.025, 0.04)])
+@pytest.mark.parametrize(("polar", "forward"), [(0.3, "z"), (0.7, "z"), (1.0, "z"), (1.0, "x")])
+def test_an_object_alone_in_a_cameras_frame_is_not_grasped_from_below(
+    support: str | None, half: tuple[float, float, float], polar: float, forward: str
+) -> None:
+    """Neither its support nor `up` is known."""
+    one, pose = box((0, 0, half[2]), half, 0.4), camera(polar, -1.5, 0.6)
+    points, pose = seen_in_world([one], pose) - pose[:3, 3], pose[:3, :3]
+    if forward == "x":  # x forward, y left, z up
+        pose = pose[:, [2, 0, 1]] * (1, -1, -1)
+    found = detect((points @ pose).astype(np.float32), np.eye(4), support=support)
+    assert found.up @ pose[2] > np.cos(np.radians(35))
+    assert found.grasps
+    assert max(grasp.approach_direction @ pose[2] for grasp in found.grasps[:10]) < 0.3
+
+
 @pytest.mark.parametrize("count", [20_000, 8_000])
 def test_a_sparse_cloud_of_the_whole_view_shows_the_same_objects(count: int) -> None:
     boxes, T_world_camera = boxes_on_table(2), camera(0.8, -1.5, 0.6)

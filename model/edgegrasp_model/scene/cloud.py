@@ -180,6 +180,14 @@ def seen_from_origin(points: Float32, up: ArrayLike | None) -> bool:
     return bool(upward <= MAX_UPWARD_SINE * np.linalg.norm(middle))
 
 
+def usual_up(forward: Float64) -> Float64:
+    """Up (3,) in most clouds that a camera sees along `forward` (3,), unit.
+
+    It is -y in a camera's frame, whose z points forward, and +z in the frames of robots.
+    """
+    return np.array([0.0, -1.0, 0.0]) if abs(forward[2]) > 0.7 else np.array([0.0, 0.0, 1.0])
+
+
 def _checked_array(field: str, array: object, size: int, row: Int64) -> Array:
     """The given rows of an array beside the cloud, of one integer or of three floats a point."""
     width = 1 if field.endswith("_ids") else 3

@@ -17,7 +17,13 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.kernels import compiled
-from edgegrasp_model.scene.cloud import LARGE_IMAGE, MAX_VIEW_TANGENT, OUTLIER_PERCENT, subsample
+from edgegrasp_model.scene.cloud import (
+    LARGE_IMAGE,
+    MAX_VIEW_TANGENT,
+    OUTLIER_PERCENT,
+    subsample,
+    usual_up,
+)
 
 CLASSES = ("other", "support", "object")
 INPUT_CHANNELS = 12  # of `scene_features`
@@ -170,9 +176,7 @@ def _camera_axes(sight: Float64, downward: list[Float64]) -> Float64:
     """
     length = float(np.linalg.norm(sight))
     z = sight / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
-    # Clouds are usually in a camera's frame (y down) or in a frame whose z points up.
-    usual = np.array([0.0, 1.0, 0.0]) if abs(z[2]) > 0.7 else np.array([0.0, 0.0, -1.0])
-    choices = [*downward, usual, np.array([1.0, 0.0, 0.0])]
+    choices = [*downward, -usual_up(z), np.array([1.0, 0.0, 0.0])]
     x = next(x for x in (np.cross(way, z) for way in choices) if np.linalg.norm(x) > 0.1)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z])

@@ -56,7 +56,14 @@ from edgegrasp_model.scene.segment import (
     with_raised_points,
     without_long,
 )
-from edgegrasp_model.scene.support import Support, ViewedPoints, correct_depth_scale, find_support
+from edgegrasp_model.scene.support import (
+    Support,
+    ViewedPoints,
+    correct_depth_scale,
+    find_support,
+    in_camera_frame,
+    up_of_cropped,
+)
 from edgegrasp_model.unseen import DepthMap
 
 MIN_VOXELS = 4  # of a surface
@@ -181,7 +188,7 @@ def select_points(
         number = chosen_objects(number, sent, options, warnings)
     kept = near_objects_along(plan, number)
     near, number = sent.take(kept), number[kept]
-    up = _up(options, support, None if viewpoints is None else segmentation)
+    up = _up(options, seen, support, None if viewpoints is None else segmentation)
     return SelectedPoints(near, number, support, up, viewpoints, labels, confidence, corrected)
 
 
@@ -388,7 +395,10 @@ def _too_many_voxels(
 
 
 def _up(
-    options: DetectOptions, support: Support | None, segmentation: Segmentation | None
+    options: DetectOptions,
+    seen: ViewedPoints,
+    support: Support | None,
+    segmentation: Segmentation | None,
 ) -> Float64:
     """Unit vector (3,) away from gravity: as sent, else the support's normal, else estimated.
 
@@ -398,7 +408,11 @@ def _up(
         return unit(np.asarray(options.up, dtype=np.float64))
     if support is not None:
         return np.asarray(support.frame.T_canonical_cloud[2, :3])
-    return np.array([0.0, 0.0, 1.0]) if segmentation is None else segmentation.up
+    if segmentation is not None:
+        return segmentation.up
+    if seen.viewpoint is not None and in_camera_frame(options) and len(seen.points) > 0:
+        return up_of_cropped(seen.points, seen.viewpoint, None)
+    return np.array([0.0, 0.0, 1.0])
 
 
 def near_objects_along(plan: Float64, number: Int64) -> Bools:

@@ -19,6 +19,8 @@ from edgegrasp_model.scene.cloud import (
     grid_cells,
     inside_workspace,
     subsample,
+    unit,
+    usual_up,
 )
 from edgegrasp_model.scene.segment import Segmentation
 
@@ -49,10 +51,8 @@ MAX_WORKSPACE_GAP = 0.05  # metres from a given plane up to a workspace that sta
 # A cloud that was cropped above its support.
 MIN_SUPPORT_SHARE = 0.2  # of points classified as support, otherwise
 CROPPED_OBJECT_SHARE = 0.8  # of points of objects, from which nothing else is left
-MIN_DOWNWARD_SINE = 0.17  # of the angle at which the camera looks down
 TOUCH_DISTANCE = 0.006  # metres from a plane that the cloud touches
-MAX_TOUCHING_PLANES = 40  # that are compared
-UPRIGHT_WEIGHT = 0.9  # additional weight of a plane that is level in an upright image
+MIN_UP_COSINE = 0.5  # of the angle between up and where most cameras see it
 ASSUMED_PLANE_GAP = 0.003  # metres from the lowest points down to the assumed plane
 
 # Depths that a given plane corrects.
@@ -221,20 +221,19 @@ def _fit_support(
 def _assume_support(
     seen: ViewedPoints, segmentation: Segmentation, objects: Bools, options: DetectOptions
 ) -> Support | None:
-    """A support under the lowest points of a cloud that was cut off above it.
-
-    Unless a camera is the origin, the frame is of a robot or a world, whose z is up.
-    """
+    """A support under the lowest points of a cloud that was cropped above it."""
     if (segmentation.support > 0.5).mean() > MIN_SUPPORT_SHARE:
         return None
-    up, cameras = options.known_up, options.viewpoint
-    if up is None and (cameras is None or np.reshape(cameras, (-1, 3)).any(axis=1).all()):
-        up = np.array([0.0, 0.0, 1.0]) if segmentation.up[2] > 0 else None
-    elif up is None and objects.mean() > CROPPED_OBJECT_SHARE:
+    up = options.known_up
+    if up is None and in_camera_frame(options):
+        if objects.mean() <= CROPPED_OBJECT_SHARE:
+            return None
         assert seen.viewpoint is not None
-        up = _up_of_cropped(seen.points[objects], seen.viewpoint)
-    if up is None:
-        return None
+        up = up_of_cropped(seen.points[objects], seen.viewpoint, segmentation.up)
+    elif up is None:
+        if segmentation.up[2] <= 0:
+            return None
+        up = np.array([0.0, 0.0, 1.0])
     lowest = float(np.percentile(seen.points.astype(np.float64) @ up, OUTLIER_PERCENT))
     plane = SupportPlane.model_construct(
         normal=tuple(up.tolist()), offset=lowest - ASSUMED_PLANE_GAP
@@ -242,32 +241,41 @@ def _assume_support(
     return measure_support(seen, plane, 0.0, False)
 
 
-def _up_of_cropped(cloud: Float32, viewpoint: Float64) -> Float64 | None:
-    """Up (3,) of a cloud (N, 3) without its support: its lower edge lies in a plane.
+def in_camera_frame(options: DetectOptions) -> bool:
+    """Whether a camera is the origin: else the frame is of a robot or a world, whose z is up."""
+    cameras = options.viewpoint
+    return cameras is not None and not np.reshape(cameras, (-1, 3)).any(axis=1).all()
 
-    Of the planes that the cloud touches, on the side that the camera does not see, the one that it
-    touches in the most places. None: the camera looks up, or it is a flat cloud.
+
+def up_of_cropped(
+    cloud: Float32,  # (N, 3) metres, in the frame of a camera
+    viewpoint: Float64,  # (3,)
+    estimate: Float64 | None,  # (3,) unit, of the network; None: unknown
+) -> Float64:
+    """Up (3,), unit, of a cloud without its support: its lower edge lies in a plane.
+
+    Of the planes that the cloud touches on the side that the camera does not see, the one that it
+    touches in the most places. As the sides of a box are touched as often as what it stands on,
+    planes count less the more they differ from where most cameras see up: between the top of the
+    image and the camera, and near the network's estimate.
     """
     points = subsample(cloud).astype(np.float64)
-    if len(points) < MIN_PLANE_POINTS:
-        return None
-    toward = viewpoint - points.mean(axis=0)
+    toward = unit(viewpoint - points.mean(axis=0))
+    hints = [toward, usual_up(-toward), *([] if estimate is None else [estimate])]
+    usual: Float64 = unit(np.sum(hints, axis=0))
     try:
         planes = ConvexHull(points).equations
-    except QhullError:
-        return None
-    behind = planes[:, :3] @ toward < -MIN_DOWNWARD_SINE * np.linalg.norm(toward)
-    behind &= planes[:, :3] @ viewpoint + planes[:, 3] < 0.0
-    planes = planes[behind]
+    except (QhullError, ValueError):  # a flat cloud; fewer than four points
+        return usual
+    likely = -planes[:, :3] @ usual > MIN_UP_COSINE
+    likely &= (planes[:, :3] @ toward < 0.0) & (planes[:, :3] @ viewpoint + planes[:, 3] < 0.0)
+    planes = planes[likely]
     near = points @ planes[:, :3].T + planes[:, 3] > -TOUCH_DISTANCE
-    fullest = np.argsort(-near.sum(axis=0), kind="stable")[:MAX_TOUCHING_PLANES]
-    places = [len(grid_cells(points[near[:, k]], TOUCH_DISTANCE)[1]) for k in fullest]
+    places = [len(grid_cells(points[touched], TOUCH_DISTANCE)[1]) for touched in near.T]
     if not places:
-        return None
-    # Alone, the sides of a box are touched as often as what it stands on; most images are upright.
-    upright = 1.0 + UPRIGHT_WEIGHT * planes[fullest, 1]
-    up: Float64 = -planes[fullest[np.argmax(places * upright)], :3]
-    return up
+        return usual
+    weight = -planes[:, :3] @ usual - MIN_UP_COSINE
+    return np.asarray(-planes[np.argmax(places * weight), :3])
 
 
 def _fit_least_squares(points: Float64, like: SupportPlane) -> SupportPlane:
