@@ -68,6 +68,7 @@ from edgegrasp_model.unseen import DepthMap
 
 MIN_VOXELS = 4  # of a surface
 SIDE_DEPTH = 0.006  # metres from a side of the workspace within which an object may be cut off
+OVERVIEW_RADIUS = 0.7  # metres around the middle of a cloud, if no camera is known
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 HAND_REACH = 0.25  # metres around an object in which a hand at it may collide
 FOLLOWED_REACH = 0.16  # the same if only known grasps are checked
@@ -217,13 +218,8 @@ def _segmentation(
     if len(sent.points) == 0 or options.support is None or not needed:
         return None
     points, up, down = sent.points, options.known_up, None
-    if viewpoints is None:  # from above the points, in an image that turns with them
-        low, high = np.percentile(points, (1, 99), axis=0)
-        away = max(1.0, 1.5 * float((high - low).max()))
-        eye = (low + high) / 2 + away * (np.array([0.0, 0.0, 1.0]) if up is None else up)
-        apart = points - points.mean(axis=0)
-        down = unit(apart[np.linalg.norm(apart, axis=1).argmax()]).astype(np.float64)
-        return segment(points, eye, up, down)
+    if viewpoints is None:
+        return _segment_from_above(points, up)
     if len(viewpoints) > 1:
         assert sent.view_ids is not None
         return segment_views(points, viewpoints, sent.view_ids, up)
@@ -233,6 +229,26 @@ def _segmentation(
         down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
         down = unit(down) if down.any() else None
     return segment(points, viewpoints[0], up, down)
+
+
+def _segment_from_above(points: Float32, up: Float64 | None) -> Segmentation:
+    """Segment points (N, 3) as seen from above their middle, in an image that turns with them.
+
+    Points farther away than OVERVIEW_RADIUS stay undecided: a room is seen too small.
+    """
+    over = np.array([0.0, 0.0, 1.0]) if up is None else up
+    beside = points - np.median(points, axis=0)
+    beside -= (beside @ over)[:, None] * over
+    near = np.linalg.norm(beside, axis=1) < OVERVIEW_RADIUS
+    some = points[near]
+    low, high = np.percentile(some, (1, 99), axis=0)
+    eye = (low + high) / 2 + max(1.0, 1.5 * float((high - low).max())) * over
+    apart = some - some.mean(axis=0)
+    down = unit(apart[np.linalg.norm(apart, axis=1).argmax()]).astype(np.float64)
+    found = segment(some, eye, up, down)
+    number, (objects, support) = np.full(len(points), UNDECIDED), np.zeros((2, len(points)), "f4")
+    number[near], objects[near], support[near] = found.number, found.object, found.support
+    return Segmentation(number, objects, support, found.confidence, found.up)
 
 
 def _objects_above(
