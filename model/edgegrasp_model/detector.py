@@ -156,11 +156,11 @@ class GraspDetector:
         elif previous is not None:
             chosen, given = bool(options.at or options.near), sent.segment_ids is not None
             scene, followed = tracking.follow(scene, previous, given, chosen)
-            if previous.search:
-                scene, followed = tracking.only_chosen(scene, followed, choice, warnings)
             if options.debug:
                 labels = tracking.relabelled(selected.labels, followed.named)
                 selected = replace(selected, labels=labels)
+            if previous.search:
+                scene, followed = tracking.only_chosen(scene, followed, choice, warnings)
         seconds = {"cloud": time.perf_counter() - start}
         return Prepared(
             options, gripper, radius, selected, scene, counts, warnings, seconds, followed

@@ -1,5 +1,6 @@
 """From the caller's array to the small, clean cloud with normals that the network sees."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self, TypeVar, cast
 
@@ -75,7 +76,8 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
     if points.ndim == 3:
         # A single row of points, such as fused images, is not an image.
         image_size = None if 1 in points.shape[:2] else points.shape[:2]
-        step = 2 if thin and _is_fine(points) else 1
+        large = image_size is not None and np.greater_equal(image_size, LARGE_IMAGE).all()
+        step = 2 if thin and large and _pixel_spacing(points) <= FINE_SPACING else 1
         row = row.reshape(points.shape[:2])[::step, ::step].reshape(-1)
         points = points[::step, ::step].reshape(-1, 3)
         x, y, z = points.T
@@ -119,14 +121,12 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
     )
 
 
-def _is_fine(image: Floats) -> bool:
-    """Whether an image (H, W, 3) is large and its neighbouring pixels lie close together."""
-    if image.shape[0] < LARGE_IMAGE[0] or image.shape[1] < LARGE_IMAGE[1]:
-        return False
+def _pixel_spacing(image: Floats) -> float:
+    """Median distance, metres, between neighbouring pixels of an image (H, W, 3); NaN: no two."""
     with np.errstate(invalid="ignore"):  # holes may be infinite
         apart = np.linalg.norm(image[::16, 1::8] - image[::16, :-1:8], axis=-1)
     apart = apart[np.isfinite(apart)]
-    return len(apart) > 0 and bool(np.median(apart) <= FINE_SPACING)
+    return float(np.median(apart)) if len(apart) else math.nan
 
 
 def subsample(rows: NDArray[Scalar], most: int = SUBSAMPLE_SIZE) -> NDArray[Scalar]:
