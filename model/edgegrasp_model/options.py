@@ -610,8 +610,8 @@ class DetectOptions(Strict):
     """camera position, metres; normals are oriented towards it. If there are several, `view_ids`
     beside the cloud says which one saw each point"""
     up: Direction | None = None
-    """direction away from gravity; any length but zero; null: the support plane's normal, else
-    +z"""
+    """direction away from gravity; any length but zero; null: the support plane's normal; without
+    it estimated in a camera's frame, else +z"""
     support: SupportChoice = AutoPlane()
     """plane that the objects rest on and the hand stays above; a kind alone is allowed; null:
     none"""

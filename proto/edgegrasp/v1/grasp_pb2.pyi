@@ -632,7 +632,9 @@ class DetectOptions(_message.Message):
 
     @_builtins.property
     def up(self) -> Global___Vector:
-        """Direction away from gravity; any length but zero; absent: the support plane's normal, else +z."""
+        """Direction away from gravity; any length but zero; absent: the support plane's normal; without
+        it estimated in a camera's frame, else +z.
+        """
 
     @_builtins.property
     def support(self) -> Global___Support:
