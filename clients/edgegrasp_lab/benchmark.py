@@ -15,8 +15,7 @@ from rich.progress import Progress, TimeElapsedColumn
 from rich.table import Table
 from typer import Argument, Option
 
-from edgegrasp_cli.flags import option_flags, parse_option_flags, takes_flags
-from edgegrasp_lab.planners import PlannerFlags, open_planner
+from edgegrasp_cli.flags import Connection, option_flags, parse_option_flags, takes_flags
 from edgegrasp_model.gripper import gripper_fields
 from edgegrasp_sim import results
 from edgegrasp_sim.benchmark import BenchmarkConfig, manifest, run_benchmark
@@ -46,6 +45,23 @@ class Cluster(BaseModel, use_attribute_docstrings=True):
     """Processes, which do not change results; default: one per core"""
     ray: str | None = None
     """Address of a Ray cluster to run on; local: this machine"""
+
+
+class PlannerFlags(Connection):
+    """The flags that choose a planner of the benchmark."""
+
+    timeout: float = 300.0
+    """Seconds to wait for a server"""
+    planner: str = "server"
+    """server, in-process, name of an installed planner, or module:callable"""
+    server: str | None = None
+    """host:port (gRPC) or http://host:port; without it, one is started"""
+    weights: tuple[Path, ...] = ()
+    """Weights besides those that ship"""
+    model: str = ""
+    """Weights to use: a name or a .safetensors file; empty: the default"""
+    robot: str | None = None
+    """Arm that executes the grasps with its own hand, in MuJoCo: name or .toml file"""
 
 
 class BenchmarkFlags(Cluster, PlannerFlags):
@@ -203,6 +219,8 @@ def run_rounds(
     config: BenchmarkConfig, asked: BenchmarkFlags, options: dict[str, Any], folder: ResultFolder
 ) -> list[Round]:
     """Run the rounds that a folder lacks, with a progress bar; returns all."""
+    from edgegrasp_lab.planners import open_planner  # loads gRPC, which help does without
+
     # Fails on a wrong folder before a server is started, and prepares meshes once for all workers.
     with Console(stderr=True).status("reading objects"):
         config.object_set()

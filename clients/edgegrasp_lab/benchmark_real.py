@@ -18,8 +18,6 @@ from edgegrasp_camera.arrays import Int64
 from edgegrasp_camera.picture import Picture
 from edgegrasp_cli.detect import DetectorFlags, open_client
 from edgegrasp_cli.flags import option_flags, parse_option_flags, takes_flags
-from edgegrasp_client import InvalidRequestError
-from edgegrasp_lab.planners import model_used
 from edgegrasp_lab.real_scenes import BEST, RealScene, SceneFigures, judge, load_scenes, renumbered
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import choose_gripper, load_gripper
@@ -50,6 +48,8 @@ def benchmark_real(
     A request contains the image and its intrinsics, or the cloud with the camera at its origin, and
     the options given as flags; nothing else about the scene.
     """
+    from edgegrasp_lab.planners import model_used
+
     fields, loaded = parse_option_flags(options), load_scenes(scenes)
     output.mkdir(parents=True, exist_ok=True)
     done: dict[str, SceneFigures] = {}
@@ -80,6 +80,8 @@ def benchmark_real(
 
 def _ask(client: Any, scene: RealScene, fields: Mapping[str, Any]) -> tuple[Any, str]:
     """The answer for a scene; an empty one and the reason if the request is refused."""
+    from edgegrasp_client import InvalidRequestError
+
     try:
         return client.detect(**scene.request, **fields), ""
     except (InvalidRequest, InvalidRequestError) as error:

@@ -17,7 +17,6 @@ from typer import Option
 from edgegrasp_camera.arrays import Float64
 from edgegrasp_cli.detect import DetectorFlags, open_client
 from edgegrasp_cli.flags import takes_flags
-from edgegrasp_client import GraspTracker
 from edgegrasp_lab.real_scenes import RealScene, load_scenes
 from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.objects import ObjectSet, SceneKind
@@ -211,6 +210,8 @@ def benchmark_tracking(
 
 def follow(client: Any, scene: Scene, seconds: float, clock: Callable[[], float]) -> Followed:
     """Follow the first grasp of a scene, which starts to move once that grasp is found."""
+    from edgegrasp_client import GraspTracker
+
     tracker, done, now, shown = GraspTracker(top_k=10), Followed(), 0.0, None
     while now < seconds:
         taken = np.floor(now * RATE + 1e-6) / RATE  # the latest image

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from edgegrasp_cli.detect import OwnDetector
-from edgegrasp_cli.flags import Connection
 from edgegrasp_client import GraspClientError, Model, ServerUnavailableError, StartCollisionError
 from edgegrasp_client.connection import local_server
+from edgegrasp_lab.benchmark import PlannerFlags
 from edgegrasp_model.errors import StartCollision
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.protocol import PlanningRules
@@ -20,23 +20,6 @@ from edgegrasp_sim.trial import PlannedGrasp, Planner, StartCollides
 GROUP = "edgegrasp.planners"  # entry points under which packages may name their planners
 SHIPPED = ("server", "in-process")
 SUFFIX = ".safetensors"
-
-
-class PlannerFlags(Connection):
-    """The flags that choose a planner of the benchmark."""
-
-    timeout: float = 300.0
-    """Seconds to wait for a server"""
-    planner: str = "server"
-    """server, in-process, name of an installed planner, or module:callable"""
-    server: str | None = None
-    """host:port (gRPC) or http://host:port; without it, one is started"""
-    weights: tuple[Path, ...] = ()
-    """Weights besides those that ship"""
-    model: str = ""
-    """Weights to use: a name or a .safetensors file; empty: the default"""
-    robot: str | None = None
-    """Arm that executes the grasps with its own hand, in MuJoCo: name or .toml file"""
 
 
 class ChosenPlanner(NamedTuple):
