@@ -151,12 +151,10 @@ def select_points(
     seen = ViewedPoints(sent.points, None if viewpoints is None else viewpoints.mean(axis=0))
     segmentation = _segmentation(sent, viewpoints, options)
     # The caller's segments, 0 and below meaning none; else all points are one object.
-    number = np.zeros(len(sent.points), dtype=np.int64)
-    if sent.segment_ids is not None:
-        number = np.where(sent.segment_ids > 0, sent.segment_ids, UNDECIDED)
-    objects = number >= 0
-    if sent.segment_ids is None and segmentation is not None:
-        objects = segmentation.number >= 0
+    number, ids = np.zeros(len(sent.points), dtype=np.int64), sent.segment_ids
+    if ids is not None:
+        number = np.where(ids > 0, ids, UNDECIDED)
+    objects = (number if ids is not None or segmentation is None else segmentation.number) >= 0
     support = find_support(seen, inside, segmentation, objects, options, warnings)
     above_all = np.ones(len(inside), np.float32), np.zeros(len(inside), np.float32)
     height, margin = above_all if support is None else support.heights(seen)
@@ -171,8 +169,7 @@ def select_points(
         if segmentation is not None:
             number, confidence = _objects_above(segmentation, support, above, plan, height, margin)
         if support is None and (viewpoints is None or not (number >= 0).any()):
-            # A single object without its support, although no camera separates an object from what
-            # touches it.
+            # All are one object, unless they lie nearer than any camera measures.
             farthest = np.inf if viewpoints is None else seen.distance().max(initial=0.0)
             whole = BACKGROUND if farthest < MIN_CAMERA_DISTANCE else 0
             number, confidence = np.full_like(number, whole), {}

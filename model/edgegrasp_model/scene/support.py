@@ -123,30 +123,11 @@ def find_support(
     request = options.support
     if request is None or len(seen.points) == 0:
         return None
-    up = options.known_up
     found: Support | None
     if isinstance(request, SupportPlane):
-        # A bin's floor is not measured by the table around it; a followed object's workspace is
-        # no bin.
-        around = np.inf if options.follows_only else MAX_WORKSPACE_GAP * np.abs(request.normal)
-        over = np.flatnonzero(inside_workspace(seen.points, options.workspace, around))
-        some = subsample(over)
-        below = float(heights_over(request, seen.points[some]).min(initial=np.inf))
-        if options.max_object_size < below < np.inf:
-            warnings.append(
-                f"the given support plane lies {below:.3g} m below everything that is seen: check "
-                "its frame, normal, and offset in metres."
-            )
-        on = np.empty(0, np.int64)
-        if segmentation is not None:
-            on = np.flatnonzero(segmentation.support > 0.5)
-        part = seen.points[subsample(on)]
-        # Where a support was cut off, only flat tops may be classified as support.
-        whole = len(on) > MIN_SUPPORT_SHARE * len(seen.points) and _wider_than_object(part, request)
-        sample = ViewedPoints(seen.points[some], seen.viewpoint)
-        found = measure_support(sample, request, GIVEN_PLANE_MARGIN, whole)
+        found = _given_support(seen, segmentation, request, options, warnings)
     else:
-        rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
+        up, rng = options.known_up, np.random.default_rng([options.seed, SUPPORT_STREAM])
         if isinstance(request, RansacPlane):
             cell, count = grid_cells(seen.points, AREA_CELL)  # equal areas count alike
             plane = fit_plane(seen, inside / count[cell], rng, up, request.max_tilt)
@@ -173,6 +154,33 @@ def find_support(
             "the viewpoint lies below the support plane: check viewpoint, up and support."
         )
     return found
+
+
+def _given_support(
+    seen: ViewedPoints,
+    segmentation: Segmentation | None,
+    plane: SupportPlane,
+    options: DetectOptions,
+    warnings: list[str],
+) -> Support:
+    """A plane that the caller gives, as the points show it."""
+    # A bin's floor is not measured by the table around it; a followed object's workspace is no bin.
+    around = np.inf if options.follows_only else MAX_WORKSPACE_GAP * np.abs(plane.normal)
+    over = np.flatnonzero(inside_workspace(seen.points, options.workspace, around))
+    sample = ViewedPoints(seen.points[subsample(over)], seen.viewpoint)
+    below = float(heights_over(plane, sample.points).min(initial=np.inf))
+    if options.max_object_size < below < np.inf:
+        warnings.append(
+            f"the given support plane lies {below:.3g} m below everything that is seen: check "
+            "its frame, normal, and offset in metres."
+        )
+    on = np.empty(0, np.int64)
+    if segmentation is not None:
+        on = np.flatnonzero(segmentation.support > 0.5)
+    # Where a support was cut off, only flat tops may be classified as support.
+    whole = len(on) > MIN_SUPPORT_SHARE * len(seen.points)
+    whole = whole and _wider_than_object(seen.points[subsample(on)], plane)
+    return measure_support(sample, plane, GIVEN_PLANE_MARGIN, whole)
 
 
 def _fit_support(
