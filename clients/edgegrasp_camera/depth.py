@@ -14,9 +14,9 @@ from edgegrasp_camera.clouds import CloudInput
 
 ENCODINGS = {"32FC1": "<f4", "64FC1": "<f8", "16UC1": "<u2"}  # as sensor_msgs/Image has them
 MILLIMETRE = 0.001  # metres for one unit of whole numbers
-FOCAL_LENGTHS = 0.1, 20.0  # shares of the image's size: 157 and 3 degrees
-OFF_CENTRE = 0.15  # share of the width or height that a principal point may lie off the middle
-OBLONG = 1.5  # ratio of the focal lengths; no real pixel is that elongated
+FOCAL_LENGTH_RANGE = 0.1, 20.0  # shares of the image's size: 157 and 3 degrees
+MAX_OFF_CENTRE = 0.15  # share of the width or height that a principal point may lie off the middle
+MAX_PIXEL_ASPECT = 1.5  # ratio of the focal lengths; no real pixel is that elongated
 
 
 class Intrinsics(NamedTuple):
@@ -119,7 +119,8 @@ def fuse_depth_images(depths: Sequence[Array], views: Sequence[Any]) -> CloudInp
     doubts: list[str] = []
     for row, (depth, view) in enumerate(zip(depths, views, strict=True)):
         found = metres(depth, view.depth_scale, f"depth_images.{row}.depth")
-        doubts += _doubts(view.intrinsics, found.shape, f"depth_images.{row}.intrinsics")
+        field = f"depth_images.{row}.intrinsics"
+        doubts += _intrinsics_warnings(view.intrinsics, found.shape, field)
         pose = np.array(view.T_cloud_camera, dtype=np.float64)
         clouds.append(unproject(found, view.intrinsics, pose))
         cameras.append(tuple(pose[:3, 3].tolist()))
@@ -136,7 +137,7 @@ def fuse_depth_images(depths: Sequence[Array], views: Sequence[Any]) -> CloudInp
     return CloudInput(together, view_ids=view_ids, viewpoint=tuple(cameras), warnings=tuple(doubts))
 
 
-def _doubts(camera: Intrinsics, shape: tuple[int, ...], field: str) -> Iterator[str]:
+def _intrinsics_warnings(camera: Intrinsics, shape: tuple[int, ...], field: str) -> Iterator[str]:
     """Doubts about intrinsics for an image (H, W), as sentences.
 
     Raises:
@@ -149,10 +150,10 @@ def _doubts(camera: Intrinsics, shape: tuple[int, ...], field: str) -> Iterator[
     for axis, size, focal, centre in axes:
         if not -0.5 <= centre <= size - 0.5:
             raise InvalidRequest(f"{field}.c{axis}", f"{centre:g}, outside of {image}", fix)
-        if not FOCAL_LENGTHS[0] <= focal / size <= FOCAL_LENGTHS[1]:
+        if not FOCAL_LENGTH_RANGE[0] <= focal / size <= FOCAL_LENGTH_RANGE[1]:
             raise InvalidRequest(f"{field}.f{axis}", f"{focal:g} for {image}", fix)
-        if abs(centre - (size - 1) / 2) > OFF_CENTRE * size:
+        if abs(centre - (size - 1) / 2) > MAX_OFF_CENTRE * size:
             yield f"{field}: c{axis} {centre:g} lies far from the middle of {image}: is it theirs?"
-    if not 1 / OBLONG <= camera.fx / camera.fy <= OBLONG:
+    if not 1 / MAX_PIXEL_ASPECT <= camera.fx / camera.fy <= MAX_PIXEL_ASPECT:
         value = f"fx {camera.fx:g} and fy {camera.fy:g}"
         raise InvalidRequest(field, value, "Send fx, fy, cx, cy in this order, in pixels.")

@@ -31,8 +31,8 @@ MAX_CHUNKS = 4096  # of a PNG file, however small they are
 MAX_LINE = 65536  # most bytes of a line of numbers; reading it takes 15 times its size
 MAX_UNPACKED = 256 * 2**20  # bytes; compressed data may claim a hundred times its own size
 MAX_MEMBERS = 64  # of an .npz file, which has 5 arrays at most
-UNZIPPED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others can take any memory
-ADDRESS = re.compile(r" at 0x[0-9a-f]+")  # an object's address, in a library's message
+ZIP_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others can take any memory
+OBJECT_ADDRESS = re.compile(r" at 0x[0-9a-f]+")  # an object's address, in a library's message
 
 FIXES = {
     "npy": "Send what numpy.save(file, points) writes, points of shape (N, 3).",
@@ -92,7 +92,7 @@ def _reading(field: str, file_format: str, size: int, fix: str) -> Iterator[None
     except (EdgeGraspError, MemoryError):
         raise
     except Exception as error:
-        fault = ADDRESS.sub("", str(error).partition(";")[0])[:100] or type(error).__name__
+        fault = OBJECT_ADDRESS.sub("", str(error).partition(";")[0])[:100] or type(error).__name__
         value = f"{size} bytes that are no whole .{file_format} file ({fault})"
         raise InvalidRequest(field, value, fix) from None
 
@@ -164,7 +164,7 @@ def _read_npz(data: bytes, max_points: int) -> CloudInput:
 
 
 def _unzipped(archive: zipfile.ZipFile, info: zipfile.ZipInfo, max_points: int) -> bytes:
-    if info.compress_type not in UNZIPPED:
+    if info.compress_type not in ZIP_METHODS:
         raise ValueError("compressed by a method that numpy does not use")
     # Six doubles per point and a header: more than any cloud of max_points needs.
     if info.file_size > 48 * max_points + 65536:
@@ -289,7 +289,7 @@ def _read_ply(data: bytes, max_points: int) -> CloudInput:
 
 # .pcd
 
-FARTHEST = 1e7  # metres of a VIEWPOINT from the origin
+MAX_VIEWPOINT_DISTANCE = 1e7  # metres of a VIEWPOINT from the origin
 PCD_TYPES = {"F4", "F8", "I1", "I2", "I4", "I8", "U1", "U2", "U4", "U8"}
 PCD_HEADER_END = re.compile(rb"^DATA[ \t]+(ascii|binary|binary_compressed)[ \t\r]*\n", re.MULTILINE)
 
@@ -311,7 +311,7 @@ def _read_pcd(data: bytes, max_points: int) -> CloudInput:
     cloud = cloud_of_records(_read_records(body, record, count, max_points, end[1].decode()))
     place = tuple(map(float, header.get("VIEWPOINT", [])[:3]))  # of the camera
     if any(place):  # zeros: unknown
-        if len(place) < 3 or not max(map(abs, place)) <= FARTHEST:
+        if len(place) < 3 or not max(map(abs, place)) <= MAX_VIEWPOINT_DISTANCE:
             raise ValueError(f"VIEWPOINT {' '.join(map(str, place))}")
         cloud = replace(cloud, viewpoint=place)
     height, width = (int(header.get(name, ["1"])[0]) for name in ("HEIGHT", "WIDTH"))

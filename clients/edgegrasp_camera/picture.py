@@ -16,24 +16,24 @@ from typing_extensions import Self
 from edgegrasp_camera.arrays import Array, Bools, Float64, Floats, Int64
 from edgegrasp_camera.clouds import CloudInput
 
-PANDA = (0.0658, 0.1122)  # metres along the hand's z: the palm's surface and the fingertips
+PANDA_Z = (0.0658, 0.1122)  # metres along the hand's z: the palm's surface, the fingertips
 STEM_LENGTH = 0.03  # metres drawn behind the palm, to show the approach
-BAR = 0.005  # metres, thickness of a fork
-BARS = (2.0, 7.0)  # the same in points, least and most
-BEHIND = 0.006  # metres behind the cloud from which a fork is drawn as hidden
-DRAWN = 10  # grasps in a picture of a request
-AROUND = 0.4  # metres from these: what a picture of a cloud shows
-LABELLED = 5  # grasps that are labelled with their rank
-SIZE = (960, 1280)  # rows and columns of a picture of a cloud without an image
-SMALLEST = 0.25  # metres across, of what such a picture shows
-SPREAD = 8  # largest gap between points that is closed, pixels
+FORK_WIDTH = 0.005  # metres, thickness of a fork
+FORK_POINTS = (2.0, 7.0)  # the same in points, least and most
+HIDDEN_DEPTH = 0.006  # metres behind the cloud from which a fork is drawn as hidden
+MAX_DRAWN = 10  # grasps in a picture of a request
+SHOWN_DISTANCE = 0.4  # metres from these: what a picture of a cloud shows
+MAX_LABELLED = 5  # grasps that are labelled with their rank
+CLOUD_PICTURE_SIZE = (960, 1280)  # rows and columns of a picture of a cloud without an image
+MIN_SHOWN_EXTENT = 0.25  # metres across, of what such a picture shows
+MAX_GAP_PIXELS = 8  # largest gap between points that is closed, pixels
 WIDTH, DPI = 10.0, 130  # inches, dots per inch
-FOOT = 0.75  # inches below the picture: title and scale
-SMOOTHED = 8  # smoothing passes over the depths before shading
-LAMP = (-0.3, -0.6, -0.74)  # direction from a surface to the light, camera frame
-MAP = "viridis"  # colours of scores from 0 to 1
-OUTLINE = "#10151d"
-REGION = "#4cc9f0"
+CAPTION_INCHES = 0.75  # inches below the picture: title and scale
+SMOOTHING_PASSES = 8  # smoothing passes over the depths before shading
+LIGHT = (-0.3, -0.6, -0.74)  # direction from a surface to the light, camera frame
+SCORE_COLOURS = "viridis"  # colours of scores from 0 to 1
+OUTLINE_COLOUR = "#10151d"
+REGION_COLOUR = "#4cc9f0"
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class View:
     def of(cls, points: ArrayLike, eye: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Self:
         """A camera at `eye` (3,) whose image holds most of the points (N, 3)."""
         seen = np.asarray(points, dtype=np.float64)
-        (rows, columns), position = SIZE, np.asarray(eye, dtype=np.float64)
+        (rows, columns), position = CLOUD_PICTURE_SIZE, np.asarray(eye, dtype=np.float64)
         z = np.median(seen, axis=0) - position
         z /= np.linalg.norm(z)
         x = np.cross(z, np.asarray(up, dtype=np.float64))
@@ -62,10 +62,10 @@ class View:
         right, down, ahead = ((seen - position) @ T[:3, :3]).T
         ahead = np.maximum(ahead, 0.05)
         (left, right), (top, bottom) = (np.quantile(v / ahead, (0.01, 0.99)) for v in (right, down))
-        least = SMALLEST / float(np.median(ahead))
+        least = MIN_SHOWN_EXTENT / float(np.median(ahead))
         focal = 0.8 * min(columns / max(right - left, least), rows / max(bottom - top, least))
         middle = columns / 2 - focal * (left + right) / 2, rows / 2 - focal * (top + bottom) / 2
-        return cls(SIZE, focal, focal, *middle, T)
+        return cls(CLOUD_PICTURE_SIZE, focal, focal, *middle, T)
 
     @classmethod
     def of_image(cls, points: Floats) -> Self | None:
@@ -100,7 +100,7 @@ class View:
         column, row = np.clip(np.rint(pixels[seen]), -1e6, 1e6).astype(np.int64).T
         within = ((row >= 0) & (row < rows) & (column >= 0) & (column < columns)).sum()
         gap = np.sqrt(rows * columns / max(within, 1))  # pixels from point to point
-        spread = int(min(1.2 * gap - 0.6, SPREAD))
+        spread = int(min(1.2 * gap - 0.6, MAX_GAP_PIXELS))
         around = np.arange(-spread, spread + 1)
         column = np.add.outer(column, np.tile(around, len(around)))
         row = np.add.outer(row, np.repeat(around, len(around)))
@@ -142,8 +142,8 @@ class Picture:
             image = np.where(seen[..., None], drawn, 255).astype(np.uint8)
         rows, columns = view.shape
         height = WIDTH * rows / columns
-        self._figure = Figure(figsize=(WIDTH, height + FOOT), dpi=DPI)
-        self._foot = FOOT / (height + FOOT)
+        self._figure = Figure(figsize=(WIDTH, height + CAPTION_INCHES), dpi=DPI)
+        self._foot = CAPTION_INCHES / (height + CAPTION_INCHES)
         self._axes: Any = self._figure.add_axes((0, self._foot, 1, 1 - self._foot))
         self._axes.set_axis_off()
         self._axes.imshow(image)
@@ -154,12 +154,12 @@ class Picture:
     def _shaded(self, depth: Float64) -> Float64:
         """(H, W, 3) the cloud in greys."""
         rows, columns = self.view.shape
-        for _ in range(SMOOTHED):  # over the noise of the camera
+        for _ in range(SMOOTHING_PASSES):  # over the noise of the camera
             around = np.pad(depth, 1, mode="edge")
             parts = [around[y : y + rows, x : x + columns] for y, x in np.ndindex(3, 3)]
-            near = [np.where(np.abs(part - depth) < BEHIND, part, depth) for part in parts]
+            near = [np.where(np.abs(part - depth) < HIDDEN_DEPTH, part, depth) for part in parts]
             depth = np.mean(near, axis=0)
-        grey = 70 + 165 * lit(depth, abs(self.view.fx), self.view.fy)
+        grey = 70 + 165 * shaded(depth, abs(self.view.fx), self.view.fy)
         return np.repeat(grey[..., None], 3, axis=2)
 
     def outline(self, mask: Bools) -> None:
@@ -178,9 +178,9 @@ class Picture:
         for shape, style in drawn:
             for line in _lines_of(shape):
                 pixels, _ = self.view.project(line)
-                self._axes.plot(*pixels.T, style, color=REGION, linewidth=1.6)
+                self._axes.plot(*pixels.T, style, color=REGION_COLOUR, linewidth=1.6)
 
-    def grasps(self, grasps: Sequence[Any], palm_and_tip: tuple[float, float] = PANDA) -> None:
+    def grasps(self, grasps: Sequence[Any], palm_and_tip: tuple[float, float] = PANDA_Z) -> None:
         """Draw a fork for every grasp, the best last, and the scale of their scores.
 
         They have a score, a T_cloud_hand (4, 4) and a width in metres, as the server's have.
@@ -188,14 +188,14 @@ class Picture:
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import Normalize
 
-        scale: Any = ScalarMappable(Normalize(0.0, 1.0), MAP)
+        scale: Any = ScalarMappable(Normalize(0.0, 1.0), SCORE_COLOURS)
         for rank, grasp in reversed(list(enumerate(grasps))):
             pieces = fork(grasp.T_cloud_hand, grasp.width, palm_and_tip)
             self._fork(pieces, scale.to_rgba(grasp.score))
-            if rank < LABELLED and len(grasps) > 1:
+            if rank < MAX_LABELLED and len(grasps) > 1:
                 text = str(rank + 1)
                 (x, y), _ = self.view.project(pieces[0, 0])
-                box = {"boxstyle": "circle,pad=0.2", "fc": "white", "ec": OUTLINE, "lw": 0.6}
+                box = {"boxstyle": "circle,pad=0.2", "fc": "white", "ec": OUTLINE_COLOUR, "lw": 0.6}
                 self._axes.text(
                     x, y, text, fontsize=8, ha="center", va="center", bbox=box, clip_on=True
                 )
@@ -214,9 +214,10 @@ class Picture:
         column, row = np.moveaxis(np.rint(pixels).astype(int), -1, 0)
         rows, columns = self.view.shape
         seen = self._depth[np.clip(row, -1, rows), np.clip(column, -1, columns)]  # (4, 17)
-        hidden = depth > seen + BEHIND
-        bar = float(np.clip(BAR * self.view.fy / np.median(depth) * self._point, *BARS))
-        for width, shade in ((bar + 1.6, OUTLINE), (bar, color)):
+        hidden = depth > seen + HIDDEN_DEPTH
+        wide = FORK_WIDTH * self.view.fy / np.median(depth) * self._point
+        bar = float(np.clip(wide, *FORK_POINTS))
+        for width, shade in ((bar + 1.6, OUTLINE_COLOUR), (bar, color)):
             for solid, alpha, cap in ((True, 1.0, "round"), (False, 0.25, "butt")):
                 x, y = np.where((hidden ^ solid)[..., None], pixels, np.nan).T
                 self._axes.plot(x, y, color=shade, linewidth=width, alpha=alpha, solid_capstyle=cap)
@@ -240,7 +241,7 @@ def draw_detection(
     its viewpoint, or obliquely from above.
     """
     points = np.asarray(sent.points)
-    flat, shown, image = points.reshape(-1, 3), detection.grasps[:DRAWN], None
+    flat, shown, image = points.reshape(-1, 3), detection.grasps[:MAX_DRAWN], None
     given, shades = sent.colors if colors is None else colors, None
     if given is not None:
         shades = np.asarray(given).reshape(-1, 3)
@@ -251,7 +252,7 @@ def draw_detection(
     else:
         seen = flat[np.isfinite(flat).all(axis=1)]
         middle = np.median([grasp.T_cloud_tcp[:3, 3] for grasp in shown] or seen, axis=0)
-        near = seen[np.linalg.norm(seen - middle, axis=1) < AROUND]
+        near = seen[np.linalg.norm(seen - middle, axis=1) < SHOWN_DISTANCE]
         up = np.asarray(detection.up, dtype=np.float64)
         aside = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
         eye = middle + 0.6 * up - 0.5 * aside
@@ -267,7 +268,7 @@ def draw_detection(
     picture.save(path)
 
 
-def lit(depth: Floats, fx: float, fy: float) -> Float64:
+def shaded(depth: Floats, fx: float, fy: float) -> Float64:
     """Brightness (H, W), 0 to 1, of a depth image lit by a lamp over the camera.
 
     `depth` is (H, W) metres along the line of sight, NaN where there is nothing; fx and fy pixels.
@@ -275,13 +276,13 @@ def lit(depth: Floats, fx: float, fy: float) -> Float64:
     down, right = np.gradient(np.asarray(depth, dtype=np.float64))
     x, y = right * fx / depth, down * fy / depth
     # The surface's normal is (x, y, -1), not of unit length.
-    facing = (LAMP[0] * x + LAMP[1] * y - LAMP[2]) / np.sqrt(x**2 + y**2 + 1)
+    facing = (LIGHT[0] * x + LIGHT[1] * y - LIGHT[2]) / np.sqrt(x**2 + y**2 + 1)
     light: Float64 = np.clip(np.nan_to_num(facing), 0.0, 1.0)
     return light
 
 
 def fork(
-    T_cloud_hand: ArrayLike, width: float, palm_and_tip: tuple[float, float] = PANDA
+    T_cloud_hand: ArrayLike, width: float, palm_and_tip: tuple[float, float] = PANDA_Z
 ) -> Float64:
     """A gripper's outline as four line pieces (4, 2, 3), cloud frame: stem, palm, both fingers.
 

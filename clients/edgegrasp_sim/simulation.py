@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edgegrasp_camera.picture import lit
+from edgegrasp_camera.picture import shaded
 from edgegrasp_results import ArmTrajectory
 from edgegrasp_sim import hand
 from edgegrasp_sim.camera import CAMERA, FARTHEST, Observation, TableView, crop, points_of
@@ -198,7 +198,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
             hits = self.world.first_hits(starts, starts + 1.01 * (points[part] - eye))
             for number, item in enumerate(self._objects):
                 painted[part[np.equal(hits, item.body.uid)]] = PAINTS[number % len(PAINTS)]
-        light = lit(np.where(seen, depth, np.nan), CAMERA.focal_length, CAMERA.focal_length)
+        light = shaded(np.where(seen, depth, np.nan), CAMERA.focal_length, CAMERA.focal_length)
         image = np.full((*depth.shape, 3), 255.0)
         image[seen] = painted * (0.45 + 0.55 * light[seen][:, None])
         return image.astype(np.uint8)

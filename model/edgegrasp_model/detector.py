@@ -44,11 +44,11 @@ NO_APPROACH_POINT = (
 )
 NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
 # Rating of a grasp from which its object gets no approach points in each round.
-ROUNDS = (1.0, ranking.SURE_SCORE, ranking.GOOD_SCORE, ranking.GOOD_SCORE)
-BALLS_AT_A_TIME = 64
-MANY_HANDS = 20  # grippers in the last training run from which weights suit any gripper
+ENOUGH_SCORES = (1.0, ranking.SURE_SCORE, ranking.GOOD_SCORE, ranking.GOOD_SCORE)
+MAX_BALLS_AT_ONCE = 64
+MIN_TRAINING_HANDS = 20  # grippers in the last training run from which weights suit any gripper
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
-PREFERRED = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
+PREFERRED_MODELS = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class GraspDetector:
         if options.gripper is not None:  # the ball has to contain every contact within reach
             radius = max(radius, gripper.max_opening / 2)
         hands = self.metadata.training.get("training_hands", 1)
-        if gripper.name != self.gripper.name and hands < MANY_HANDS:
+        if gripper.name != self.gripper.name and hands < MIN_TRAINING_HANDS:
             warnings.append(
                 f"the weights were trained for the gripper {self.gripper.name!r}: their scores are "
                 f"uncalibrated for {gripper.name!r}; use them for ranking only."
@@ -177,7 +177,7 @@ class GraspDetector:
             return None
         given = prepared.options, prepared.gripper, prepared.crop_radius, prepared.counts
         sampler = Sampler(scene, *given, sees_hands=self.sees_hands)
-        for enough in ROUNDS:
+        for enough in ENOUGH_SCORES:
             with prepared.timed("candidates"):
                 done: Int64 | tuple[()] = ()
                 if scored is not None:
@@ -207,7 +207,7 @@ class GraspDetector:
             elif scene is not None and sample is not None:
                 logits = sample.logits
                 if self.sees_hands:
-                    logits = ranking.judged_together(logits, sample, scene, gripper)
+                    logits = ranking.average_similar_hands(logits, sample, scene, gripper)
                 contact = sample.candidates.contact_index
                 rating, score = self._scores(scene, contact, expit(logits))
                 ordering = score, rating, gripper, options, counts
@@ -331,7 +331,7 @@ class GraspDetector:
         """The network's logits (E,) of candidates: of all hands at once, or of some balls."""
         logits, network = np.empty(len(candidates), np.float32), self.metadata.network
         _, ball = np.unique(candidates.approach_index, return_inverse=True)
-        part = np.zeros_like(ball) if self.sees_hands else ball // BALLS_AT_A_TIME
+        part = np.zeros_like(ball) if self.sees_hands else ball // MAX_BALLS_AT_ONCE
         for number in range(part.max(initial=-1) + 1):
             rows = np.flatnonzero(part == number)
             with prepared.timed("description"):
@@ -359,7 +359,7 @@ class ModelCatalogue:
         if not detectors:
             raise InvalidCheckpoint("weights: found none. Give a folder with .safetensors files.")
         self._detectors = dict(detectors)
-        preferred = [name for name in PREFERRED if name in detectors] or sorted(detectors)
+        preferred = [name for name in PREFERRED_MODELS if name in detectors] or sorted(detectors)
         self.default = default or preferred[0]
         self.get(self.default)
 

@@ -14,8 +14,8 @@ from edgegrasp_model.results import NoGrasp
 from edgegrasp_model.scene.cloud import wrong_array
 from edgegrasp_model.scene.scene import Scene
 
-FIRST_TOUCH = 0.004  # metres behind the outermost point within which points count as touched first
-FLIP = np.diag(np.array([-1.0, -1.0, 1.0, 1.0], dtype=np.float32))  # the same hand, y reversed
+TOUCH_DEPTH = 0.004  # metres behind the outermost point; others there are touched first too
+FLIPPED = np.diag(np.array([-1.0, -1.0, 1.0, 1.0], dtype=np.float32))  # the same hand, y reversed
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def from_hand_poses(
     """The edge grasps nearest to hand poses (M, 4, 4), canonical frame; the poses stay as given.
 
     The contact point is the first that a closing finger touches, on the side whose normal is closer
-    to the closing direction: of the points within FIRST_TOUCH of the outermost one between the
+    to the closing direction: of the points within TOUCH_DEPTH of the outermost one between the
     fingers, the one nearest to where the gripper puts its contacts. The approach point is the point
     within `crop_radius` metres of it that is nearest to the hand's approach axis.
     """
@@ -102,7 +102,7 @@ def from_hand_poses(
     for side, outward in enumerate((y, -y)):
         outermost = np.full(len(T_cloud_hand), -np.inf, dtype=np.float32)
         np.maximum.at(outermost, hand, outward)
-        first = np.flatnonzero(outward > outermost[hand] - FIRST_TOUCH)
+        first = np.flatnonzero(outward > outermost[hand] - TOUCH_DEPTH)
         hands, best = _least(hand[first], off_contact[first])
         touched[side, hands] = between[first[best]]
         normal = scene.cloud.normals[view.row[touched[side, hands]]]
@@ -116,7 +116,7 @@ def from_hand_poses(
     for row in found.tolist():
         reason[row] = None
     given = T_cloud_hand[found]
-    pose = np.where((side[found] == 0)[:, None, None], given, given @ FLIP)
+    pose = np.where((side[found] == 0)[:, None, None], given, given @ FLIPPED)
     a, c = approach[found], view.row[contact[found]]
     edge = scene.cloud.points[c] - scene.cloud.points[a]
     depth = np.maximum(np.einsum("ed,ed->e", edge, pose[:, :3, 2]), 0.0)

@@ -17,7 +17,7 @@ from edgegrasp_model.options import DetectOptions, GripperGeometry, HandPart, Li
 
 GRIPPER_FOLDER = Path(__file__).parent / "grippers"
 APPROACH_LENGTH = 0.05  # metres of straight approach that must be free, or is described
-SEEN_LENGTH = 0.0465  # metres of finger length from the tips: as long as the Panda's
+FINGER_LENGTH = 0.0465  # metres of finger length from the tips: as long as the Panda's
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Gripper:
 
     @cached_property
     def seen_palm_z(self) -> float:
-        """The palm's z, but at most SEEN_LENGTH behind the tips, as if the fingers were short."""
-        return max(self.palm_z, self.tip_z - SEEN_LENGTH)
+        """The palm's z, but at most FINGER_LENGTH behind the tips, as if the fingers were short."""
+        return max(self.palm_z, self.tip_z - FINGER_LENGTH)
 
     @cached_property
     def finger_thickness(self) -> float:

@@ -14,7 +14,7 @@ from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
 
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 
-BLOCK = 64  # points per block; blocks out of reach are skipped
+BLOCK_SIZE = 64  # points per block; blocks out of reach are skipped
 SLACK = 1e-5  # metres; a generous bound of float32 errors
 
 
@@ -68,7 +68,7 @@ def points_in_hand_boxes(
     for e in range(len(turn)):
         for k in range(len(sphere)):
             if _may_reach(sphere[k], turn[e], shift[e], low, high):
-                for i in range(k * BLOCK, min((k + 1) * BLOCK, len(xs))):
+                for i in range(k * BLOCK_SIZE, min((k + 1) * BLOCK_SIZE, len(xs))):
                     x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
                     if _between(x, y, z, low, high):
                         hand[place], row[place] = e, i
@@ -130,7 +130,7 @@ def signed_distance_to_boxes(hands: InHands, boxes: Float64) -> Float32:
     sphere, nearest = _blocks(columns), np.full(len(turn), np.inf, np.float32)
     for e in range(len(turn)):
         for k in range(len(sphere)):
-            block = columns[:, k * BLOCK : (k + 1) * BLOCK]
+            block = columns[:, k * BLOCK_SIZE : (k + 1) * BLOCK_SIZE]
             for b in range(len(extents)):
                 middle = sphere[k : k + 1, :3].T
                 least = _nearest_to_box(middle, turn[e], shift[e], extents[b]) - sphere[k, 3]
@@ -149,7 +149,7 @@ def free_way(hands: InHands, boxes: Float64, behind: float) -> Float32:
     """
     columns, turn, shift = hands
     sphere, way, solid = _blocks(columns), np.empty(len(turn), np.float32), boxes.astype(np.float32)
-    ahead = np.empty(BLOCK, np.float32)
+    ahead = np.empty(BLOCK_SIZE, np.float32)
     for e in range(len(turn)):
         nearest = np.float32(np.inf)
         for b in range(len(solid)):
@@ -217,7 +217,7 @@ def non_max_suppression(
 
 
 @compiled("contract")
-def mean_of_alike(
+def mean_over_similar(
     values: Float32, T_cloud_tcp: Float32, number: Int64, near: float, angle: float
 ) -> Float32:
     """The mean value (E,) of the other hands on the same object that are like each one.
@@ -268,11 +268,11 @@ def distance_behind(
 
 @compiled("contract")
 def _blocks(columns: Float32) -> Float32:
-    """Bounding spheres (K, 4) of BLOCK points at a time: middle and radius."""
+    """Bounding spheres (K, 4) of BLOCK_SIZE points at a time: middle and radius."""
     count = columns.shape[1]
-    sphere = np.zeros(((count + BLOCK - 1) // BLOCK, 4), np.float32)
+    sphere = np.zeros(((count + BLOCK_SIZE - 1) // BLOCK_SIZE, 4), np.float32)
     for k in range(len(sphere)):
-        block = columns[:, k * BLOCK : (k + 1) * BLOCK]
+        block = columns[:, k * BLOCK_SIZE : (k + 1) * BLOCK_SIZE]
         furthest = np.float32(0.0)
         for d in range(3):
             sphere[k, d] = (block[d].min() + block[d].max()) / np.float32(2.0)
@@ -325,7 +325,7 @@ def _count_between(
 ) -> int:
     """How many points of block k lie between two corners of a hand's frame."""
     # As separate functions on contiguous arrays, such loops are vectorised to 16 points at a time.
-    start, stop = k * BLOCK, (k + 1) * BLOCK
+    start, stop = k * BLOCK_SIZE, (k + 1) * BLOCK_SIZE
     xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
     found = 0
     for i in range(len(xs)):
@@ -340,7 +340,7 @@ def _count_on_way(
 ) -> int:
     """How many points of block k a box passes over; `per_way` (3,): 1 / its way, hand frame."""
     low, high = box[0], box[1]
-    start, stop = k * BLOCK, (k + 1) * BLOCK
+    start, stop = k * BLOCK_SIZE, (k + 1) * BLOCK_SIZE
     xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
     found = 0
     for i in range(len(xs)):
@@ -376,9 +376,9 @@ def _nearest_to_box(columns: Float32, turn: Float32, shift: Float32, extent: Flo
 def _least_between(
     columns: Float32, k: int, turn: Float32, shift: Float32, box: Float32, ahead: Float32
 ) -> np.float32:
-    """Least z of the points of block k in a box (2, 3); `ahead` (BLOCK,) is written over."""
+    """Least z of the points of block k in a box (2, 3); `ahead` (BLOCK_SIZE,) is written over."""
     low, high = box[0], box[1]
-    start, stop = k * BLOCK, (k + 1) * BLOCK
+    start, stop = k * BLOCK_SIZE, (k + 1) * BLOCK_SIZE
     xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
     for i in range(len(xs)):
         x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)

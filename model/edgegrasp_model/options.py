@@ -52,7 +52,7 @@ Name = Annotated[str, Field(max_length=100)]
 Share = Annotated[float, Field(ge=0.0, le=1.0), numeric]
 Length = Annotated[float, Field(gt=0.0, le=1000.0), numeric]
 HandLength = Annotated[float, Field(gt=0.0, le=1.0), numeric]  # metres
-SAME = 1e-6  # metres; lengths of a gripper that differ by less are the same
+SAME_LENGTH = 1e-6  # metres; lengths of a gripper that differ by less are the same
 NearHand = Annotated[float, Field(ge=-1.0, le=1.0), numeric]  # metres
 Corner = Annotated[
     tuple[NearHand, NearHand, NearHand],
@@ -333,7 +333,7 @@ class GripperGeometry(Strict):
     def _consistent(self) -> Self:
         if any(low[1] < 0 for low, _ in self.finger.boxes):
             raise ValueError("finger.boxes must lie outside the inner face: no y below 0")
-        if abs(max(high[2] for _, high in self.finger.boxes) - self.tip_z) > SAME:
+        if abs(max(high[2] for _, high in self.finger.boxes) - self.tip_z) > SAME_LENGTH:
             raise ValueError("tip_z must be the highest z of finger.boxes")
         if self.swing is not None:
             reach, radius = self.swing.reach, self.swing.radius

@@ -15,31 +15,31 @@ from edgegrasp_model.candidates.collision import clearances, hand_views
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import OUTCOME_CODE, Sample
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.kernels import mean_of_alike, non_max_suppression
+from edgegrasp_model.kernels import mean_over_similar, non_max_suppression
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Outcome, Ungraspable
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.unseen import leaves_image, unseen_space
 from edgegrasp_results import DebugInfo, DetectedObject, Grasp
 
-COLLIDING = 0.5  # factor on the score of a colliding grasp in the ranking
+COLLISION_FACTOR = 0.5  # factor on the score of a colliding grasp in the ranking
 GOOD_SCORE = 0.5  # score from which an object has a good grasp
 SURE_SCORE = 0.9  # score from which the order `highest` goes by height (the paper's robot policy)
 FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
-HIDDEN = 0.004  # metres of unseen space into which an object may extend
-FLAT = 0.012  # metres of visible height below which the support may block grasps
-DRAWBACK, FAR = 0.02, 0.1  # of a rating; metres from an object's middle
+MAX_HIDDEN_DEPTH = 0.004  # metres of unseen space into which an object may extend
+FLAT_HEIGHT = 0.012  # metres of visible height below which the support may block grasps
+MAX_DRAWBACK, FAR = 0.02, 0.1  # of a rating; metres from an object's middle
 # Best hands that are compared; weight of the logarithm of how many good ones are around each; loss
 # of rating by which a good one counts 1/e as much.
-BEST, SURROUNDED, LESS = 100, 0.1, 0.02
-OUTSIDE = 0.3  # of the rating of a hand that reaches out of the image
+COMPARED_HANDS, DENSITY_WEIGHT, RATING_SCALE = 100, 0.1, 0.02
+OUTSIDE_LOSS = 0.3  # of the rating of a hand that reaches out of the image
 # Hands that are judged together: metres and radians apart; weight of a hand's own logit; factor
 # that calibrates the average.
-ALIKE, ALIKE_ANGLE, OWN, SHARPER = 0.03, math.radians(30), 0.3, 1.3
+SIMILAR_DISTANCE, SIMILAR_ANGLE, OWN_WEIGHT, SHARPENING = 0.03, math.radians(30), 0.3, 1.3
 OUTCOMES = list(Outcome)
 
 
-def judged_together(
+def average_similar_hands(
     logits: Float32,  # (E,) of the scored candidates
     sample: Sample,
     scene: Scene,
@@ -53,8 +53,9 @@ def judged_together(
     candidates = sample.candidates
     number = scene.object_of_point[candidates.contact_index]
     T_cloud_tcp = candidates.T_cloud_hand @ gripper.T_hand_tcp
-    others = mean_of_alike(logits, T_cloud_tcp, number, ALIKE, ALIKE_ANGLE)
-    averaged = np.float32(SHARPER * OWN) * logits + np.float32(SHARPER * (1.0 - OWN)) * others
+    others = mean_over_similar(logits, T_cloud_tcp, number, SIMILAR_DISTANCE, SIMILAR_ANGLE)
+    own, rest = np.float32(SHARPENING * OWN_WEIGHT), np.float32(SHARPENING * (1.0 - OWN_WEIGHT))
+    averaged = own * logits + rest * others
     return np.where(np.isnan(others), logits, averaged)
 
 
@@ -87,7 +88,7 @@ def select(
     order, dropped = order[good], order[:0]
     counts["above_min_score"] = len(order)
     if options.order == "score":
-        liked = surrounded_first(order, worth, T_cloud_tcp)
+        liked = densest_first(order, worth, T_cloud_tcp)
         order = objects_first(order, liked, rating, scene.object_of_point[contact])
     if (rule := options.suppression) is not None:
         near = rule.translation, rule.rotation
@@ -99,20 +100,20 @@ def select(
     return order, outcome
 
 
-def surrounded_first(order: Int64, worth: Floats, T_cloud_tcp: Floats) -> Int64:
+def densest_first(order: Int64, worth: Floats, T_cloud_tcp: Floats) -> Int64:
     """The rows `order`, the best reordered by how many good hands surround each; worth (E,).
 
     New noise makes another hand the best one, but good ones still surround the same hands.
     """
-    best = order[:BEST]
+    best = order[:COMPARED_HANDS]
     place, turn = T_cloud_tcp[best, :3, 3], T_cloud_tcp[best, :3, :3].reshape(-1, 9)
     trace, approach = turn @ turn.T, turn[:, 2::3] @ turn[:, 2::3].T
     trace = np.maximum(trace, 2 * approach - trace)  # a hand turned by half is the same
     angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
-    away = np.square(cdist(place, place) / ALIKE) + np.square(angle / ALIKE_ANGLE)
-    good = np.exp((worth[best] - worth[best].max(initial=0.0)) / LESS)
-    raised = worth[best] + SURROUNDED * np.log(np.exp(-away / 2) @ good)
-    return np.concatenate([best[np.argsort(-raised, kind="stable")], order[BEST:]])
+    away = np.square(cdist(place, place) / SIMILAR_DISTANCE) + np.square(angle / SIMILAR_ANGLE)
+    good = np.exp((worth[best] - worth[best].max(initial=0.0)) / RATING_SCALE)
+    raised = worth[best] + DENSITY_WEIGHT * np.log(np.exp(-away / 2) @ good)
+    return np.concatenate([best[np.argsort(-raised, kind="stable")], order[COMPARED_HANDS:]])
 
 
 def _drawbacks(
@@ -132,9 +133,9 @@ def _drawbacks(
     lean = np.hypot(T_cloud_tcp[:, 0, 2], T_cloud_tcp[:, 1, 2])
     along, _, tilt = np.abs(T_cloud_tcp[:, :3, 1].T)  # x points to the camera
     small = np.log(size[mine].max(initial=1) / size[mine]) / 3
-    taken: Floats = DRAWBACK * (np.minimum(apart / FAR, 1.0) + lean + along + tilt + small)
+    taken: Floats = MAX_DRAWBACK * (np.minimum(apart / FAR, 1.0) + lean + along + tilt + small)
     if scene.P_image_cloud is not None:
-        taken = taken + OUTSIDE * leaves_image(scene.P_image_cloud, T_cloud_hand, gripper)
+        taken = taken + OUTSIDE_LOSS * leaves_image(scene.P_image_cloud, T_cloud_hand, gripper)
     return taken
 
 
@@ -150,7 +151,7 @@ def ranked(
     contact_index: Int64,  # (E,) rows of the scene's cloud
     hands: Float32,  # (E, 4, 4) T_cloud_hand
     score: Floats,  # (E,) probabilities
-    collision_free: Bools,  # (E,) the scores of the others are multiplied by COLLIDING
+    collision_free: Bools,  # (E,) the scores of the others are multiplied by COLLISION_FACTOR
     gripper: Gripper,
     # `highest`: by height where the score is SURE_SCORE or more; `clearance`: collision-free ones
     # first, by clearance
@@ -161,7 +162,7 @@ def ranked(
     collision_free = collision_free | (options.collision.mode == "ignore")
     if options.order == "score":
         score = score - _drawbacks(scene, contact_index, hands, gripper)
-    worth = np.where(collision_free, score, COLLIDING * score)
+    worth = np.where(collision_free, score, COLLISION_FACTOR * score)
     keys: tuple[Array, ...] = (-worth,)
     if options.order == "highest":
         sure, height = worth >= SURE_SCORE, (hands @ gripper.T_hand_tcp)[:, 2, 3]
@@ -219,7 +220,7 @@ def _touched_first(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> tup
     np.minimum.at(met[:, 1], hand, place)
     met = np.where(np.isfinite(met), met, np.float32(0.0))
     beyond = unseen_space(scene.depths, T_cloud_hand, met, gripper).beyond
-    return met, np.asarray(np.maximum(*beyond) > HIDDEN)
+    return met, np.asarray(np.maximum(*beyond) > MAX_HIDDEN_DEPTH)
 
 
 def detected_objects(
@@ -247,13 +248,13 @@ def detected_objects(
                 quaternion=turn.as_quat().astype(np.float32),
                 best_score=best.get(which),
                 confidence=scene.confidence.get(which),
-                reason=None if good else _why(scene, which, 2 * half, sample, score, gripper),
+                reason=None if good else _reason(scene, which, 2 * half, sample, score, gripper),
             )
         )
     return objects
 
 
-def _why(
+def _reason(
     scene: Scene,
     number: int,
     size: Float32,
@@ -273,7 +274,7 @@ def _why(
     outcome = sample.outcome[drawn]
     codes = OUTCOME_CODE[Outcome.SUPPORT], OUTCOME_CODE[Outcome.DIRECTION]
     out_of_reach = np.isin(outcome, codes)
-    if size[2] < FLAT and out_of_reach.sum() >= len(outcome) / 2:
+    if size[2] < FLAT_HEIGHT and out_of_reach.sum() >= len(outcome) / 2:
         return Ungraspable.TOO_FLAT
     if not sample.collision_free[scored].any():
         allowed = outcome != OUTCOME_CODE[Outcome.DIRECTION]

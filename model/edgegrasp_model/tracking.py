@@ -17,7 +17,7 @@ from edgegrasp_model.candidates.edge_grasps import spread_out
 from edgegrasp_model.candidates.sample import allowed_directions
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.kernels import mean_of_alike, non_max_suppression
+from edgegrasp_model.kernels import mean_over_similar, non_max_suppression
 from edgegrasp_model.options import (
     MAX_SURFACE,
     Collision,
@@ -27,29 +27,29 @@ from edgegrasp_model.options import (
     Suppression,
     Workspace,
 )
-from edgegrasp_model.ranking import COLLIDING, objects_first, ranked
+from edgegrasp_model.ranking import COLLISION_FACTOR, objects_first, ranked
 from edgegrasp_model.results import OBSTACLE, Following
 from edgegrasp_model.scene.cloud import pose_matrix, subsample
 from edgegrasp_model.scene.scene import Scene, numbers_chosen
 from edgegrasp_model.scene.segment import BACKGROUND, UNDECIDED
 from edgegrasp_results import Evaluation, Grasp, Tracking
 
-MARGIN = 0.1  # of the score, by which another grasp must be better
-ALIVE = 0.25  # score from which a followed grasp may stay the first
-SLACK = 0.006  # metres by which the hand of a followed grasp may overlap the cloud
-AROUND = 0.03  # metres around followed objects in which they are searched
-FOREIGN = 0.5  # metres from the cloud beyond which `previous` must be in another frame
-ASIDE, IN_REACH = 0.1, 2.0  # radians beside the camera's view and metres from it: out of view
+SWITCH_MARGIN = 0.1  # of the score, by which another grasp must be better
+MIN_FOLLOWED_SCORE = 0.25  # score from which a followed grasp may stay the first
+ALLOWED_OVERLAP = 0.006  # metres by which the hand of a followed grasp may overlap the cloud
+SEARCH_MARGIN = 0.03  # metres around followed objects in which they are searched
+MAX_FRAME_DISTANCE = 0.5  # metres from the cloud beyond which `previous` must be in another frame
+OUT_OF_VIEW_ANGLE, MAX_VIEW_DISTANCE = 0.1, 2.0  # radians beside the view; metres from the camera
 # Registration: in each step, points farther from the cloud than this are left out, metres.
-STEPS = (*(0.03,) * 4, *(0.015,) * 4, *(0.008,) * 4)
-SPACING = 0.004  # metres to the nearest point along the surface within which the surface continues
-TANGENT = 0.3  # weight of distances beyond that, relative to 1 across the surface
+REGISTRATION_DISTANCES = (*(0.03,) * 4, *(0.015,) * 4, *(0.008,) * 4)
+SURFACE_SPACING = 0.004  # metres along a surface to its nearest point, where it continues
+TANGENT_WEIGHT = 0.3  # weight of distances beyond that, relative to 1 across the surface
 # Prior for no motion, in points: where the shape leaves motion undetermined, the object stays.
-STIFF = (0.5,) * 3 + (0.3,) * 3
-FEWEST = 6  # points that say how an object moved
-FOUND, GOOD = 0.5, 0.75  # share of its points on the cloud: found; well seen
+STILL_PRIOR = (0.5,) * 3 + (0.3,) * 3
+MIN_REGISTERED_POINTS = 6  # points that say how an object moved
+FOUND_SHARE, WELL_SEEN_SHARE = 0.5, 0.75  # share of its points on the cloud: found; well seen
 # From an object's surface, within which points belong to it: metres, and spacings of its points.
-ON_OBJECT, SPACINGS = 0.012, 1.5
+OBJECT_REACH, REACH_SPACINGS = 0.012, 1.5
 
 
 @dataclass(frozen=True)
@@ -87,14 +87,14 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
         sights, distance = some - eye, np.linalg.norm(places - eye, axis=1, keepdims=True)
         sights /= np.maximum(np.linalg.norm(sights, axis=1, keepdims=True), 1e-9)
         aside, _ = cKDTree(sights).query((places - eye) / np.maximum(distance, 1e-9))
-        apart[(aside > ASIDE) & (distance[:, 0] < IN_REACH)] = 0.0
-    if (away := float(np.min(apart))) > FOREIGN:
+        apart[(aside > OUT_OF_VIEW_ANGLE) & (distance[:, 0] < MAX_VIEW_DISTANCE)] = 0.0
+    if (away := float(np.min(apart))) > MAX_FRAME_DISTANCE:
         value = f"grasps {away:.2g} m from the nearest point of the cloud"
         fix = "Send previous in the frame of this cloud, or leave it out."
         raise InvalidRequest("options.previous", value, fix)
     if previous.search:
         return options
-    low, high = np.min(places, axis=0) - AROUND, np.max(places, axis=0) + AROUND
+    low, high = np.min(places, axis=0) - SEARCH_MARGIN, np.max(places, axis=0) + SEARCH_MARGIN
     if options.workspace is not None:
         whole = np.array([options.workspace.min, options.workspace.max])
         low, high = np.maximum(low, whole[0]), np.minimum(high, whole[1])
@@ -125,7 +125,7 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
     # Of two objects that match the same points, the better match is there.
     for T, share, row in sorted(matches, key=lambda match: -match[1]):
         now = places[row] @ T[:3, :3].T + T[:3, 3]
-        if share < FOUND or np.median(number[near := seen[cloud.near(now)]]) < 0:
+        if share < FOUND_SHARE or np.median(number[near := seen[cloud.near(now)]]) < 0:
             continue
         near = near[number[near] >= 0]
         there, count = np.unique(number[near], return_counts=True)
@@ -138,7 +138,7 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
         else:
             renamed[mine], taken[mine], named[which] = name, True, name
         moved[previous.objects[row].number] = T, name
-        fits = share >= GOOD
+        fits = share >= WELL_SEEN_SHARE
         here = now.astype(np.float32) if fits else sampled(points[renamed == name])
         surface.setdefault(name, here)
     next_id = max([previous.free_id, *(1 + one for one in named.values())])
@@ -188,8 +188,9 @@ def merged(
     if old:
         before = np.reshape([one.T_cloud_hand for one in old], (-1, 4, 4))
         move, number = zip(*(followed.moved[one.object] for one in old), strict=True)
-        rule = options.collision.model_copy(update={"margin": options.collision.margin - SLACK})
         # A small overlap is allowed, since the hand was fully checked when it was found.
+        margin = options.collision.margin - ALLOWED_OVERLAP
+        rule = options.collision.model_copy(update={"margin": margin})
         there = zip(old, number, score((move @ before).astype(np.float32), rule), strict=True)
         kept = [replace(e.grasp, id=one.id, object=now) for one, now, e in there if e.grasp]
     if kept:
@@ -202,9 +203,9 @@ def merged(
     order = _order(grasps, options, scene, gripper, len(kept))
     became, first = untracked(previous).first, [one.id for one in previous.grasps[:1]]
     held = next((row for row in order if grasps[row].id in first), None)
-    if held is not None and (worth := _worth(grasps[held], options)) >= ALIVE:
+    if held is not None and (worth := _worth(grasps[held], options)) >= MIN_FOLLOWED_SCORE:
         # Without a search the others are the earlier answer's own, whose scores vary with noise.
-        better = previous.search and _worth(grasps[order[0]], options) > worth + MARGIN
+        better = previous.search and _worth(grasps[order[0]], options) > worth + SWITCH_MARGIN
         became = Following.REPLACED if better else Following.KEPT
         order = order if better else [held, *(row for row in order if row != held)]
     tracking = Tracking(became, followed.next_id + len(found))
@@ -232,7 +233,7 @@ def _order(
     near = rule.translation, rule.rotation
     if options.suppression is None:  # a grasp near a kept one is the same; all others stay
         of_kept = (rows < kept).astype(np.float32)
-        like_kept = mean_of_alike(of_kept, T_cloud_tcp, np.zeros_like(rows), *near) > 0.0
+        like_kept = mean_over_similar(of_kept, T_cloud_tcp, np.zeros_like(rows), *near) > 0.0
         rows = rows[(rows < kept) | ~like_kept]
     else:
         rows, _ = non_max_suppression(T_cloud_tcp, rows, *near, len(rows))
@@ -252,7 +253,7 @@ def _order(
 
 def _worth(grasp: Grasp, options: DetectOptions) -> float:
     free = grasp.collision_free or options.collision.mode == "ignore"
-    return grasp.score if free else COLLIDING * grasp.score
+    return grasp.score if free else COLLISION_FACTOR * grasp.score
 
 
 class Surface(NamedTuple):
@@ -265,7 +266,7 @@ class Surface(NamedTuple):
     def near(self, places: Float64) -> Int64:
         """The points on an object, by K points (K, 3) of its surface."""
         spacing = float(np.median(cKDTree(places).query(places, k=[2])[0]))
-        rows = self.tree.query_ball_point(places, max(ON_OBJECT, SPACINGS * spacing))
+        rows = self.tree.query_ball_point(places, max(OBJECT_REACH, REACH_SPACINGS * spacing))
         return np.unique(np.concatenate([np.asarray(one, dtype=np.int64) for one in rows]))
 
 
@@ -276,36 +277,36 @@ def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
     count only where an object ends.
     """
     T = np.eye(4)
-    if len(before) < FEWEST or len(cloud.points) < FEWEST:
+    if len(before) < MIN_REGISTERED_POINTS or len(cloud.points) < MIN_REGISTERED_POINTS:
         return T, 0.0
     spread = max(float(np.square(before - before.mean(axis=0)).sum(axis=1).mean()), 1e-9)
-    stiff, total = np.diag(np.multiply(STIFF, [spread] * 3 + [1.0] * 3)), np.zeros(6)
-    for reach in STEPS:
+    stiff, total = np.diag(np.multiply(STILL_PRIOR, [spread] * 3 + [1.0] * 3)), np.zeros(6)
+    for reach in REGISTRATION_DISTANCES:
         now = before @ T[:3, :3].T + T[:3, 3]
         apart, row = cloud.tree.query(now, distance_upper_bound=reach)
         row, hit = np.asarray(row), np.isfinite(apart)
-        if hit.sum() < FEWEST:
+        if hit.sum() < MIN_REGISTERED_POINTS:
             return T, 0.0
         off, normal = cloud.points[row[hit]] - now[hit], cloud.normals[row[hit]].astype(np.float64)
         middle = now.mean(axis=0)
         across = np.einsum("kd,kd->k", off, normal)
         along = off - across[:, None] * normal
         length = np.linalg.norm(along, axis=1)
-        along *= (np.maximum(length - SPACING, 0.0) / np.maximum(length, 1e-9))[:, None]
+        along *= (np.maximum(length - SURFACE_SPACING, 0.0) / np.maximum(length, 1e-9))[:, None]
         arm = now[hit] - middle
         moves = np.zeros((len(arm), 3, 6))  # of each point, by a turn and a shift
         moves[:, (1, 2, 0), (2, 0, 1)], moves[:, (2, 0, 1), (1, 2, 0)] = arm, -arm
         moves[:, :, 3:] = np.eye(3)
-        rows, ends = np.einsum("kd,kdm->km", normal, moves), length > SPACING
+        rows, ends = np.einsum("kd,kdm->km", normal, moves), length > SURFACE_SPACING
         sides = moves[ends].reshape(-1, 6)
-        system = rows.T @ rows + TANGENT * sides.T @ sides + stiff
-        target = rows.T @ across + TANGENT * sides.T @ along[ends].ravel() - stiff @ total
+        system = rows.T @ rows + TANGENT_WEIGHT * sides.T @ sides + stiff
+        target = rows.T @ across + TANGENT_WEIGHT * sides.T @ along[ends].ravel() - stiff @ total
         step = np.linalg.solve(system, target)
         total += step
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         T = pose_matrix(turn, middle + step[3:] - turn @ middle) @ T
     now = before @ T[:3, :3].T + T[:3, 3]
-    apart, _ = cloud.tree.query(now, distance_upper_bound=STEPS[-1])
+    apart, _ = cloud.tree.query(now, distance_upper_bound=REGISTRATION_DISTANCES[-1])
     return T, float(np.isfinite(apart).mean())
 
 

@@ -12,22 +12,22 @@ from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
 from edgegrasp_model.kernels import compiled, distance_behind
 
-CELL = 0.0022  # metres across a cell of the depth map, at the middle of the cloud
+MAP_CELL = 0.0022  # metres across a cell of the depth map, at the middle of the cloud
 SPLAT = 2  # cells around its own that a point covers, up to the next point of the cloud
-BEHIND = 0.004  # metres behind a surface that still count as the surface
-DEEP = 0.02  # metres farther behind at which space counts as fully unknown
-FAR = 0.10  # metres behind a surface; distances are clipped here
+THICKNESS = 0.004  # metres behind a surface that still count as the surface
+UNKNOWN_DEPTH = 0.02  # metres farther behind at which space counts as fully unknown
+MAX_UNSEEN_DEPTH = 0.10  # metres behind a surface; distances are clipped here
 UNKNOWN_SHARE = 0.25  # unseen share of the way of a part of the hand that counts as a collision
-SLICES = 9  # of the hand, along y
+HAND_SLICES = 9  # of the hand, along y
 OUTSIDE_SHARE = 0.5  # of the way of a slice, from which a hand reaches out of the image
-LINE = 27  # places on the closing line, from beyond one finger to beyond the other
-NOTHING = np.float32(np.inf)
-STEEP = 1e-3  # sine of the angle to up below which up cannot orient the map
-HALF = 256  # most cells from the middle of the map to its edge: some 0.5 m
-FARTHEST = 10 * HALF  # stands for everything beyond
+PLACES = 27  # places on the closing line, from beyond one finger to beyond the other
+NO_SURFACE = np.float32(np.inf)
+MIN_UP_SINE = 1e-3  # sine of the angle to up below which up cannot orient the map
+HALF_MAP_CELLS = 256  # most cells from the middle of the map to its edge: some 0.5 m
+FAR_CELL = 10 * HALF_MAP_CELLS  # stands for everything beyond
 NUM_EXTENTS = 11
 EXTENT_POINTS = 256  # most points of an object that its extents are measured with
-FARTHEST_EXTENT = 0.25  # metres; extents are clipped here
+MAX_EXTENT = 0.25  # metres; extents are clipped here
 
 
 class UnseenSpace(NamedTuple):
@@ -58,17 +58,17 @@ def unseen_space(
     nearest = [depth.behind(T_cloud_hand, np.concatenate(places)) for depth in depths]
     behind: list[Float32] = np.split(np.min(nearest, axis=0), ends, axis=1)
     shares = [unseen(part).mean(axis=1) for part in behind[:-1]]
-    tips = [np.minimum(part, FAR).mean(axis=1) for part in behind[:2]]
-    along = behind[-1].reshape(len(T_cloud_hand), LINE, len(line) // LINE)  # (E, Y, P)
+    tips = [np.minimum(part, MAX_UNSEEN_DEPTH).mean(axis=1) for part in behind[:2]]
+    along = behind[-1].reshape(len(T_cloud_hand), PLACES, len(line) // PLACES)  # (E, Y, P)
     step, high, low = y[1] - y[0], first_met[:, :1], first_met[:, 1:]
     hidden = unseen(along).mean(axis=2)  # (E, Y)
-    seen = (along < BEHIND).all(axis=2)
+    seen = (along < THICKNESS).all(axis=2)
     return UnseenSpace(
         parts=shares[: len(parts)],
         ways=shares[len(parts) :],
         depths=tips,
         beyond=[step * (hidden * side).sum(axis=1) for side in (y > high, y < low)],
-        free=step * (seen * ((y > low + BEHIND) & (y < high - BEHIND))).sum(axis=1),
+        free=step * (seen * ((y > low + THICKNESS) & (y < high - THICKNESS))).sum(axis=1),
     )
 
 
@@ -104,7 +104,7 @@ def leaves_image(
 
 def unseen(behind: Float32) -> Float32:
     """How unknown space is, by its distance (...) behind the first surface: 0 seen, 1 unknown."""
-    share: Float32 = np.clip((behind - np.float32(BEHIND)) / np.float32(DEEP), 0.0, 1.0)
+    share: Float32 = np.clip((behind - np.float32(THICKNESS)) / np.float32(UNKNOWN_DEPTH), 0.0, 1.0)
     return share
 
 
@@ -155,17 +155,17 @@ def _palm_ways(gripper: Gripper) -> list[Float32]:
     for low, high in gripper.hand.boxes:
         x = 0.6 * np.array([low[0], high[0]])
         z = np.linspace(low[2] - APPROACH_LENGTH, high[2], 7)[:-1]
-        slices += [_grid(x, [y], z) for y in np.linspace(low[1], high[1], SLICES)]
+        slices += [_grid(x, [y], z) for y in np.linspace(low[1], high[1], HAND_SLICES)]
     return slices
 
 
 @lru_cache(maxsize=16)
 def _closing_line(gripper: Gripper) -> tuple[Float32, Float32]:
-    """The y (LINE,) of places from beyond one finger to beyond the other, and points at each."""
+    """The y (PLACES,) of places from beyond one finger to beyond the other, and points at each."""
     half, length = gripper.pad_half_width, gripper.tip_z - gripper.seen_palm_z
     thick = gripper.finger_thickness
     end = gripper.max_opening / 2 + thick
-    y = np.linspace(-end, end, LINE, dtype=np.float32)
+    y = np.linspace(-end, end, PLACES, dtype=np.float32)
     across = _grid([-0.5 * half, 0.5 * half], [0.0], gripper.tip_z - np.array([0.1, 0.3]) * length)
     line = across + y[:, None, None] * np.array([0.0, 1.0, 0.0], dtype=np.float32)
     return y, line.reshape(-1, 3)
@@ -215,7 +215,7 @@ def visible_extents(
     group = groups.reshape(-1).astype(np.int64)
     _extents(np.concatenate(parts), bounds, group, T_cloud_hand, side, limits, extents)
     extents[:, -3:] = sizes[group]
-    return np.clip(extents, -FARTHEST_EXTENT, FARTHEST_EXTENT, out=extents)
+    return np.clip(extents, -MAX_EXTENT, MAX_EXTENT, out=extents)
 
 
 @compiled("contract")
@@ -266,18 +266,18 @@ class DepthMap(NamedTuple):
         away = max(float(np.linalg.norm(way)), 1e-6)
         ahead = way / away
         across = np.cross(ahead, np.asarray(up, dtype=np.float64))
-        if np.linalg.norm(across) < STEEP * np.linalg.norm(up):  # seen from straight above
+        if np.linalg.norm(across) < MIN_UP_SINE * np.linalg.norm(up):  # seen from straight above
             across = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
         across /= np.linalg.norm(across)
         axes = np.stack([across, np.cross(ahead, across), ahead]).astype(np.float32)
         along = (points - viewpoint) @ axes.T  # (N, 3)
         tangents = along[:, :2] / np.maximum(along[:, 2:], np.float32(1e-6))
-        cell = np.clip(np.floor(tangents / np.float32(CELL / away)), -FARTHEST, FARTHEST)
-        half = min(int(np.abs(cell).max()) + SPLAT, HALF)
-        depth = np.full((2 * half + 1, 2 * half + 1), NOTHING)
+        cell = np.clip(np.floor(tangents / np.float32(MAP_CELL / away)), -FAR_CELL, FAR_CELL)
+        half = min(int(np.abs(cell).max()) + SPLAT, HALF_MAP_CELLS)
+        depth = np.full((2 * half + 1, 2 * half + 1), NO_SURFACE)
         distance = np.linalg.norm(along, axis=1).astype(np.float32)
         _cover(depth, cell.astype(np.int64) + half, distance)
-        return cls(viewpoint, axes, CELL / away, depth)
+        return cls(viewpoint, axes, MAP_CELL / away, depth)
 
     def behind(self, T_cloud_hand: Float32, places: Float32) -> Float32:
         """Metres (E, S) that places (S, 3) of hands (E, 4, 4) lie behind a surface, or 0."""

@@ -16,17 +16,17 @@ from edgegrasp_model.scene.obstacles import box_pose
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.support import heights_over
 from edgegrasp_results import DetectedObject, Grasp
-from edgegrasp_robot.surroundings import CELL, Load, moved
+from edgegrasp_robot.surroundings import VOXEL_SIZE, Load, moved
 
-STEP = 0.005  # metres along the way
-BESIDE = 0.01  # metres; points nearer to the held object already touch it
-MEETS = 0.003  # metres between points that touch
-STRAY = 0.1  # share of the held points that meet others where masks end and readings stray
-SINKS = 0.001  # metres that the held object may go down toward the support
-HIDDEN = 0.03  # metres that the foot of an object may be hidden from the camera
-PUT_DOWN = 0.005  # metres over a region's bottom at which the hand lets go
-TURNS = 8  # of an object about the vertical, in a region
-SHARES = (0.0, -0.5, 0.5, -1.0, 1.0)  # of the room that a region leaves, to each side
+WAY_STEP = 0.005  # metres along the way
+TOUCHING = 0.01  # metres; points nearer to the held object already touch it
+CONTACT_DISTANCE = 0.003  # metres between points that touch
+STRAY_SHARE = 0.1  # share of the held points that meet others where masks end and readings stray
+MAX_SINKING = 0.001  # metres that the held object may go down toward the support
+MAX_HIDDEN_FOOT = 0.03  # metres that the foot of an object may be hidden from the camera
+RELEASE_HEIGHT = 0.005  # metres over a region's bottom at which the hand lets go
+TURNS_IN_REGION = 8  # of an object about the vertical, in a region
+PLACE_SHARES = (0.0, -0.5, 0.5, -1.0, 1.0)  # of the room that a region leaves, to each side
 
 
 class Held(NamedTuple):
@@ -46,9 +46,9 @@ def held_by(grasp: Grasp, scene: Scene, gripper: Gripper) -> Held:
     if not held.any():
         return Held(points[held], points)
     own = points[held]
-    low, high = own.min(axis=0) - BESIDE, own.max(axis=0) + BESIDE
+    low, high = own.min(axis=0) - TOUCHING, own.max(axis=0) + TOUCHING
     near = ((points > low) & (points < high)).all(axis=1)
-    near[near] = cKDTree(own).query(points[near], distance_upper_bound=BESIDE)[0] <= BESIDE
+    near[near] = cKDTree(own).query(points[near], distance_upper_bound=TOUCHING)[0] <= TOUCHING
     return Held(own, points[~near])
 
 
@@ -62,16 +62,16 @@ def can_leave(
     if not len(held.points):
         return True
     ends = np.concatenate([held.points, held.points + way])
-    low, high = ends.min(axis=0) - MEETS, ends.max(axis=0) + MEETS
+    low, high = ends.min(axis=0) - CONTACT_DISTANCE, ends.max(axis=0) + CONTACT_DISTANCE
     others = held.others[((held.others > low) & (held.others < high)).all(axis=1)]
     tree = cKDTree(others)
-    if _lowest(scene, held.points + way) < _lowest(scene, held.points) - SINKS:
+    if _lowest(scene, held.points + way) < _lowest(scene, held.points) - MAX_SINKING:
         return False
-    steps = max(1, int(np.ceil(np.linalg.norm(way) / STEP)))
+    steps = max(1, int(np.ceil(np.linalg.norm(way) / WAY_STEP)))
     for share in np.arange(1, steps + 1) / steps:
         there = held.points + share * way
-        away = tree.query(there, distance_upper_bound=MEETS)[0]
-        if np.isfinite(away).mean() > STRAY:
+        away = tree.query(there, distance_upper_bound=CONTACT_DISTANCE)[0]
+        if np.isfinite(away).mean() > STRAY_SHARE:
             return False
         for T_cloud_box, half in map(box_pose, collision.obstacles):
             T_box_cloud = np.linalg.inv(T_cloud_box.astype(np.float64))
@@ -102,7 +102,7 @@ def load_of(
         T_scene_box, half = pose_matrix(np.eye(3), (low + high) / 2), (high - low) / 2
         T_cloud_box = np.linalg.inv(scene.frame.T_canonical_cloud) @ T_scene_box
     foot = _lowest(scene, (T_cloud_box[:3, 3] - half[2] * T_cloud_box[:3, 2])[None])
-    below = foot if scene.support is not None and 0.0 < foot < HIDDEN else 0.0
+    below = foot if scene.support is not None and 0.0 < foot < MAX_HIDDEN_FOOT else 0.0
     points = moved(T_base_cloud, held.points)
     return Load(points, T_base_cloud @ T_cloud_box, half, below)
 
@@ -116,7 +116,7 @@ def places_for(
     for pose in _places(place, load):
         off, half = load.above_its_foot
         around = np.abs(moved(np.linalg.inv(pose), voxels) - (0.0, 0.0, off))
-        if not (around < half + CELL / 2).all(axis=1).any():
+        if not (around < half + VOXEL_SIZE / 2).all(axis=1).any():
             yield pose
 
 
@@ -125,13 +125,13 @@ def _places(place: Place, load: Load) -> Iterator[Float64]:
         yield np.reshape(np.array(place.T_base_object), (4, 4))
         return
     low, high = np.array(place.region.min), np.array(place.region.max)
-    shares = sorted(product(SHARES, SHARES), key=lambda pair: np.hypot(*pair))
-    for share, turn in product(shares, range(TURNS)):
-        about = Rotation.from_euler("z", 2 * np.pi * turn / TURNS).as_matrix()
+    shares = sorted(product(PLACE_SHARES, PLACE_SHARES), key=lambda pair: np.hypot(*pair))
+    for share, turn in product(shares, range(TURNS_IN_REGION)):
+        about = Rotation.from_euler("z", 2 * np.pi * turn / TURNS_IN_REGION).as_matrix()
         pose = np.eye(4)
         pose[:3, :3] = about @ load.T_base_box[:3, :3]
         reach = np.abs(pose[:3, :3]) @ load.half  # of the turned box, along the base's axes
-        reach[2] += load.below / 2 + PUT_DOWN / 2
+        reach[2] += load.below / 2 + RELEASE_HEIGHT / 2
         room = (high - low) / 2 - reach
         if (room > 0.0).all():
             pose[:2, 3] = ((low + high) / 2)[:2] + share * room[:2]

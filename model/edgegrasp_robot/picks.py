@@ -21,21 +21,21 @@ from edgegrasp_model.scene.scene import Scene
 from edgegrasp_results import ArmPlan, ArmTrajectory, DetectedObject, Detection, Grasp
 from edgegrasp_robot.held import Held, can_leave, held_by, load_of, places_for
 from edgegrasp_robot.robot import GROUP, Robot
-from edgegrasp_robot.surroundings import HELD, Load, Surroundings, carrying, moved, surrounded
+from edgegrasp_robot.surroundings import HELD_NAME, Load, Surroundings, carrying, moved, surrounded
 
-TRIED = 200  # most grasps that are tried with the arm, in their order
-PLACES = 6  # in a region, that the arm may be asked for with one grasp
-LEVEL = 0.9  # of the base's z, how much of it is up at least for a region
-SPARE = 4  # grasps tried beyond top_k, as some may get no motion
+MAX_TRIED = 200  # most grasps that are tried with the arm, in their order
+MAX_PLACES = 6  # in a region, that the arm may be asked for with one grasp
+MIN_LEVEL = 0.9  # of the base's z, how much of it is up at least for a region
+EXTRA_GRASPS = 4  # grasps tried beyond top_k, as some may get no motion
 LINE_STEP = 0.025  # metres between poses of a straight motion
 MAX_JUMP = 1.0  # most radians that a joint turns between two of them
-OFF_LINE = 0.002  # most metres between the hand and its straight line
-SHARE = 0.99  # share of the limits that is used, as splines overshoot a little
-DT = 0.01  # seconds between the rows of a trajectory
-FINE = 0.005  # radians between the joints that are checked along a trajectory
-PATH_STEP = 0.03  # radians between the joints that are checked along a path
+MAX_OFF_LINE = 0.002  # most metres between the hand and its straight line
+LIMIT_SHARE = 0.99  # share of the limits that is used, as splines overshoot a little
+STEP_SECONDS = 0.01  # seconds between the rows of a trajectory
+TRAJECTORY_CHECK_STEP = 0.005  # radians between the joints that are checked along a trajectory
+PATH_CHECK_STEP = 0.03  # radians between the joints that are checked along a path
 PATH_SECONDS = 1.0  # of a request, for searches that find no path; others take milliseconds
-RESTARTS = 2  # of the inverse kinematics, from joints at random
+IK_RESTARTS = 2  # of the inverse kinematics, from joints at random
 TRAVEL_COST = 0.02  # cost, as a share of a score, per radian of the joint that turns most
 # Of a hand about its z, by columns of its pose.
 AS_IT_IS, HALF_TURN = np.ones(4, np.float32), np.float32([-1.0, -1.0, 1.0, 1.0])
@@ -62,7 +62,7 @@ def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
     if options.gripper not in (None, robot.gripper.name):
         fix = f"Leave it out: the robot {robot.name!r} has a {robot.gripper.name!r}."
         raise InvalidRequest("options.gripper", "another gripper than the robot's", fix)
-    changes = {"top_k": max(options.top_k, TRIED), "gripper": robot.hand}
+    changes = {"top_k": max(options.top_k, MAX_TRIED), "gripper": robot.hand}
     return options.model_copy(update=changes)
 
 
@@ -96,7 +96,7 @@ def plan_picks(
         moves, waiting = asked.plan == "motion", iter(grasps)
         missing = options.top_k
         while missing > 0 and time.monotonic() < until:
-            tried = arm.reach_some(waiting, missing + (SPARE if moves else 0))
+            tried = arm.reach_some(waiting, missing + (EXTRA_GRASPS if moves else 0))
             if not tried:
                 break
             failures.update(pick.outcome for pick in tried)
@@ -159,12 +159,12 @@ class _Arm:
         self._start_x = robot.hand_pose(self._start)[:3, 0]
         near = np.maximum(robot.lower, self._start - np.pi)
         far = np.minimum(robot.upper, self._start + np.pi)
-        drawn = np.random.default_rng(options.seed).uniform(near, far, (RESTARTS, len(near)))
+        drawn = np.random.default_rng(options.seed).uniform(near, far, (IK_RESTARTS, len(near)))
         self._drawn = list(drawn)  # joints to start from where the given ones lead nowhere
         self._T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
         up = scene.frame.directions_in_cloud((0.0, 0.0, 1.0))
         self._up = self._T_base_cloud[:3, :3] @ up
-        if self._place is not None and self._place.region is not None and self._up[2] < LEVEL:
+        if self._place is not None and self._place.region is not None and self._up[2] < MIN_LEVEL:
             fix = "Send T_base_object, or the poses of a base frame whose z is up."
             value = f"a region where up is {self._up.round(2).tolist()} in the base frame"
             raise InvalidRequest("options.robot.place.region", value, fix)
@@ -220,7 +220,7 @@ class _Arm:
                     break
                 line.append(joints)
             else:
-                if not (first.hasCollisions(line[0]) or _touches(along, line, PATH_STEP)):
+                if not (first.hasCollisions(line[0]) or _touches(along, line, PATH_CHECK_STEP)):
                     return line, "reachable"
                 outcome = "arm_collision"
         return [], outcome
@@ -240,7 +240,7 @@ class _Arm:
             with carrying(self._robot, put.around, put.load, T_base_hand) as scene:
                 over = self._free_path(scene, put.back[-1], put.down[0])
                 timed += [self._timed(scene, over), self._timed(scene, put.down, True)]
-                scene.removeGeometry(HELD)
+                scene.removeGeometry(HELD_NAME)
                 timed.append(self._timed(scene, put.away, True))
         parts = [part for part in timed if part is not None]
         if len(parts) < len(timed):
@@ -271,12 +271,12 @@ class _Arm:
         T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand
         T_box_hand = np.linalg.inv(load.T_base_box) @ T_base_hand
         with carrying(self._robot, around, load, T_base_hand) as scene:
-            for T_base_box in islice(places, PLACES):
+            for T_base_box in islice(places, MAX_PLACES):
                 T_base_place = T_base_box @ T_box_hand
                 poses = _straight(T_base_place, self._up, over, 0.0)
                 down, _ = self._reach(poses, [back[-1], *self._drawn], scene, scene)
                 if down:
-                    scene.removeGeometry(HELD)
+                    scene.removeGeometry(HELD_NAME)
                     out = _straight(T_base_place, -T_base_place[:3, 2], 0.0, rules.approach_length)
                     away, _ = self._reach(out, down[-1:], scene, scene)
                     hand = self._robot.hand_pose(down[-1])
@@ -302,7 +302,8 @@ class _Arm:
     def _free_path(self, scene: core.Scene, start: Float64, end: Float64) -> list[Float64]:
         """Joints between which linear joint motions are collision-free; none: there are none."""
         names, seed = self._robot.joint_names, self._options.seed % 2**31
-        options = RRTOptions(GROUP, 3000, rrt_connect=True, collision_check_step_size=PATH_STEP)
+        step = PATH_CHECK_STEP
+        options = RRTOptions(GROUP, 3000, rrt_connect=True, collision_check_step_size=step)
         begin = time.monotonic()
         # Nodes alone are no limit: none are added where every way is blocked. Zero is without end.
         options.max_planning_time = max(1e-3, min(self._path_seconds, self._until - begin))
@@ -314,7 +315,7 @@ class _Arm:
         except RuntimeError:  # no path within these limits
             self._path_seconds -= time.monotonic() - begin
             return []
-        rules = core.PathShortcuttingOptions(GROUP, PATH_STEP, seed=seed)
+        rules = core.PathShortcuttingOptions(GROUP, PATH_CHECK_STEP, seed=seed)
         return list(map(np.array, core.PathShortcutter(scene, rules).shortcut(path).positions))
 
     def _timed(
@@ -324,7 +325,8 @@ class _Arm:
         path = core.JointPath()
         path.joint_names, path.positions = self._robot.joint_names, list(joints)
         mode = SplineFittingMode.Cubic if straight else SplineFittingMode.Adaptive
-        options = TOPPRAOptions(dt=DT, mode=mode, velocity_scale=SHARE, acceleration_scale=SHARE)
+        scales = {"velocity_scale": LIMIT_SHARE, "acceleration_scale": LIMIT_SHARE}
+        options = TOPPRAOptions(dt=STEP_SECONDS, mode=mode, **scales)
         try:
             found = PathParameterizerTOPPRA(scene, GROUP).generate(path, options)
         except RuntimeError:
@@ -335,9 +337,9 @@ class _Arm:
         if straight:
             hand = np.array([self._robot.hand_pose(row)[:3, 3] for row in (*rows, joints[-1])])
             along = unit(hand[-1] - hand[0])
-            if np.linalg.norm(np.cross(hand - hand[0], along), axis=1).max() > OFF_LINE:
+            if np.linalg.norm(np.cross(hand - hand[0], along), axis=1).max() > MAX_OFF_LINE:
                 return None
-        return None if _touches(scene, rows, FINE) else found
+        return None if _touches(scene, rows, TRAJECTORY_CHECK_STEP) else found
 
 
 def _touches(scene: core.Scene, joints: Sequence[Float64] | Float64, step: float) -> bool:

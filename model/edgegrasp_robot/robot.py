@@ -29,7 +29,7 @@ Kinematics = dict[str, list[Any]]
 
 ROBOT_FOLDER = Path(__file__).parent / "robots"
 GROUP, HAND = "arm", "edgegrasp_hand"  # names in the planner's model
-CAREFUL = 2.0  # per second squared: acceleration limit if none is given
+DEFAULT_ACCELERATION = 2.0  # per second squared: acceleration limit if none is given
 MOVING = ("revolute", "continuous", "prismatic")
 as_text = partial(ElementTree.tostring, encoding="unicode")
 IK = SimpleIkOptions(
@@ -62,7 +62,7 @@ class RobotFile(Strict):
     T_flange_hand: HandPose
     home: Joints = ()  # where the arm touches nothing of itself; empty: near zero
     max_velocity: Joints = ()  # of each joint; empty: the URDF's
-    max_acceleration: Joints = ()  # of each joint; empty: CAREFUL each
+    max_acceleration: Joints = ()  # of each joint; empty: DEFAULT_ACCELERATION each
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     joints = _chain(root, file)
     joint_names = [str(joint.get("name")) for joint in joints]
     if not file.max_acceleration:
-        file = file.model_copy(update={"max_acceleration": (CAREFUL,) * len(joints)})
+        file = file.model_copy(update={"max_acceleration": (DEFAULT_ACCELERATION,) * len(joints)})
     for field in ("home", "max_velocity", "max_acceleration"):
         given = getattr(file, field)
         if given and len(given) != len(joints):

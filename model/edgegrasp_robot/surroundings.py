@@ -20,15 +20,15 @@ from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.support import heights_over
 from edgegrasp_robot.robot import HAND, Robot, touching
 
-CELL = 0.01  # metres, side of a voxel
-AROUND = 2.0  # metres from the arm's base; farther points are left out
-SEEN_SELF = 0.02  # metres; points this near to the arm are the arm itself
-INSIDE = 10  # voxels of objects that may lie inside the arm, given camera errors
-SLAB = (6.0, 6.0, 0.5)  # metres, of the support
-FOOT = 0.015  # metres of what is held, at its foot, that may touch what it is put on
-NEAR = 0.02  # metres from what is held, within which voxels are its own
+VOXEL_SIZE = 0.01  # metres, side of a voxel
+MAX_RANGE = 2.0  # metres from the arm's base; farther points are left out
+SELF_DISTANCE = 0.02  # metres; points this near to the arm are the arm itself
+MAX_VOXELS_INSIDE = 10  # voxels of objects that may lie inside the arm, given camera errors
+SUPPORT_SIZE = (6.0, 6.0, 0.5)  # metres, of the support
+FOOT_HEIGHT = 0.015  # metres of what is held, at its foot, that may touch what it is put on
+NEAR_HELD = 0.02  # metres from what is held, within which voxels are its own
 GREY = np.ones(4)
-HELD = "what is held"
+HELD_NAME = "what is held"
 
 Obstacle = tuple[str, core.Box | core.OcTree, Float64]  # its name, shape and pose in the base frame
 
@@ -44,7 +44,7 @@ class Load(NamedTuple):
     @property
     def above_its_foot(self) -> tuple[float, Float64]:
         """The box without its foot: how much higher its middle is, and half its lengths."""
-        cut = min(FOOT, self.half[2])
+        cut = min(FOOT_HEIGHT, self.half[2])
         return cut / 2, self.half - (0.0, 0.0, cut / 2)
 
 
@@ -62,16 +62,16 @@ class Surroundings(NamedTuple):
             return self.boxes
         # Columns of coal's octrees: centre, size, probability of being occupied, and the threshold;
         # octomap allows no certainty.
-        cells = np.tile([0.0, 0.0, 0.0, CELL, 0.97, 0.5], (len(self.voxels), 1))
+        cells = np.tile([0.0, 0.0, 0.0, VOXEL_SIZE, 0.97, 0.5], (len(self.voxels), 1))
         cells[:, :3] = self.voxels
-        return [*self.boxes, ("the cloud", core.OcTree(list(cells), CELL), self.T_base_scene)]
+        return [*self.boxes, ("the cloud", core.OcTree(list(cells), VOXEL_SIZE), self.T_base_scene)]
 
     def without(self, load: Load) -> "Surroundings":
         """The same once a load is taken away."""
         centers = moved(self.T_base_scene, self.voxels)
         inside = np.abs(moved(np.linalg.inv(load.T_base_box), centers)) < load.half
         own = inside.all(axis=1)
-        own |= cKDTree(load.points).query(centers, distance_upper_bound=NEAR)[0] <= NEAR
+        own |= cKDTree(load.points).query(centers, distance_upper_bound=NEAR_HELD)[0] <= NEAR_HELD
         return self._replace(voxels=self.voxels[~own])
 
 
@@ -88,13 +88,13 @@ def carrying(
     T_joint_box[:3, 3] += off * T_joint_box[:3, 2]
     pose, box = np.asfortranarray(T_joint_box), core.Box(*(2 * half))
     with _standing_in([scene], robot, around.all()):
-        scene.addBoxGeometry(HELD, robot.flange_frame, box, pose, GREY)
-        scene.setCollisions(HELD, HAND, False)
+        scene.addBoxGeometry(HELD_NAME, robot.flange_frame, box, pose, GREY)
+        scene.setCollisions(HELD_NAME, HAND, False)
         try:
             yield scene
         finally:
             with suppress(RuntimeError):  # the load may have been put down
-                scene.removeGeometry(HELD)
+                scene.removeGeometry(HELD_NAME)
 
 
 @contextmanager
@@ -123,13 +123,13 @@ def surrounded(
         # A slab below the support plane, its middle below the arm's base.
         normal, base = np.array(scene.support.normal), np.linalg.inv(T_base_scene)[:3, 3]
         upright = Rotation.align_vectors(normal[None], [[0.0, 0.0, 1.0]])[0].as_matrix()
-        middle = base - (heights_over(scene.support, base) + SLAB[2] / 2) * normal
+        middle = base - (heights_over(scene.support, base) + SUPPORT_SIZE[2] / 2) * normal
         T_scene_slab = pose_matrix(upright, middle)
-        known.append(("the support", core.Box(*SLAB), T_base_scene @ T_scene_slab))
+        known.append(("the support", core.Box(*SUPPORT_SIZE), T_base_scene @ T_scene_slab))
     voxels = _voxels(robot, joints, scene, points, T_base_scene)
     if asked.avoid_unseen:
         hidden = _hidden(scene, voxels, T_base_scene)
-        hidden = hidden[~_near_robot(robot, joints, moved(T_base_scene, hidden), SEEN_SELF)]
+        hidden = hidden[~_near_robot(robot, joints, moved(T_base_scene, hidden), SELF_DISTANCE)]
         voxels = np.concatenate([voxels, hidden])
     around = Surroundings(own, known, voxels, T_base_scene)
     obstacles = around.all()
@@ -173,13 +173,13 @@ def _own_objects(robot: Robot, joints: Float64, scene: Scene, T_base_cloud: Floa
     of_object = scene.object_of_point >= 0
     number = scene.object_of_point[of_object]
     objects = moved(T_base_cloud, scene.points_in_cloud[of_object])
-    near = _near_robot(robot, joints, objects, SEEN_SELF)
-    within = _near_robot(robot, joints, objects, CELL / 2)
+    near = _near_robot(robot, joints, objects, SELF_DISTANCE)
+    within = _near_robot(robot, joints, objects, VOXEL_SIZE / 2)
     own: set[int] = set()
     for row in np.unique(number[near]).tolist():
         if near[number == row].mean() > 0.5:
             own.add(row)
-        elif within[number == row].sum() > INSIDE:
+        elif within[number == row].sum() > MAX_VOXELS_INSIDE:
             value = f"a pose that puts the arm into object {row}"
             fix = "Send where the cloud's frame is in the arm's base frame, and the joints now."
             raise InvalidRequest("options.robot.T_base_cloud", value, fix)
@@ -204,14 +204,14 @@ def _voxels(
     else:  # in single precision, since most of an image is support
         plane = np.append(scene.support.normal, -scene.support.offset)
         plane = (plane @ scene.frame.T_canonical_cloud).astype(flat.dtype)
-        kept = np.flatnonzero(flat @ plane[:3] > CELL / 2 - plane[3])  # NaN is not
+        kept = np.flatnonzero(flat @ plane[:3] > VOXEL_SIZE / 2 - plane[3])  # NaN is not
     # In cells of the scene's frame, from the arm's base.
     T, base = scene.frame.T_canonical_cloud, np.linalg.inv(T_base_scene)[:3, 3]
-    cells = flat[kept] @ (T[:3, :3].T / CELL).astype(flat.dtype)
-    cells += ((T[:3, 3] - base) / CELL).astype(flat.dtype)
-    cells = cells[np.einsum("ij,ij->i", cells, cells) < (AROUND / CELL) ** 2]
-    centers = _centers(cells + (base / CELL).astype(flat.dtype))
-    return centers[~_near_robot(robot, joints, moved(T_base_scene, centers), SEEN_SELF)]
+    cells = flat[kept] @ (T[:3, :3].T / VOXEL_SIZE).astype(flat.dtype)
+    cells += ((T[:3, 3] - base) / VOXEL_SIZE).astype(flat.dtype)
+    cells = cells[np.einsum("ij,ij->i", cells, cells) < (MAX_RANGE / VOXEL_SIZE) ** 2]
+    centers = _centers(cells + (base / VOXEL_SIZE).astype(flat.dtype))
+    return centers[~_near_robot(robot, joints, moved(T_base_scene, centers), SELF_DISTANCE)]
 
 
 def _hidden(scene: Scene, voxels: Float64, T_base_scene: Float64) -> Float64:
@@ -220,14 +220,14 @@ def _hidden(scene: Scene, voxels: Float64, T_base_scene: Float64) -> Float64:
         fix = "Send the option viewpoint, or depth images with their poses."
         raise InvalidRequest("options.robot.avoid_unseen", "true, without a camera's position", fix)
     base = np.linalg.inv(T_base_scene)[:3, 3]
-    steps = np.arange(CELL, 2 * AROUND, CELL)[:, None, None]
+    steps = np.arange(VOXEL_SIZE, 2 * MAX_RANGE, VOXEL_SIZE)[:, None, None]
     hidden = []
     for eye in scene.viewpoints.astype(np.float64):
         places = (voxels + steps * unit(voxels - eye)).reshape(-1, 3)
-        kept = np.einsum("ij,ij->i", places - base, places - base) < AROUND**2
+        kept = np.einsum("ij,ij->i", places - base, places - base) < MAX_RANGE**2
         if scene.support is not None:
-            kept &= heights_over(scene.support, places) > CELL / 2
-        hidden.append(places[kept] / CELL)
+            kept &= heights_over(scene.support, places) > VOXEL_SIZE / 2
+        hidden.append(places[kept] / VOXEL_SIZE)
     return _centers(*hidden)
 
 
@@ -243,7 +243,7 @@ def _centers(*groups: Floats) -> Float64:
         taken = np.zeros(size, dtype=bool)
         taken[tuple(cell - corner)] = True
         common &= taken
-    return np.asarray((np.argwhere(common) + corner.T + 0.5) * CELL)
+    return np.asarray((np.argwhere(common) + corner.T + 0.5) * VOXEL_SIZE)
 
 
 def moved(T_b_a: Float64, points: ArrayLike) -> Float64:

@@ -24,8 +24,8 @@ from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_model.networks.checkpoint import load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
-from edgegrasp_model.networks.hand import BEYOND, HandBatch
-from edgegrasp_model.ranking import HIDDEN
+from edgegrasp_model.networks.hand import UNSEEN_NUMBERS, HandBatch
+from edgegrasp_model.ranking import MAX_HIDDEN_DEPTH
 from edgegrasp_training.examples import pack_hands, tried_grasps
 from edgegrasp_training.views import find_views, load_view, scene_of, table
 
@@ -228,7 +228,7 @@ def score_views(paths: list[Path], weights: list[Path]) -> Scored:
             with torch.inference_mode():
                 logit = network(packed.batch).double().numpy()
             logits.append(logit / metadata.temperature)
-        hidden = (description[:, BEYOND] > HIDDEN).any(dim=1).numpy()
+        hidden = (description[:, UNSEEN_NUMBERS] > MAX_HIDDEN_DEPTH).any(dim=1).numpy()
         kind = np.full(len(hidden), scene_of(path).split("_")[0])
         parts.append(Scored(kind, hidden, packed.label.numpy() > 0.5, np.stack(logits)))
     if not parts:

@@ -27,7 +27,7 @@ from edgegrasp_model.candidates.edge_grasps import (
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.networks.config import NetworkConfig
-from edgegrasp_model.networks.hand import HEIGHTS, UNKNOWN_HEIGHT, HandBatch
+from edgegrasp_model.networks.hand import HEIGHT_NUMBERS, UNKNOWN_HEIGHT, HandBatch
 from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
 from edgegrasp_model.scene.scene import Surroundings
 from edgegrasp_training.recipes import LENGTH_UNIT
@@ -59,7 +59,7 @@ class TriedGrasps:
         if self.seen is None:
             return self
         unknown = self.seen.description.clone()
-        unknown[:, HEIGHTS] = UNKNOWN_HEIGHT
+        unknown[:, HEIGHT_NUMBERS] = UNKNOWN_HEIGHT
         return replace(self, seen=replace(self.seen, description=unknown))
 
     def balls(self) -> Int64:

@@ -27,7 +27,7 @@ from edgegrasp_model.options import (
     SupportPlane,
     Workspace,
 )
-from edgegrasp_model.ranking import judged_together
+from edgegrasp_model.ranking import average_similar_hands
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_sim.camera import Observation, TableView, ViewRange
 from edgegrasp_sim.engine import choose_engine
@@ -378,7 +378,7 @@ def choose_grasps(
     if guide is None:
         rows, best = _any(sample, options.grasps_per_view, rng), None
     else:
-        rating = judged_together(sample.logits, sample, scene, prepared.gripper)
+        rating = average_similar_hands(sample.logits, sample, scene, prepared.gripper)
         number = scene.object_of_point[sample.candidates.contact_index]
         rows = _likely(number, sample.logits, rating, options.grasps_per_view, rng)
         best = int(np.searchsorted(rows, rating.argmax()))

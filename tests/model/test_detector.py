@@ -12,11 +12,11 @@ from edgegrasp_camera.depth import DepthView, Intrinsics, fuse_depth_images
 from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue, choose_device
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, UnknownModel
-from edgegrasp_model.kernels import mean_of_alike
+from edgegrasp_model.kernels import mean_over_similar
 from edgegrasp_model.networks.checkpoint import save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, parse_options
-from edgegrasp_model.ranking import surrounded_first
+from edgegrasp_model.ranking import densest_first
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene import network
 from edgegrasp_model.scene.cloud import CloudInput
@@ -380,7 +380,7 @@ def test_hands_are_averaged_with_others_on_the_same_object_that_are_near_and_tur
     poses = hands([0.0, 0.01, 0.02, 0.1, 0.01, 0.01], [0.0, 0.1, np.pi, 0.0, 0.0, 1.0])
     logits = np.array([3.0, -1.0, -2.0, 2.0, 5.0, 7.0], dtype=np.float32)
     number = np.array([0, 0, 0, 0, 1, 0])  # the fifth is on another object
-    found = mean_of_alike(logits, poses, number, 0.03, 0.5)
+    found = mean_over_similar(logits, poses, number, 0.03, 0.5)
     np.testing.assert_allclose(found[:3], [-1.5, 0.5, 1.0], atol=1e-6)
     assert np.isnan(found[3:]).all()
 
@@ -389,7 +389,7 @@ def test_a_hand_among_good_ones_comes_before_a_lone_one_that_is_hardly_better() 
     poses, order = hands([0.0, 0.01, 0.02, 0.2], [0.0] * 4), np.array([3, 1, 0, 2])
     for lone, first in ((0.92, 1), (0.99, 3)):
         worth = np.array([0.9, 0.91, 0.9, lone])
-        assert surrounded_first(order, worth, poses)[0] == first
+        assert densest_first(order, worth, poses)[0] == first
 
 
 # Grasps across an outline: seen from straight above, where no side of an object is seen.

@@ -32,18 +32,18 @@ from edgegrasp_model.unseen import unseen_space, visible_extents
 # The network
 POINT_UNIT = 0.05  # metres; scale of the positions around the fingers
 DROPOUT = 0.1  # dropout of the classifier's inputs
-CHUNK = 64  # hands at a time, so that the work stays in cache
+HANDS_AT_A_TIME = 64  # hands at a time, so that the work stays in cache
 
 # The description
-AXIS = 0.001  # metres from the approach axis, on which the approach point itself lies
-SLAB = 0.004  # metres; thickness of the first layer each finger would meet
-FACING = 0.7  # cosine from which a normal faces a finger
-ABOVE = 0.001  # metres over the camera
+AXIS_RADIUS = 0.001  # metres from the approach axis, on which the approach point itself lies
+SLAB_THICKNESS = 0.004  # metres; thickness of the first layer each finger would meet
+MIN_FACING = 0.7  # cosine from which a normal faces a finger
+ABOVE_CAMERA = 0.001  # metres over the camera
 # Metres beyond the pads' sides, the open fingers' inner faces, the palm and the tips.
-BESIDE, OUTSIDE, BEHIND, BEYOND_TIPS = 0.027, 0.06, 0.026, 0.012
+BESIDE_PADS, OUTSIDE_FINGERS, BEHIND_PALM, BEYOND_TIPS = 0.027, 0.06, 0.026, 0.012
 UNKNOWN_HEIGHT = 0.10  # metres; heights are clipped here, and unknown ones get this value
-HEIGHTS = slice(58, 61)  # numbers that are heights over the support plane
-BEYOND = slice(65, 67)  # unseen metres outward from what each finger meets first
+HEIGHT_NUMBERS = slice(58, 61)  # numbers that are heights over the support plane
+UNSEEN_NUMBERS = slice(65, 67)  # unseen metres outward from what each finger meets first
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,12 @@ class HandBatch:
         if around.viewpoints is not None and len(around.viewpoints) == 1:
             # If a hand approaches straight from the camera, up decides instead of rounding errors.
             eye = around.viewpoints[0]
-            toward = eye + ABOVE * UP - hands[:, :3, 3]
+            toward = eye + ABOVE_CAMERA * UP - hands[:, :3, 3]
             along_x = np.einsum("ed,ed->e", toward, hands[:, :3, 0])
             side = np.where(along_x < 0.0, -1.0, 1.0).astype(np.float32)
         description = describe_hands(around, candidates, gripper, view, eye, side, description_size)
-        x, y = gripper.pad_half_width + BESIDE, gripper.max_opening / 2 + OUTSIDE
-        low, high = (-x, -y, gripper.seen_palm_z - BEHIND), (x, y, gripper.tip_z + BEYOND_TIPS)
+        x, y = gripper.pad_half_width + BESIDE_PADS, gripper.max_opening / 2 + OUTSIDE_FINGERS
+        low, high = (-x, -y, gripper.seen_palm_z - BEHIND_PALM), (x, y, gripper.tip_z + BEYOND_TIPS)
         box = np.array([low, high, (0.0, 0.0, gripper.tip_z)], dtype=np.float32)
         points = _around_fingers(view, around.cloud.normals, hands, side, box, num_points)
         return cls(*map(torch.from_numpy, (description, *points)))
@@ -115,7 +115,7 @@ class HandNet(nn.Module):
         known = batch.description[:, : self.config.description_size]
         description = (known - self.mean) / self.std  # (E, F)
         encoder, chunks = layers.packed(self.point_encoder), []
-        for points, count in layers.in_chunks(CHUNK, batch.points, batch.point_count):
+        for points, count in layers.in_chunks(HANDS_AT_A_TIME, batch.points, batch.point_count):
             positions, normals = torch.split(points, 3, dim=2)
             encoded = encoder(torch.cat((positions / POINT_UNIT, normals), dim=2))  # (E, P, C)
             if layers.float32_inference(encoded):
@@ -323,10 +323,10 @@ def _measure_between(points: Float32, normals: Float32, hand: _Hand, numbers: Fl
     _extent(points[0], np.float32(0.0), numbers[11:14])
     numbers[14], numbers[15] = _mean(np.abs(normal[0])), _mean(np.abs(ny))
     numbers[16] = _mean(normal[2])
-    numbers[17], numbers[18] = np.log1p(np.sum(ny > FACING)), np.log1p(np.sum(ny < -FACING))
-    numbers[19], numbers[20] = _mean(ny[y > AXIS]), _mean(ny[y < -AXIS])
+    numbers[17], numbers[18] = np.log1p(np.sum(ny > MIN_FACING)), np.log1p(np.sum(ny < -MIN_FACING))
+    numbers[19], numbers[20] = _mean(ny[y > AXIS_RADIUS]), _mean(ny[y < -AXIS_RADIUS])
     for finger in range(2):
-        first = y > numbers[4] - SLAB if finger == 0 else y < numbers[5] + SLAB
+        first = y > numbers[4] - SLAB_THICKNESS if finger == 0 else y < numbers[5] + SLAB_THICKNESS
         count, at = np.sum(first), 21 + 4 * finger
         numbers[at], numbers[at + 1] = np.log1p(count), _mean(ny[first])
         numbers[at + 2] = _mean(z[first]) if count else length / 2
