@@ -191,6 +191,16 @@ def object_in_scene(
 # The forms of the wire
 
 
+def float32_points(cloud: Cloud) -> Float32 | None:
+    """The cloud as (N, 3) float32 if it is an array of N points, else None."""
+    if not isinstance(cloud, np.ndarray) or cloud.shape[1:] != (3,):
+        return None
+    if cloud.dtype not in (np.float32, np.float64):
+        return None
+    with np.errstate(over="ignore"):  # the server refuses infinity
+        return np.ascontiguousarray(cloud, dtype=np.float32)
+
+
 def cloud_file(cloud: Cloud) -> tuple[str, bytes]:
     """The cloud as a file, its format first, which is one of FILE_FORMATS.
 
@@ -201,10 +211,8 @@ def cloud_file(cloud: Cloud) -> tuple[str, bytes]:
             format.
     """
     if isinstance(cloud, np.ndarray) and not cloud.dtype.hasobject:
-        if cloud.dtype in (np.float32, np.float64) and cloud.shape[1:] == (3,):
-            with np.errstate(over="ignore"):  # the server refuses infinity
-                cloud = np.ascontiguousarray(cloud, np.float32)
-        return "npy", npy_bytes(cloud)
+        points = float32_points(cloud)
+        return "npy", npy_bytes(cloud if points is None else points)
     if not isinstance(cloud, str | PathLike):
         kind = f"a {type(cloud).__name__}"
         value = f"dtype {cloud.dtype}" if isinstance(cloud, np.ndarray) else kind
@@ -309,4 +317,4 @@ def _sent(name: str, array: object) -> Array:
         raise invalid(name, f"shape {array.shape}, dtype {array.dtype}", fix)
     if array.size and kind == "int32" and (array.max() >= 2**31 or array.min() < -(2**31)):
         raise invalid(name, f"values from {array.min()} to {array.max()}", fix)
-    return np.ascontiguousarray(array.reshape(-1, *row), np.dtype(kind).newbyteorder("<"))
+    return np.ascontiguousarray(array.reshape(-1, *row), dtype=kind)
