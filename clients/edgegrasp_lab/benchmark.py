@@ -241,8 +241,14 @@ def run_rounds(
                 text = f"{scene} GSR {successes}/{attempts} DR {successes}/{objects}"
                 progress.update(bar, advance=1, description=text)
 
-            where: dict[str, Any] = {"workers": asked.workers, "ray": asked.ray, "folder": folder}
-            return run_benchmark(config, planner.make, **where, on_round=on_round)
+            return run_benchmark(
+                config,
+                planner.make,
+                workers=asked.workers,
+                ray=asked.ray,
+                folder=folder,
+                on_round=on_round,
+            )
 
 
 def _print_summary(summary: dict[str, Any], planner: str) -> None:

@@ -244,11 +244,15 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
             raise RuntimeError("there is no scene yet; call reset or reset_from_poses first")
         return self._gripper
 
-    def _run(self, T_world_hand: ArrayLike, **how: bool) -> GraspResult:
+    def _run(
+        self, T_world_hand: ArrayLike, *, to_the_end: bool, shake: bool = False
+    ) -> GraspResult:
         T = require_pose(T_world_hand)
         self._restore_rest()
         objects = {item.body.uid: item for item in self._objects}
-        return run_grasp(self._hand, T, objects, self._obstacles, **how)
+        return run_grasp(
+            self._hand, T, objects, self._obstacles, to_the_end=to_the_end, shake=shake
+        )
 
     def _restore_rest(self) -> None:
         # Every grasp starts from one saved state, so that earlier tries leave no trace.

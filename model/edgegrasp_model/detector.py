@@ -210,8 +210,9 @@ class GraspDetector:
                     logits = ranking.average_similar_hands(logits, sample, scene, gripper)
                 contact = sample.candidates.contact_index
                 rating, score = self._scores(scene, contact, expit(logits))
-                ordering = score, rating, gripper, options, counts
-                rows, outcome = ranking.select(scene, sample, *ordering)
+                rows, outcome = ranking.select(
+                    scene, sample, score, rating, gripper, options, counts
+                )
                 best, free = sample.candidates.take(rows), sample.collision_free[rows]
                 grasps = ranking.grasps_in_cloud(scene, best, gripper, score[rows], free)
             if options.debug and scene is not None:

@@ -29,7 +29,7 @@ from edgegrasp_model.options import (
 )
 from edgegrasp_model.ranking import COLLISION_FACTOR, objects_first, ranked
 from edgegrasp_model.results import OBSTACLE, Following
-from edgegrasp_model.scene.cloud import pose_matrix, subsample
+from edgegrasp_model.scene.cloud import pose_matrix, subsample, unit
 from edgegrasp_model.scene.scene import Scene, numbers_chosen
 from edgegrasp_model.scene.segment import BACKGROUND, UNDECIDED
 from edgegrasp_results import Evaluation, Grasp, Tracking
@@ -84,10 +84,9 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
     apart = np.asarray(cKDTree(some).query(np.array(places))[0])
     if options.viewpoint is not None:  # what is out of view may be anywhere near the camera
         eye = np.reshape(options.viewpoint, (-1, 3)).mean(axis=0)
-        sights, distance = some - eye, np.linalg.norm(places - eye, axis=1, keepdims=True)
-        sights /= np.maximum(np.linalg.norm(sights, axis=1, keepdims=True), 1e-9)
-        aside, _ = cKDTree(sights).query((places - eye) / np.maximum(distance, 1e-9))
-        apart[(aside > OUT_OF_VIEW_ANGLE) & (distance[:, 0] < MAX_VIEW_DISTANCE)] = 0.0
+        aside, _ = cKDTree(unit(some - eye)).query(unit(places - eye))
+        distance = np.linalg.norm(places - eye, axis=1)
+        apart[(aside > OUT_OF_VIEW_ANGLE) & (distance < MAX_VIEW_DISTANCE)] = 0.0
     if (away := float(np.min(apart))) > MAX_FRAME_DISTANCE:
         value = f"grasps {away:.2g} m from the nearest point of the cloud"
         fix = "Send previous in the frame of this cloud, or leave it out."

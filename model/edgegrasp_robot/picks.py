@@ -325,8 +325,12 @@ class _Arm:
         path = core.JointPath()
         path.joint_names, path.positions = self._robot.joint_names, list(joints)
         mode = SplineFittingMode.Cubic if straight else SplineFittingMode.Adaptive
-        scales = {"velocity_scale": LIMIT_SHARE, "acceleration_scale": LIMIT_SHARE}
-        options = TOPPRAOptions(dt=STEP_SECONDS, mode=mode, **scales)
+        options = TOPPRAOptions(
+            dt=STEP_SECONDS,
+            mode=mode,
+            velocity_scale=LIMIT_SHARE,
+            acceleration_scale=LIMIT_SHARE,
+        )
         try:
             found = PathParameterizerTOPPRA(scene, GROUP).generate(path, options)
         except RuntimeError:

@@ -320,6 +320,13 @@ def test_an_object_alone_in_a_cameras_frame_is_not_grasped_from_below(
     assert max(grasp.approach_direction @ pose[2] for grasp in found.grasps[:10]) < 0.3
 
 
+def test_a_cloud_without_a_camera_may_have_no_points_at_its_middle() -> None:
+    points = seen_in_world([box((0, 0, 0.03), (0.03, 0.02, 0.03))], camera(0.7, -1.5, 0.6))
+    points = np.concatenate([np.add(points, (x, 0, 0)) for x in (-1.5, 1.5)])
+    found = detector().detect(points.astype(np.float32), parse_options({"num_candidates": 300}))
+    assert found.objects
+
+
 @pytest.mark.parametrize("count", [20_000, 8_000])
 def test_a_sparse_cloud_of_the_whole_view_shows_the_same_objects(count: int) -> None:
     boxes, T_world_camera = boxes_on_table(2), camera(0.8, -1.5, 0.6)

@@ -21,7 +21,9 @@ from edgegrasp_model.scene.cloud import (
     LARGE_IMAGE,
     MAX_VIEW_TANGENT,
     OUTLIER_PERCENT,
+    pose_matrix,
     subsample,
+    unit,
     usual_up,
 )
 
@@ -137,7 +139,7 @@ def range_image(
     """Render points as seen from a viewpoint."""
     downward = [way for way in (None if up is None else -up, down) if way is not None]
     apart = subsample(points).astype(np.float64) - viewpoint
-    sight = apart / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-9)
+    sight = unit(apart)
     # Rounded, so that the image is independent of the order of the points.
     turn = _camera_axes(sight.mean(axis=0).round(9), downward)
     for _ in range(2):
@@ -164,9 +166,7 @@ def range_image(
     if (times := min(round(pixel_size / finest), int(np.ceil(coarse)))) > 1:
         pixel_size /= times
         filled = _enlarged(filled[..., 2], times, corner, pixel_size)
-    T_cloud_camera = np.eye(4)
-    T_cloud_camera[:3, :3], T_cloud_camera[:3, 3] = turn.T, viewpoint
-    return RangeImage(filled, pixel_size, T_cloud_camera, corner)
+    return RangeImage(filled, pixel_size, pose_matrix(turn.T, viewpoint), corner)
 
 
 def _camera_axes(sight: Float64, downward: list[Float64]) -> Float64:

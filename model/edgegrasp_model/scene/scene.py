@@ -229,13 +229,14 @@ def _segmentation(
 
 
 def _segment_from_above(points: Float32, up: Float64 | None) -> Segmentation:
-    """Segment points (N, 3) as seen from above their middle, in an image that turns with them.
+    """Segment points (N, 3) as seen from above the middle one, in an image that turns with them.
 
     Points farther away than OVERVIEW_RADIUS stay undecided: a room is seen too small.
     """
     over = np.array([0.0, 0.0, 1.0]) if up is None else up
     beside = points - np.median(points, axis=0)
     beside -= (beside @ over)[:, None] * over
+    beside -= beside[np.linalg.norm(beside, axis=1).argmin()]  # there may be none at the median
     near = np.linalg.norm(beside, axis=1) < OVERVIEW_RADIUS
     some = points[near]
     low, high = np.percentile(some, (1, 99), axis=0)
@@ -355,8 +356,7 @@ def _projection(sent: CheckedCloud, eyes: Float64 | None, frame: CanonicalFrame)
     row, (height, width) = subsample(sent.row, 1000), sent.image_size
     x = (2 * (row % width) + 1)[:, None] / width - 1
     y = (2 * (row // width) + 1)[:, None] / height - 1
-    sight = frame.points(subsample(sent.points, 1000)) - eyes
-    sight /= np.maximum(np.linalg.norm(sight, axis=1, keepdims=True), 1e-9)
+    sight = unit(frame.points(subsample(sent.points, 1000)) - eyes)
     none = np.zeros_like(sight)
     equations = np.block([[sight, none, -x * sight], [none, sight, -y * sight]])
     P = np.linalg.eigh(equations.T @ equations)[1][:, 0].reshape(3, 3)

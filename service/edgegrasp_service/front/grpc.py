@@ -387,9 +387,9 @@ async def _answer(service: GraspService, stream: Call, request: dict[str, Any]) 
 
 
 def _timeout(request: dict[str, Any]) -> float:
-    """The timeout in seconds; raises InvalidRequest for one that is not positive."""
+    """The timeout in seconds; raises InvalidRequest unless it is positive and finite, or absent."""
     timeout: float = struct.unpack("<d", request["timeout"])[0]
-    if not timeout > 0.0:
+    if request["timeout"] is not FOREVER and not 0.0 < timeout < math.inf:
         raise InvalidRequest("timeout", str(timeout), "Send seconds, or leave it out.")
     return timeout
 
