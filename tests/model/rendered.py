@@ -58,10 +58,12 @@ def to_world(T_world_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
 
 
-def render(boxes: list[SolidBox], T_world_camera: np.ndarray, seed: int = 0) -> np.ndarray:
+def render(
+    boxes: list[SolidBox], T_world_camera: np.ndarray, seed: int = 0, zoom: float = 1.0
+) -> np.ndarray:
     """The organised cloud (HEIGHT, WIDTH, 3) in the camera's frame, NaN where nothing is seen."""
     row, column = np.indices((HEIGHT, WIDTH))
-    x, y = (column - WIDTH / 2) / FOCAL_LENGTH, (row - HEIGHT / 2) / FOCAL_LENGTH
+    x, y = np.array([column - WIDTH / 2, row - HEIGHT / 2]) / (FOCAL_LENGTH * zoom)
     rays = np.stack([x, y, np.ones((HEIGHT, WIDTH))], axis=-1).reshape(-1, 3)
     in_world, eye = rays @ T_world_camera[:3, :3].T, T_world_camera[:3, 3]
     depth = np.full(len(rays), np.inf)

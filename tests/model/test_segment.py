@@ -113,6 +113,16 @@ def test_background_around_them_makes_no_other_objects(seed: int, around: set[st
         assert grasp.object in {each.number for each in crowded.objects}
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_larger_than_the_pixels_hides_no_object(seed: int) -> None:
+    rng, pose = np.random.default_rng(seed), camera(0.8, -1.5, 0.85)
+    boxes = [box((x, rng.uniform(-0.03, 0.03), 0.03), (0.02, 0.04, 0.03)) for x in (-0.07, 0.07)]
+    image = render([table(), *boxes], pose, zoom=3.0)
+    found = detect(image + rng.normal(0.0, 0.001, image.shape).astype(np.float32))
+    assert standing(found, boxes, pose) == {0, 1}
+    assert_grasped(found, boxes, pose)
+
+
 @pytest.mark.parametrize("polar", [0.05, 0.4])
 @pytest.mark.parametrize("height", [0.045, 0.12])
 def test_a_bin_has_contents_and_no_rims(polar: float, height: float) -> None:

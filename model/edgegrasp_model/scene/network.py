@@ -114,7 +114,8 @@ NEAREST_DEPTH = 0.05  # metres from the viewpoint
 DENSITY_CELLS = 40  # cells across the view in which the density of points is measured
 PIXEL_SPACING = 1.25  # side of a pixel, in distances of sparse points, so that few stay empty
 MAX_HOLE_SPACING = 1.6  # pixels between points up to which holes are filled by interpolation
-MAX_PIXEL_SIZE = 0.003  # metres at the median depth; larger pixels are divided
+# Metres at the median depth: smaller pixels show noise, and larger ones are divided.
+MIN_PIXEL_SIZE, MAX_PIXEL_SIZE = 0.0015, 0.003
 MAX_POINTS_PER_PIXEL = 2  # more add nothing
 SURFACE_DEPTH = 0.02  # metres; a point nearer by this much hides another of the same pixel
 NORMAL_STRIDE = 2  # pixels from each pixel to the neighbours that give its normal
@@ -155,15 +156,17 @@ def range_image(
     place = ((ahead[:, :2] / ahead[:, 2:] - low) / cell).astype(np.int64)
     occupied = len(np.unique(place[:, 0] * 4096 + place[:, 1])) * cell * cell
     spacing = float(np.sqrt(occupied / len(points)))
-    pixel_size = finest if spacing < MAX_HOLE_SPACING * finest else PIXEL_SPACING * spacing
+    depth = max(float(np.median(in_view[:, 2])), NEAREST_DEPTH)
+    dense = spacing < MAX_HOLE_SPACING * finest
+    pixel_size = max(finest, MIN_PIXEL_SIZE / depth) if dense else PIXEL_SPACING * spacing
     pixels = (high - low) / pixel_size
     width, height = (int(np.ceil(side / SIDE_MULTIPLE)) * SIDE_MULTIPLE for side in pixels)
     middle = (low + high) / 2
     corner = middle - pixel_size * np.array([width, height]) / 2
     some = subsample(points, MAX_POINTS_PER_PIXEL * width * height)
     filled = _fill_holes(_render(some, viewpoint, turn, corner, pixel_size, (height, width)))
-    coarse = float(np.median(in_view[:, 2])) * pixel_size / MAX_PIXEL_SIZE
-    if (times := min(round(pixel_size / finest), int(np.ceil(coarse)))) > 1:
+    coarse = int(np.ceil(depth * pixel_size / MAX_PIXEL_SIZE))
+    if (times := min(round(pixel_size / finest), coarse)) > 1:
         pixel_size /= times
         filled = _enlarged(filled[..., 2], times, corner, pixel_size)
     return RangeImage(filled, pixel_size, pose_matrix(turn.T, viewpoint), corner)
