@@ -11,7 +11,7 @@ from tests.checks import bounded_memory, refusal
 
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.results import SUPPORT
-from edgegrasp_model.scene.cloud import CloudInput, check_cloud
+from edgegrasp_model.scene.cloud import CloudInput, check_cloud, voxelise
 from edgegrasp_model.scene.scene import build_scene, select_points
 from edgegrasp_model.scene.segment import BACKGROUND, Segmentation
 from edgegrasp_model.scene.support import ViewedPoints, find_support, heights_over
@@ -121,6 +121,15 @@ def test_noise_larger_than_the_pixels_hides_no_object(seed: int) -> None:
     found = detect(image + rng.normal(0.0, 0.001, image.shape).astype(np.float32))
     assert standing(found, boxes, pose) == {0, 1}
     assert_grasped(found, boxes, pose)
+
+
+@pytest.mark.parametrize("seed", [3, 8])
+def test_a_voxel_downsampled_cloud_without_a_viewpoint_keeps_its_objects(seed: int) -> None:
+    boxes, pose = boxes_on_table(seed), view(np.random.default_rng(seed))
+    cloud = seen_in_world([table(1.0, 0.8), *boxes, *FURNISHINGS["floor"]], pose)
+    found = detector().detect(voxelise(cloud, 0.004).mean(cloud))
+    assert standing(found, boxes, np.eye(4)) == {0, 1, 2, 3}
+    assert_grasped(found, boxes, np.eye(4))
 
 
 @pytest.mark.parametrize("polar", [0.05, 0.4])

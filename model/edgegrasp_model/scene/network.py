@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from edgegrasp_camera.arrays import Float32, Float64
+from edgegrasp_camera.arrays import Bools, Float32, Float64
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.scene.cloud import (
     LARGE_IMAGE,
@@ -114,6 +114,8 @@ NEAREST_DEPTH = 0.05  # metres from the viewpoint
 DENSITY_CELLS = 40  # cells across the view in which the density of points is measured
 PIXEL_SPACING = 1.25  # side of a pixel, in distances of sparse points, so that few stay empty
 MAX_HOLE_SPACING = 1.6  # pixels between points up to which holes are filled by interpolation
+MIN_FILLED = 0.93  # of the pixels between two that show something
+COARSER, MAX_COARSENINGS = 1.5, 3  # times as large are pixels of which fewer are filled
 # Metres at the median depth: smaller pixels show noise, and larger ones are divided.
 MIN_PIXEL_SIZE, MAX_PIXEL_SIZE = 0.0015, 0.003
 MAX_POINTS_PER_PIXEL = 2  # more add nothing
@@ -159,12 +161,11 @@ def range_image(
     depth = max(float(np.median(in_view[:, 2])), NEAREST_DEPTH)
     dense = spacing < MAX_HOLE_SPACING * finest
     pixel_size = max(finest, MIN_PIXEL_SIZE / depth) if dense else PIXEL_SPACING * spacing
-    pixels = (high - low) / pixel_size
-    width, height = (int(np.ceil(side / SIDE_MULTIPLE)) * SIDE_MULTIPLE for side in pixels)
-    middle = (low + high) / 2
-    corner = middle - pixel_size * np.array([width, height]) / 2
-    some = subsample(points, MAX_POINTS_PER_PIXEL * width * height)
-    filled = _fill_holes(_render(some, viewpoint, turn, corner, pixel_size, (height, width)))
+    for coarsening in range(MAX_COARSENINGS + 1):
+        filled, corner = _draw(points, viewpoint, turn, (low, high), pixel_size)
+        if coarsening == MAX_COARSENINGS or _share_filled(~np.isnan(filled[..., 2])) > MIN_FILLED:
+            break
+        pixel_size *= COARSER
     coarse = int(np.ceil(depth * pixel_size / MAX_PIXEL_SIZE))
     if (times := min(round(pixel_size / finest), coarse)) > 1:
         pixel_size /= times
@@ -195,6 +196,25 @@ def _view(points: Float64) -> tuple[Float64, Float64]:
     edge = 0.02 * (high - low) + 1e-3
     low, high = np.maximum(low - edge, -MAX_VIEW_TANGENT), np.minimum(high + edge, MAX_VIEW_TANGENT)
     return low.round(9), high.round(9)
+
+
+def _draw(
+    points: Float32, viewpoint: Float64, turn: Float64, ends: tuple[Float64, Float64], pixel: float
+) -> tuple[Float32, Float64]:
+    """The image (H, W, 3) between `ends` of the view, `pixel` wide at a depth of 1, and corner."""
+    low, high = ends
+    sides = (high - low) / pixel
+    width, height = (int(np.ceil(side / SIDE_MULTIPLE)) * SIDE_MULTIPLE for side in sides)
+    corner = (low + high) / 2 - pixel * np.array([width, height]) / 2
+    some = subsample(points, MAX_POINTS_PER_PIXEL * width * height)
+    return _fill_holes(_render(some, viewpoint, turn, corner, pixel, (height, width))), corner
+
+
+def _share_filled(seen: Bools) -> float:
+    """Share of the pixels (H, W) between two that show something that do so as well."""
+    beside, above = seen[:, :-2] & seen[:, 2:], seen[:-2] & seen[2:]
+    both = np.count_nonzero(beside & seen[:, 1:-1]) + np.count_nonzero(above & seen[1:-1])
+    return both / max(np.count_nonzero(beside) + np.count_nonzero(above), 1)
 
 
 def _enlarged(depth: Float32, times: int, corner: Float64, pixel_size: float) -> Float32:
