@@ -525,7 +525,7 @@ def chosen_support(background: np.ndarray, objects: np.ndarray, camera: object) 
     seen = ViewedPoints(points.astype(np.float32), np.array(camera))
     inside = np.ones(len(points), bool)
     warnings: list[str] = []
-    return find_support(seen, inside, shown, number == 0, parse_options({}), warnings), warnings
+    return find_support(seen, inside, shown, parse_options({}), warnings), warnings
 
 
 @pytest.mark.parametrize("seed", range(4))

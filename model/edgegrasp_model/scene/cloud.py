@@ -58,6 +58,24 @@ class CheckedCloud:
         points = self.points.take(place, axis=0)  # many times faster than indexing
         return replace(self, points=points, row=self.row[place], **arrays)
 
+    def projection(self, frame: "CanonicalFrame", eyes: Float64 | None) -> Float64 | None:
+        """The projection (3, 4) of canonical points into the image of one camera that was sent.
+
+        By direct linear transformation; None without such an image. `eyes` (W, 3) are the cameras,
+        canonical frame.
+        """
+        if self.image_size is None or eyes is None or len(eyes) > 1:
+            return None
+        row, (height, width) = subsample(self.row, 1000), self.image_size
+        x = (2 * (row % width) + 1)[:, None] / width - 1
+        y = (2 * (row // width) + 1)[:, None] / height - 1
+        sight = unit(frame.points(subsample(self.points, 1000)) - eyes)
+        none = np.zeros_like(sight)
+        equations = np.block([[sight, none, -x * sight], [none, sight, -y * sight]])
+        P = np.linalg.eigh(equations.T @ equations)[1][:, 0].reshape(3, 3)
+        P *= np.sign((sight @ P[2]).sum())
+        return np.column_stack([P, -P @ eyes[0]])
+
 
 def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False) -> CheckedCloud:
     """Check a caller's CloudInput or array of points, and drop the holes of an organised one.
@@ -272,8 +290,11 @@ class Voxels(NamedTuple):
         return np.asarray(tally.indices[order[tally.indptr[1:] - 1]] + low, dtype=np.int64)
 
 
-def voxelise(points: Floats, voxel_size: float) -> Voxels:
-    """Sort points (N, 3) into voxels with edges of `voxel_size` metres."""
+def voxelise(points: Floats, voxel_size: float, most: float = math.inf) -> Voxels:
+    """Sort points (N, 3) into voxels with edges of `voxel_size` metres.
+
+    InvalidRequest: there are more than `most`.
+    """
     # Axis by axis is three times as fast as all at once.
     cells = [((axis - float(axis.min())) / voxel_size).astype(np.int64) for axis in points.T]
     # Stored cube by cube, so that loops over hands skip many distant points at a time.
@@ -283,6 +304,14 @@ def voxelise(points: Floats, voxel_size: float) -> Voxels:
     for cell in cells:
         keys = keys * CUBE_VOXELS + cell % CUBE_VOXELS
     _, voxel, count = np.unique(keys, return_inverse=True, return_counts=True)
+    if len(count) > most:
+        size = " x ".join(f"{length:.2g}" for length in np.ptp(points, axis=0))
+        raise InvalidRequest(
+            "options.workspace",
+            f"{len(count)} voxels of {1000 * voxel_size:g} mm around objects, in {size} m",
+            "Send a workspace around the objects, or a support plane: at most "
+            f"{most} are accepted, fewer where the deadline is near.",
+        )
     return Voxels(voxel, count)
 
 
@@ -300,6 +329,34 @@ def inliers_and_neighbours(points: Float32) -> tuple[Bools, Int64]:
         return np.ones(len(points), dtype=bool), np.asarray(row)
     mean = np.asarray(distance)[:, 1 : OUTLIER_NEIGHBORS + 1].mean(axis=1)
     return mean <= mean.mean() + OUTLIER_DEVIATIONS * mean.std(), np.asarray(row)
+
+
+def clean_cloud(
+    sent: CheckedCloud,  # N points
+    voxels: Voxels,  # of these points
+    middles: Float32,  # (V, 3) the voxels' mean points, canonical frame, metres
+    frame: "CanonicalFrame",
+    eyes: Float64 | None,  # (W, 3) the cameras, canonical frame
+) -> tuple["Cloud", Bools]:
+    """The voxels without outliers, and a mask (V,) of them.
+
+    Normals are as given, else estimated and turned to the camera: without one, to a place one metre
+    above the middle.
+    """
+    kept, near = inliers_and_neighbours(middles)
+    points, normals = middles[kept], smallest_variance_directions(middles, near)[kept]
+    seen_from = (points.min(axis=0) + points.max(axis=0)) / 2 + UP
+    if eyes is not None:
+        seen_from = eyes.astype(np.float32)
+        if len(eyes) > 1 and sent.view_ids is not None:
+            seen_from = seen_from[voxels.commonest(sent.view_ids)[kept]]
+    away = np.einsum("nd,nd->n", normals, seen_from - points) < 0
+    normals = np.where(away[:, None], -normals, normals)
+    if sent.normals is not None:
+        given = frame.directions(voxels.mean(unit(sent.normals))[kept])
+        none = np.linalg.norm(given, axis=1) < MIN_LENGTH  # opposite ones in a voxel
+        normals = np.where(none[:, None], normals, unit(given)).astype(np.float32)
+    return Cloud(points, normals), kept
 
 
 @compiled("contract")

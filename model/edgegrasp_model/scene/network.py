@@ -21,7 +21,6 @@ from edgegrasp_model.scene.cloud import (
     LARGE_IMAGE,
     MAX_VIEW_TANGENT,
     OUTLIER_PERCENT,
-    pose_matrix,
     subsample,
     unit,
     usual_up,
@@ -128,7 +127,7 @@ class RangeImage(NamedTuple):
 
     points: Float32  # (H, W, 3) metres; NaN where nothing was seen
     footprint: float  # metres, width of a pixel at a depth of one metre
-    T_cloud_camera: Float64  # (4, 4)
+    turn: Float64  # (3, 3) rows: the camera's axes in the cloud's frame
     corner: Float64  # (2,) x / z and y / z of the upper left corner
 
 
@@ -137,10 +136,10 @@ def range_image(
     viewpoint: Float64,  # (3,) of the camera
     up: Float64 | None,  # (3,) away from gravity, drawn upward; None: unknown
     # (3,) downward in the image if `up` is unknown or along the sight; None: by the usual frames
-    down: Float64 | None = None,
+    down: Float64 | None,
 ) -> RangeImage:
     """Render points as seen from a viewpoint."""
-    downward = [way for way in (None if up is None else -up, down) if way is not None]
+    downward = [*([] if up is None else [-up]), *([] if down is None else [unit(down)])]
     apart = subsample(points).astype(np.float64) - viewpoint
     sight = unit(apart)
     # Rounded, so that the image is independent of the order of the points.
@@ -170,7 +169,7 @@ def range_image(
     if (times := min(round(pixel_size / finest), coarse)) > 1:
         pixel_size /= times
         filled = _enlarged(filled[..., 2], times, corner, pixel_size)
-    return RangeImage(filled, pixel_size, pose_matrix(turn.T, viewpoint), corner)
+    return RangeImage(filled, pixel_size, turn, corner)
 
 
 def _camera_axes(sight: Float64, downward: list[Float64]) -> Float64:

@@ -30,30 +30,23 @@ from edgegrasp_model.options import (
 )
 from edgegrasp_model.results import OBSTACLE, SUPPORT, UNLABELLED
 from edgegrasp_model.scene.cloud import (
-    MIN_LENGTH,
     UP,
     CanonicalFrame,
     CheckedCloud,
     Cloud,
     Voxels,
-    inliers_and_neighbours,
+    clean_cloud,
     inside_workspace,
-    smallest_variance_directions,
-    subsample,
     unit,
     voxelise,
 )
 from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.segment import (
     BACKGROUND,
-    MIN_CONFIDENCE,
     UNDECIDED,
     Segmentation,
-    confidences,
-    segment,
-    segment_views,
-    with_clusters,
-    with_raised_points,
+    objects_above,
+    segment_cloud,
     without_long,
 )
 from edgegrasp_model.scene.support import (
@@ -66,15 +59,11 @@ from edgegrasp_model.scene.support import (
 )
 from edgegrasp_model.unseen import DepthMap
 
-MIN_VOXELS = 4  # of a surface
 SIDE_DEPTH = 0.006  # metres from a side of the workspace within which an object may be cut off
-OVERVIEW_RADIUS = 0.7  # metres around the middle of a cloud, if no camera is known
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 HAND_REACH = 0.25  # metres around an object in which a hand at it may collide
 FOLLOWED_REACH = 0.16  # the same if only known grasps are checked
-MIN_CAMERA_DISTANCE = 0.06  # metres; no camera measures closer
 FOUND_PLANE_CLEARANCE = 0.0015  # metres that hands stay above a plane that was not given
-CROPPED_CONFIDENCE = 0.95  # of clusters in a cloud that was cropped above its support
 MAX_NEAR_DISTANCE = 0.1  # metres from `near` to the object that it names
 MAX_AT_DISTANCE = 0.02  # from `at` to its object, as a share of the image's width
 
@@ -135,7 +124,7 @@ def select_points(
     warnings: list[str],
 ) -> SelectedPoints:
     """Correct depths, segment, remove the support, and drop what no hand at an object can reach."""
-    viewpoints = camera_positions(sent, options)
+    viewpoints, given = camera_positions(sent, options), _objects_given(sent, options)
     for name in ("approach_region", "contact_region"):
         if (region := getattr(options, name)) is not None:
             check_region(region, sent, name)
@@ -148,14 +137,16 @@ def select_points(
         sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
-    seen = ViewedPoints(sent.points, None if viewpoints is None else viewpoints.mean(axis=0))
-    segmentation = _segmentation(sent, viewpoints, options)
     # The caller's segments, 0 and below meaning none; else all points are one object.
-    number, ids = np.zeros(len(sent.points), dtype=np.int64), sent.segment_ids
-    if ids is not None:
-        number = np.where(ids > 0, ids, UNDECIDED)
-    objects = (number if ids is not None or segmentation is None else segmentation.number) >= 0
-    support = find_support(seen, inside, segmentation, objects, options, warnings)
+    number, found = np.zeros(len(sent.points), dtype=np.int64), None
+    if sent.segment_ids is not None:
+        number = np.where(sent.segment_ids > 0, sent.segment_ids, UNDECIDED)
+    needed = isinstance(options.support, AutoPlane) or (options.support is not None and not given)
+    if needed and len(sent.points) > 0:
+        found = segment_cloud(sent, viewpoints, options.known_up)
+        found = found if sent.segment_ids is None else found._replace(number=number)
+    seen = ViewedPoints(sent.points, None if viewpoints is None else viewpoints.mean(axis=0))
+    support = find_support(seen, inside, found, options, warnings)
     above_all = np.ones(len(inside), np.float32), np.zeros(len(inside), np.float32)
     height, margin = above_all if support is None else support.heights(seen)
     labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
@@ -165,14 +156,14 @@ def select_points(
     counts["above_support"] = int(inside.sum())
     plan = (support.frame.points(sent.points) if support else sent.points.astype(np.float64))[:, :2]
     number, confidence = number[above], dict[int, float]()
-    if not _objects_given(sent, options):
-        if segmentation is not None:
-            number, confidence = _objects_above(segmentation, support, above, plan, height, margin)
-        if support is None and (viewpoints is None or not (number >= 0).any()):
-            # All are one object, unless they lie nearer than any camera measures.
-            farthest = np.inf if viewpoints is None else seen.distance().max(initial=0.0)
-            whole = BACKGROUND if farthest < MIN_CAMERA_DISTANCE else 0
-            number, confidence = np.full_like(number, whole), {}
+    if found is not None and not given:
+        if support is not None:
+            over = height[above], margin[above], math.isnan(support.growth)
+            number, certain = objects_above(found, above, plan, *over)
+            confidence = dict(enumerate(certain.tolist()))
+        elif viewpoints is not None and (found.number[above] >= 0).any():
+            number, confidence = found.number, dict(enumerate(found.confidence.tolist()))
+    if not given:
         number = without_long(number, sent.points, options.max_object_size)
         if counts["above_support"] and not (inside & (number >= 0)).any():
             warnings.append(
@@ -186,8 +177,15 @@ def select_points(
         number = chosen_objects(number, sent, options, warnings)
     kept = near_objects_along(plan, number)
     near, number = sent.take(kept), number[kept]
-    up = _up(options, seen, support, None if viewpoints is None else segmentation)
+    up = _up(options, seen, support, None if viewpoints is None else found)
     return SelectedPoints(near, number, support, up, viewpoints, labels, confidence, corrected)
+
+
+def _objects_given(sent: CheckedCloud, options: DetectOptions) -> bool:
+    """Whether the caller defines the objects: by segments, by rows, or as one object."""
+    regions = options.approach_region, options.contact_region
+    by_rows = any(isinstance(shape, Rows) for one in regions if one for shape in one.include)
+    return sent.segment_ids is not None or by_rows or options.objects == "off"
 
 
 def labels_of_all_pixels(sent: CheckedCloud, labels: Int64) -> Int64:
@@ -198,82 +196,6 @@ def labels_of_all_pixels(sent: CheckedCloud, labels: Int64) -> Int64:
     kept = labels.reshape(height, width)[:: sent.step, :: sent.step]
     wide = kept.repeat(sent.step, axis=0).repeat(sent.step, axis=1)
     return np.ascontiguousarray(wide[:height, :width]).reshape(-1)
-
-
-def _objects_given(sent: CheckedCloud, options: DetectOptions) -> bool:
-    """Whether the caller defines the objects: by segments, by rows, or as one object."""
-    regions = options.approach_region, options.contact_region
-    by_rows = any(isinstance(shape, Rows) for one in regions if one for shape in one.include)
-    return sent.segment_ids is not None or by_rows or options.objects == "off"
-
-
-def _segmentation(
-    sent: CheckedCloud, viewpoints: Float64 | None, options: DetectOptions
-) -> Segmentation | None:
-    """The network's segmentation of the points; None if it is not needed."""
-    needed = isinstance(options.support, AutoPlane) or not _objects_given(sent, options)
-    if len(sent.points) == 0 or options.support is None or not needed:
-        return None
-    points, up, down = sent.points, options.known_up, None
-    if viewpoints is None:
-        return _segment_from_above(points, up)
-    if len(viewpoints) > 1:
-        assert sent.view_ids is not None
-        return segment_views(points, viewpoints, sent.view_ids, up)
-    if sent.image_size is not None:
-        row = subsample(sent.row, 5000) // sent.image_size[1]
-        sight = unit(subsample(points, 5000) - viewpoints[0])
-        down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
-        down = unit(down) if down.any() else None
-    return segment(points, viewpoints[0], up, down)
-
-
-def _segment_from_above(points: Float32, up: Float64 | None) -> Segmentation:
-    """Segment points (N, 3) as seen from above the middle one, in an image that turns with them.
-
-    Points farther away than OVERVIEW_RADIUS stay undecided: a room is seen too small.
-    """
-    over = np.array([0.0, 0.0, 1.0]) if up is None else up
-    beside = points - np.median(points, axis=0)
-    beside -= (beside @ over)[:, None] * over
-    beside -= beside[np.linalg.norm(beside, axis=1).argmin()]  # there may be none at the median
-    near = np.linalg.norm(beside, axis=1) < OVERVIEW_RADIUS
-    some = points[near]
-    low, high = np.percentile(some, (1, 99), axis=0)
-    eye = (low + high) / 2 + max(1.0, 1.5 * float((high - low).max())) * over
-    apart = some - some.mean(axis=0)
-    down = unit(apart[np.linalg.norm(apart, axis=1).argmax()]).astype(np.float64)
-    found = segment(some, eye, up, down)
-    number, (objects, support) = np.full(len(points), UNDECIDED), np.zeros((2, len(points)), "f4")
-    number[near], objects[near], support[near] = found.number, found.object, found.support
-    return Segmentation(number, objects, support, found.confidence, found.up)
-
-
-def _objects_above(
-    segmentation: Segmentation,  # of N points
-    support: Support | None,
-    above: Int64,  # (M,) which of them rise above the support
-    plan: Float64,  # (M, 2) places along it, metres
-    height: Float32,  # (N,) metres over it
-    margin: Float32,  # (N,) metres over it that belong to it
-) -> tuple[Int64, dict[int, float]]:
-    """The object (M,) of each point above the support, and the confidence of each object."""
-    number = segmentation.number[above]
-    confidence = dict(enumerate(segmentation.confidence.tolist()))
-    if support is not None:
-        likely = (segmentation.object + segmentation.support)[above] > MIN_CONFIDENCE
-        number = with_raised_points(number, plan, height[above], margin[above], likely)
-        cut_off = math.isnan(support.growth)
-        if cut_off or not (number >= 0).any():
-            first = len(confidence)
-            number = with_clusters(number, plan, likely | cut_off, first)
-            new = np.flatnonzero(number >= first)
-            which = number[new] - first
-            mean = np.bincount(which, segmentation.object[above[new]]) / np.bincount(which)
-            certain = np.full(len(mean), CROPPED_CONFIDENCE) if cut_off else confidences(mean)
-            confidence |= enumerate(certain.tolist(), first)
-            number[new[certain[which] <= MIN_CONFIDENCE]] = BACKGROUND
-    return number, confidence
 
 
 def build_scene(
@@ -294,16 +216,12 @@ def build_scene(
         return None
     eye = None if viewpoints is None else viewpoints[0]
     frame = CanonicalFrame.of_scene(sent.points, selected.up, eye)
-    voxels = voxelise(canonical := frame.points(sent.points), voxel_size)
-    counts["voxels"] = len(voxels.size)
-    if counts["voxels"] > max_voxels:
-        raise _too_many_voxels(counts["voxels"], max_voxels, voxel_size, sent, options)
-    middles = voxels.mean(canonical)
     eyes = None if viewpoints is None else frame.points(viewpoints)
-    cloud, kept = _clean_cloud(sent, middles, voxels, frame, eyes)
-    counts["kept"] = int(kept.sum())
-    if cloud is None:
-        return None
+    projection = sent.projection(frame, eyes)
+    voxels = voxelise(canonical := frame.points(sent.points), voxel_size, max_voxels)
+    middles = voxels.mean(canonical)
+    cloud, kept = clean_cloud(sent, voxels, middles, frame, eyes)
+    counts |= {"voxels": len(kept), "kept": len(cloud.points)}
     in_cloud = frame.points_in_cloud(middles)
     number = voxels.commonest(selected.number)[kept]
     held = inside_workspace(in_cloud, options.workspace)[kept] & (number >= 0)
@@ -328,7 +246,7 @@ def build_scene(
         at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, sent.points),
         viewpoints=None if eyes is None else eyes.astype(np.float32),
         confidence=selected.confidence,
-        P_image_cloud=_projection(sent, eyes, frame),
+        P_image_cloud=projection,
         obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
         corrected=selected.corrected,
     )
@@ -342,68 +260,6 @@ def _plane_under_hands(plane: SupportPlane, frame: CanonicalFrame, spare: float)
     turned = frame.directions(normal) / length
     return SupportPlane.model_construct(
         normal=tuple(turned.tolist()), offset=float(foot @ turned) + spare
-    )
-
-
-def _projection(sent: CheckedCloud, eyes: Float64 | None, frame: CanonicalFrame) -> Float64 | None:
-    """The projection (3, 4) of canonical points into the image of one camera that was sent.
-
-    By direct linear transformation. None without such an image. `eyes` (W, 3) are the cameras,
-    canonical frame.
-    """
-    if sent.image_size is None or eyes is None or len(eyes) > 1:
-        return None
-    row, (height, width) = subsample(sent.row, 1000), sent.image_size
-    x = (2 * (row % width) + 1)[:, None] / width - 1
-    y = (2 * (row // width) + 1)[:, None] / height - 1
-    sight = unit(frame.points(subsample(sent.points, 1000)) - eyes)
-    none = np.zeros_like(sight)
-    equations = np.block([[sight, none, -x * sight], [none, sight, -y * sight]])
-    P = np.linalg.eigh(equations.T @ equations)[1][:, 0].reshape(3, 3)
-    P *= np.sign((sight @ P[2]).sum())
-    return np.column_stack([P, -P @ eyes[0]])
-
-
-def _clean_cloud(
-    sent: CheckedCloud,  # M points
-    middles: Float32,  # (V, 3) the voxels' mean points, canonical frame, metres
-    voxels: Voxels,
-    frame: CanonicalFrame,
-    eyes: Float64 | None,  # (W, 3) the cameras, canonical frame
-) -> tuple[Cloud | None, Bools]:
-    """The voxels without outliers, and a mask (V,) of them; no cloud if too few are left.
-
-    Normals are as given, else estimated and turned to the camera: without one, to a place one metre
-    above the middle.
-    """
-    kept, near = inliers_and_neighbours(middles)
-    if kept.sum() < MIN_VOXELS:
-        return None, kept
-    points, normals = middles[kept], smallest_variance_directions(middles, near)[kept]
-    seen_from = (points.min(axis=0) + points.max(axis=0)) / 2 + UP
-    if eyes is not None:
-        seen_from = eyes.astype(np.float32)
-        if len(eyes) > 1 and sent.view_ids is not None:
-            seen_from = seen_from[voxels.commonest(sent.view_ids)[kept]]
-    away = np.einsum("nd,nd->n", normals, seen_from - points) < 0
-    normals = np.where(away[:, None], -normals, normals)
-    if sent.normals is not None:
-        given = frame.directions(voxels.mean(unit(sent.normals))[kept])
-        none = np.linalg.norm(given, axis=1) < MIN_LENGTH  # opposite ones in a voxel
-        normals = np.where(none[:, None], normals, unit(given)).astype(np.float32)
-    return Cloud(points, normals), kept
-
-
-def _too_many_voxels(
-    count: int, most: int, voxel_size: float, sent: CheckedCloud, options: DetectOptions
-) -> InvalidRequest:
-    size = " x ".join(f"{length:.2g}" for length in np.ptp(sent.points, axis=0))
-    cropped = "no workspace" if options.workspace is None else "the workspace"
-    return InvalidRequest(
-        "options.workspace",
-        f"{cropped}, which leaves {count} voxels of {1000 * voxel_size:g} mm in {size} m",
-        "Send a workspace around the objects, or a support plane: at most "
-        f"{most} are accepted, fewer where the deadline is near.",
     )
 
 

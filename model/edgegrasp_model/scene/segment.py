@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.kernels import compiled
-from edgegrasp_model.scene.cloud import grid_cells, subsample, unit
+from edgegrasp_model.scene.cloud import CheckedCloud, grid_cells, subsample, unit
 from edgegrasp_model.scene.network import NEAREST_DEPTH, SceneNet, range_image, scene_features
 
 WEIGHTS = Path(__file__).with_name("network.safetensors")
@@ -38,6 +38,8 @@ POINT_REACH = 0.012  # metres from a point to an object, or to its pixel at a de
 MIN_RISE = 0.004  # metres above the support's margin, of points that are added to an object
 MIN_CLUSTER_CELLS, MIN_CELL_POINTS = 5, 4  # of cells POINT_REACH wide
 MIN_CONFIDENCE = 0.5  # of an object; below, it is background
+CROPPED_CONFIDENCE = 0.95  # of clusters in a cloud that was cropped above its support
+OVERVIEW_RADIUS = 0.7  # metres around the middle of a cloud, if no camera is known
 
 
 class Segmentation(NamedTuple):
@@ -80,63 +82,85 @@ def confidences(mean: Float64) -> Float64:
     return np.asarray(1.0 / (1.0 + np.exp(-(constant + factor * mean))))
 
 
+def segment_cloud(
+    cloud: CheckedCloud,  # N points
+    viewpoints: Float64 | None,  # (W, 3) of the cameras; None: they are unknown
+    up: Float64 | None,  # (3,) unit, away from gravity; None: unknown
+) -> Segmentation:
+    """Segment a cloud view by view; an object seen in several views gets one number."""
+    points = cloud.points
+    number, confidence, seen_up = np.full(len(points), UNDECIDED), np.empty(0), np.zeros(3)
+    objects, support = np.zeros((2, len(points)), dtype=np.float32)
+    views = _view_from_above(points, up) if viewpoints is None else _views(cloud, viewpoints)
+    for rows, viewpoint, down in views:
+        own = segment(points[rows], viewpoint, up, down)
+        number[rows] = np.where(own.number >= 0, own.number + len(confidence), own.number)
+        objects[rows], support[rows] = own.object, own.support
+        confidence = np.concatenate([confidence, own.confidence])
+        seen_up += own.up
+    if len(views) > 1:
+        number, confidence = merge_views(points, number, confidence)
+    return Segmentation(number, objects, support, confidence, unit(seen_up))
+
+
+class View(NamedTuple):
+    """What one camera sees of N points."""
+
+    rows: Int64 | slice  # of its points
+    viewpoint: Float64  # (3,)
+    down: Float64 | None  # (3,) downward in the image; None: unknown
+
+
+def _views(cloud: CheckedCloud, viewpoints: Float64) -> list[View]:
+    """The views of a cloud from its cameras (W, 3)."""
+    if len(viewpoints) > 1:
+        assert cloud.view_ids is not None
+        rows = [np.flatnonzero(cloud.view_ids == view) for view in range(len(viewpoints))]
+        return [View(*each, None) for each in zip(rows, viewpoints, strict=True) if len(each[0])]
+    down = None
+    if cloud.image_size is not None:
+        row = subsample(cloud.row, 5000) // cloud.image_size[1]
+        sight = unit(subsample(cloud.points, 5000) - viewpoints[0])
+        down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
+    return [View(slice(None), viewpoints[0], down)]
+
+
+def _view_from_above(points: Float32, up: Float64 | None) -> list[View]:
+    """The view of points (N, 3) from above the middle one, in an image that turns with them.
+
+    Points farther away than OVERVIEW_RADIUS stay undecided: a room is seen too small.
+    """
+    over = np.array([0.0, 0.0, 1.0]) if up is None else up
+    beside = points - np.median(points, axis=0)
+    beside -= (beside @ over)[:, None] * over
+    beside -= beside[np.linalg.norm(beside, axis=1).argmin()]  # there may be none at the median
+    near = np.flatnonzero(np.linalg.norm(beside, axis=1) < OVERVIEW_RADIUS)
+    some = points[near]
+    low, high = np.percentile(some, (1, 99), axis=0)
+    eye = (low + high) / 2 + max(1.0, 1.5 * float((high - low).max())) * over
+    apart = some - some.mean(axis=0)
+    down = apart[np.linalg.norm(apart, axis=1).argmax()].astype(np.float64)
+    return [View(near, eye, down)]
+
+
 def segment(
     points: Float32,  # (N, 3) cloud frame, metres
     viewpoint: Float64,  # (3,) of the camera that saw them
     up: Float64 | None,  # (3,) unit, away from gravity; None: unknown
-    down: Float64 | None = None,  # (3,) unit, downward in the image, used if `up` is unknown
+    down: Float64 | None,  # (3,) downward in the image, used if `up` is unknown
 ) -> Segmentation:
-    """Segment points seen by one camera."""
-    image = range_image(points, viewpoint, up, down)
-    turn, (network, _) = image.T_cloud_camera[:3, :3], shipped()
-    up_in_view = None if up is None else up @ turn
+    """Segment points seen by one camera; `up` is as long as pixels agree about it."""
+    image, (network, _) = range_image(points, viewpoint, up, down), shipped()
+    up_in_view = None if up is None else image.turn @ up
     features = scene_features(image.points, up_in_view, image.footprint)
     pixels, seen_up = run_network(network, features, image.points, image.footprint)
     of_pixel, mean = group_pixels(pixels)
     confidence = confidences(mean)
     likely = confidence > MIN_CONFIDENCE
     new = np.append(np.where(likely, np.cumsum(likely) - 1, BACKGROUND), [UNDECIDED, BACKGROUND])
-    of_pixel = new[of_pixel]
-    number = np.full(len(points), UNDECIDED)
-    objects, support = np.zeros((2, len(points)), dtype=np.float32)
-    T_camera_cloud = np.linalg.inv(image.T_cloud_camera).astype(np.float64)
-    _label_points(
-        points,
-        T_camera_cloud,
-        image.corner,
-        2 * image.footprint,
-        pixels.points,
-        of_pixel,
-        pixels.classes,
-        number,
-        objects,
-        support,
-    )
-    return Segmentation(number, objects, support, confidence[likely], turn @ seen_up)
-
-
-def segment_views(
-    points: Float32,  # (N, 3) cloud frame, metres
-    viewpoints: Float64,  # (W, 3) of the cameras
-    view_ids: Int64,  # (N,) the camera that saw each point
-    up: Float64 | None,  # (3,) unit, away from gravity; None: unknown
-) -> Segmentation:
-    """Segment points view by view; an object seen in several views gets one number."""
-    number, seen_up = np.full(len(points), UNDECIDED), np.zeros(3)
-    objects, support = np.zeros((2, len(points)), dtype=np.float32)
-    confidence = np.empty(0)
-    for view in np.unique(view_ids):
-        rows = np.flatnonzero(view_ids == view)
-        own = segment(points[rows], viewpoints[view], up)
-        number[rows] = np.where(own.number >= 0, own.number + len(confidence), own.number)
-        objects[rows], support[rows] = own.object, own.support
-        confidence = np.concatenate([confidence, own.confidence])
-        seen_up += own.up * len(rows)
-    merged = merge_views(points, number, len(confidence))
-    best = np.zeros(int(merged.max(initial=-1)) + 1)
-    np.maximum.at(best, merged, confidence)
-    number = np.where(number >= 0, merged[np.maximum(number, 0)], number) if len(merged) else number
-    return Segmentation(number, objects, support, best, unit(seen_up))
+    eye = image.turn @ viewpoint
+    labels = _label_points(points, image.turn, eye, image.corner, pixels, new[of_pixel])
+    return Segmentation(*labels, confidence[likely], seen_up @ image.turn)
 
 
 def run_network(
@@ -145,7 +169,7 @@ def run_network(
     points: Float32,  # (H, W, 3) camera frame, metres; NaN where nothing was seen
     footprint: float,  # width of a pixel at a depth of one metre, metres
 ) -> tuple[Pixels, Float64]:
-    """A network's output for a range image, and its estimate of up (3,); camera frame."""
+    """A network's output for a range image, and its pixels' ways up, summed (3,); camera frame."""
     with torch.inference_mode(), one_thread():
         output = network(torch.from_numpy(features)[None])
         classes = output.classes[0].softmax(dim=0).contiguous().numpy()
@@ -156,7 +180,7 @@ def run_network(
     seen_up = ways[:, ~np.isnan(seen[..., 2])].sum(axis=1).astype(np.float64)
     if not seen_up.any():  # nothing was seen: assume toward the camera
         seen_up = np.array([0.0, 0.0, -1.0])
-    return Pixels(seen, classes, votes, links, 2 * footprint), unit(seen_up)
+    return Pixels(seen, classes, votes, links, 2 * footprint), seen_up
 
 
 @contextmanager
@@ -243,20 +267,48 @@ def _join_pixels(
         component[n] = root
 
 
-def merge_views(points: Float32, number: Int64, count: int) -> Int64:
-    """The new number (O,) of each object: those in the same place are joined."""
+def merge_views(points: Float32, number: Int64, confidence: Float64) -> tuple[Int64, Float64]:
+    """The numbers (N,) and confidences of objects (O,), those in the same place joined."""
     held = np.flatnonzero(number >= 0)
     if len(held) == 0:
-        return np.arange(count)
+        return number, confidence
     cell, points_in = grid_cells(points[held], VIEW_CELL)
-    shape = count, len(points_in)
+    shape = len(confidence), len(points_in)
     lies = coo_array((np.ones(len(held), dtype=np.int32), (number[held], cell)), shape).tocsr()
     lies.data[:] = 1
     shared = (lies @ lies.T).toarray()
     cells = np.diag(shared)
     same = shared >= MIN_VIEW_OVERLAP * np.maximum(np.minimum.outer(cells, cells), 1)
     same &= shared > 0
-    return np.asarray(connected_components(same, directed=False)[1])
+    count, merged = connected_components(same, directed=False)
+    number = number.copy()
+    number[held] = merged[number[held]]
+    best = np.zeros(count)
+    np.maximum.at(best, merged, confidence)
+    return number, best
+
+
+def objects_above(
+    found: Segmentation,  # of N points
+    above: Int64,  # (M,) which of them rise above the support
+    plan: Float64,  # (M, 2) places along it, metres
+    height: Float32,  # (M,) metres over it
+    margin: Float32,  # (M,) metres over it that belong to it
+    cut_off: bool,  # the cloud ends above the support
+) -> tuple[Int64, Float64]:
+    """The object (M,) of each point above the support, and the confidence (O,) of each object."""
+    likely = (found.object + found.support)[above] > MIN_CONFIDENCE
+    number = with_raised_points(found.number[above], plan, height, margin, likely)
+    if not cut_off and (number >= 0).any():
+        return number, found.confidence
+    first = len(found.confidence)
+    number = with_clusters(number, plan, likely | cut_off, first)
+    new = np.flatnonzero(number >= first)
+    which = number[new] - first
+    mean = np.bincount(which, found.object[above[new]]) / np.bincount(which)
+    certain = np.full(len(mean), CROPPED_CONFIDENCE) if cut_off else confidences(mean)
+    number[new[certain[which] <= MIN_CONFIDENCE]] = BACKGROUND
+    return number, np.concatenate([found.confidence, certain])
 
 
 def with_raised_points(
@@ -326,29 +378,32 @@ def without_long(number: Int64, points: Float32, max_size: float) -> Int64:
 
 @compiled("contract")
 def _label_points(
-    points: Float32,
-    T_camera_cloud: Float64,
-    corner: Float64,
-    pixel_size: float,
-    seen: Float32,
-    of_pixel: Int64,
-    classes: Float32,
-    number: Int64,
-    objects: Float32,
-    support: Float32,
-) -> None:
-    """Give each point the label of the nearest output pixel around it, if one is near enough."""
+    points: Float32,  # (N, 3) cloud frame, metres
+    turn: Float64,  # (3, 3) to the camera's frame
+    origin: Float64,  # (3,) the camera's place, in the directions of its frame
+    corner: Float64,  # (2,) of the image, as in `RangeImage`
+    pixels: Pixels,
+    of_pixel: Int64,  # (H, W) the object of each
+) -> tuple[Int64, Float32, Float32]:
+    """The labels (N,) of the nearest output pixel around each point, if one is near enough.
+
+    Its object, and its probabilities of an object and of a support.
+    """
+    seen, classes = pixels.points, pixels.classes
     rows, columns, _ = seen.shape
-    T, per_pixel = T_camera_cloud.astype(np.float32), np.float32(1.0 / pixel_size)
+    number = np.full(len(points), UNDECIDED)
+    objects, support = np.zeros((2, len(points)), np.float32)
+    T, t = turn.astype(np.float32), origin.astype(np.float32)
+    per_pixel = np.float32(1.0 / pixels.footprint)
     left, top = np.float32(corner[0]) * per_pixel, np.float32(corner[1]) * per_pixel
     reach = np.float32(POINT_REACH)
     for n in range(len(points)):
         a, b, c = points[n, 0], points[n, 1], points[n, 2]
-        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c - t[2]
         if z < NEAREST_DEPTH:
             continue
-        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
-        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
+        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c - t[0]
+        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c - t[1]
         per_metre = per_pixel / z
         u, v = x * per_metre - left, y * per_metre - top
         if u < 0 or v < 0 or u >= columns or v >= rows:
@@ -364,3 +419,4 @@ def _label_points(
         if row >= 0:
             number[n] = of_pixel[row, column]
             objects[n], support[n] = classes[2, row, column], classes[1, row, column]
+    return number, objects, support

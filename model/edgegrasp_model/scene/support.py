@@ -115,7 +115,6 @@ def find_support(
     seen: ViewedPoints,  # N points
     inside: Bools,  # (N,) which of them lie in the workspace
     segmentation: Segmentation | None,  # the network's output, where it was asked
-    objects: Bools,  # (N,) which of them are of an object
     options: DetectOptions,
     warnings: list[str],  # gets what is wrong with it, or that there is none
 ) -> Support | None:
@@ -135,9 +134,9 @@ def find_support(
             found = None if found is None or found.share < request.min_share else found
         else:
             assert segmentation is not None
-            found = _fit_support(seen, segmentation, objects, up, rng)
+            found = _fit_support(seen, segmentation, up, rng)
             if found is None:
-                found = _assume_support(seen, segmentation, objects, options)
+                found = _assume_support(seen, segmentation, options)
                 if found is not None:
                     warnings.append(
                         "no support plane is seen: one is assumed under the lowest points. Send "
@@ -186,12 +185,12 @@ def _given_support(
 def _fit_support(
     seen: ViewedPoints,
     segmentation: Segmentation,
-    objects: Bools,
     up: Float64 | None,
     rng: np.random.Generator,
 ) -> Support | None:
     """The plane of the points classified as support, weighted toward those near objects."""
-    on, held = np.flatnonzero(segmentation.support > 0.5), np.flatnonzero(objects)
+    on = np.flatnonzero(segmentation.support > 0.5)
+    held = np.flatnonzero(segmentation.number >= 0)
     part = ViewedPoints(seen.points[subsample(on)], seen.viewpoint)
     around = seen.points[subsample(held, 500)]
     # Metres to the nearest object; infinity beyond NEAR_DISTANCE, or where there is no object.
@@ -227,12 +226,12 @@ def _fit_support(
 
 
 def _assume_support(
-    seen: ViewedPoints, segmentation: Segmentation, objects: Bools, options: DetectOptions
+    seen: ViewedPoints, segmentation: Segmentation, options: DetectOptions
 ) -> Support | None:
     """A support under the lowest points of a cloud that was cropped above it."""
     if (segmentation.support > 0.5).mean() > MIN_SUPPORT_SHARE:
         return None
-    up = options.known_up
+    up, objects = options.known_up, segmentation.number >= 0
     if up is None and in_camera_frame(options):
         if objects.mean() <= CROPPED_OBJECT_SHARE:
             return None
