@@ -24,13 +24,9 @@ MIN_EDGE_LENGTH = 0.003  # metres between approach and contact point
 # Metres that an edge stays below half the opening, a contact inside the fingertips, and a hand
 # behind what is ahead of it.
 FIT_MARGIN = 0.002
-MIN_EDGE_DEPTH = 1e-4  # metres; a shallower edge has no approach direction
 CLOSING_ALLOWANCE = 0.01  # metres by which an object may be narrower than it looks
 WIDE_SHARE = 0.75  # of the opening, from which an object counts as wide
 PAD_ALLOWANCE = 0.004  # metres beside the finger pads in which points count
-GRID_CELLS = tuple(0.04 * 0.7**level for level in range(8))  # metres, of grids over points
-GRID_NODES = 2**14  # along each side of a grid
-HASH_FACTOR = 2654435761  # Knuth's multiplicative hash, modulo 2^32
 
 
 def spread_out(
@@ -40,22 +36,24 @@ def spread_out(
 ) -> Int64:
     """Choose `count` different rows far from each other, or all of them if there are fewer.
 
-    They lie nearest to the nodes of grids, of which each is finer than the one before, around the
-    middle of the points: noise and other points hardly change them.
+    They lie nearest to the nodes of grids, of 4 cm to 3 mm, each finer than the one before, around
+    the middle of the points: noise and other points hardly change them.
     """
     chosen, total = np.asarray(before, dtype=np.int64), min(len(before) + count, len(points))
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     offset = (points - middle).astype(np.float64)
-    for cell in GRID_CELLS:
+    side = 2**14  # nodes
+    for cell in (0.04 * 0.7**level for level in range(8)):
         if len(chosen) == total:
             break
         place = offset / cell
         node = np.rint(place)
-        number = (node + GRID_NODES // 2) @ (GRID_NODES**2, GRID_NODES, 1.0)
+        number = (node + side // 2) @ (side**2, side, 1.0)
         order = np.argsort(number + np.square(place - node).sum(axis=1))
         nearest = order[np.diff(number[order], prepend=-1.0) > 0]
         free = nearest[~np.isin(number[nearest], number[chosen])]
-        mixed = number[free].astype(np.uint64) * np.uint64(HASH_FACTOR) % np.uint64(2**32)
+        # In the order of Knuth's multiplicative hash.
+        mixed = number[free].astype(np.uint64) * np.uint64(2654435761) % np.uint64(2**32)
         chosen = np.append(chosen, free[np.argsort(mixed)][: total - len(chosen)])
     rest = np.delete(np.arange(len(points)), chosen)[: total - len(chosen)]
     return np.append(chosen[len(before) :], rest)
@@ -139,7 +137,7 @@ def edge_grasps(
     faults = {
         NoGrasp.TOO_SHORT: length <= MIN_EDGE_LENGTH,
         NoGrasp.TOO_LONG: length >= min(gripper.max_opening / 2 - FIT_MARGIN, reach),
-        NoGrasp.NO_DIRECTION: depth <= MIN_EDGE_DEPTH,
+        NoGrasp.NO_DIRECTION: depth <= 1e-4,  # the approach is given by nothing but noise
         NoGrasp.TOO_DEEP: depth >= gripper.contact_z - gripper.palm_z,
     }
     pair = np.flatnonzero(~np.any(list(faults.values()), axis=0))
@@ -237,7 +235,6 @@ LEAN_ANGLE = np.radians(30.0)  # from vertical
 SURFACE_DROP = 0.006  # metres below an edge from which a surface counts as another one
 SURFACE_GAP = 0.007  # metres without a point, from which a surface counts as ended
 MAX_INSERTION = 0.020  # metres deeper than an edge grasp; more does not hold better
-CELLS_PER_GAP = 4  # cells of a strip's histogram in the gap that ends it
 
 
 class Outline(NamedTuple):
@@ -376,7 +373,7 @@ def extents_across(
     """Least and greatest metres (M, 2) that the surface extends into the object, across an edge."""
     columns, extent = np.ascontiguousarray(points[rows].T), np.zeros((len(frame), 2), np.float32)
     length, gap = strip[1], strip[3]
-    cell = gap / CELLS_PER_GAP
+    cell = gap / 4  # of a histogram along the strip
     cells = int(np.ceil((length + gap) / cell)) + 1
     reached = np.empty(cells, np.float32)
     depth = np.empty(np.max(last - first) if len(first) else 0, np.float32)

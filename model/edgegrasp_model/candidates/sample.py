@@ -34,14 +34,11 @@ from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
-MIN_APPROACH_POINTS, MAX_APPROACH_POINTS = 32, 64  # of a scene, for each view
-MAX_VIEWS_SAMPLED = 4  # for which there are further approach points
+MAX_APPROACH_POINTS = 64  # of a scene, for each of up to four views; half as many at least
 MIN_PER_OBJECT = 4  # of an object, however many there are; twice as many if there is room
 OVERSAMPLING = 4  # hands checked for collision, in multiples of num_candidates
 SAME_TRANSLATION, SAME_ROTATION = 0.004, math.radians(10)  # within which hands share one score
 OUTCOME_CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
-PRESET_ANGLE = math.radians(30)  # between a hand's direction and straight down, or the horizontal
-MIN_APPROACH_UP = -0.1  # where nothing is asked for: cosine of the outward approach and up
 
 
 @dataclass(frozen=True)
@@ -89,9 +86,9 @@ class Sampler:
         most = options.num_approach_points
         if most is None and len(size) <= MAX_APPROACH_POINTS:
             wanted = np.clip(size // POINTS_PER_APPROACH, 2 * MIN_PER_OBJECT, MAX_APPROACH_POINTS)
-            wanted = np.maximum(wanted, MIN_APPROACH_POINTS // len(size))
+            wanted = np.maximum(wanted, MAX_APPROACH_POINTS // 2 // len(size))
             wanted = np.floor(wanted * min(MAX_APPROACH_POINTS / wanted.sum(), 1.0))
-            views = 1 if scene.viewpoints is None else min(len(scene.viewpoints), MAX_VIEWS_SAMPLED)
+            views = 1 if scene.viewpoints is None else min(len(scene.viewpoints), 4)
             wanted = np.maximum(wanted.astype(np.int64), MIN_PER_OBJECT) * views
         else:  # the largest objects first where there are fewer approach points than objects
             total = most or MAX_APPROACH_POINTS
@@ -236,13 +233,13 @@ def allowed_directions(
     """Which directions (E,) the hand may move in."""
     rise = direction @ UP
     if constraint is None:
-        return np.asarray(-rise > MIN_APPROACH_UP)
+        return np.asarray(rise < 0.1)  # not from far below the horizontal
     allowed = np.zeros(len(direction), dtype=bool)
     for cone in constraint.cones:
         axis = in_frame(cone.direction)
         allowed |= direction @ (axis / np.linalg.norm(axis)) >= math.cos(cone.max_angle)
     if constraint.preset == "top-down":
-        allowed |= -rise >= math.cos(PRESET_ANGLE)
+        allowed |= -rise >= math.cos(math.radians(30))
     if constraint.preset == "side":
-        allowed |= np.abs(rise) <= math.sin(PRESET_ANGLE)
+        allowed |= np.abs(rise) <= math.sin(math.radians(30))
     return allowed

@@ -20,14 +20,8 @@ MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more 
 OUTLIER_NEIGHBORS = 8
 OUTLIER_DEVIATIONS = 2.5
 NORMAL_NEIGHBORS = 20
-JACOBI_SWEEPS = 6  # rounds of Jacobi's method for a symmetric 3 x 3 matrix; more change nothing
-JACOBI_TOLERANCE = 1e-12  # off-diagonal sum at which it stops, as a share of the trace
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
-CUBE_VOXELS = 8  # along the edge of a cube; points are stored cube by cube
 MAX_VIEW_TANGENT = 1.2  # of half a depth camera's field of view
-MAX_UPWARD_SINE = 0.5  # of the angle from the horizontal at which a camera looks up
-MIN_LENGTH = 1e-3  # of a horizontal offset (metres) or mean normal that has a direction
-SUBSAMPLE_SIZE = 6000  # points that represent a cloud in fits, means and views
 LARGE_IMAGE = 704, 960  # pixels of an image of which every second row and column may be enough
 FINE_SPACING = 0.00125  # metres between neighbouring pixels of such an image, at most
 OUTLIER_PERCENT = 0.5  # of the points, beyond each end of a range
@@ -147,8 +141,11 @@ def _pixel_spacing(image: Floats) -> float:
     return float(np.median(apart)) if len(apart) else math.nan
 
 
-def subsample(rows: NDArray[Scalar], most: int = SUBSAMPLE_SIZE) -> NDArray[Scalar]:
-    """Rows spread evenly over all of an array, `most` of them or a few more."""
+def subsample(rows: NDArray[Scalar], most: int = 6000) -> NDArray[Scalar]:
+    """Rows spread evenly over all of an array, `most` of them or a few more.
+
+    As many as by default represent a cloud in fits, means and views.
+    """
     return rows[:: max(len(rows) // most, 1)]
 
 
@@ -188,14 +185,14 @@ def pose_matrix(turn: Floats, place: ArrayLike) -> Float64:
 def seen_from_origin(points: Float32, up: ArrayLike | None) -> bool:
     """Whether points (N, 3) look as if seen by a camera at the origin along +z.
 
-    If `up` (3,) is known, such a camera must not look steeply upward.
+    If `up` (3,) is known, such a camera looks at most 30 degrees upward.
     """
     x, y, z = points.T
     if len(points) == 0 or z.min() <= 0 or np.quantile(np.hypot(x, y) / z, 0.99) > MAX_VIEW_TANGENT:
         return False
     middle = points.mean(axis=0, dtype=np.float64)
     upward = 0.0 if up is None else np.dot(up, middle) / np.linalg.norm(up)
-    return bool(upward <= MAX_UPWARD_SINE * np.linalg.norm(middle))
+    return bool(upward <= 0.5 * np.linalg.norm(middle))
 
 
 def usual_up(forward: Float64) -> Float64:
@@ -297,12 +294,12 @@ def voxelise(points: Floats, voxel_size: float, most: float = math.inf) -> Voxel
     """
     # Axis by axis is three times as fast as all at once.
     cells = [((axis - float(axis.min())) / voxel_size).astype(np.int64) for axis in points.T]
-    # Stored cube by cube, so that loops over hands skip many distant points at a time.
-    keys = np.zeros(len(points), dtype=np.int64)
+    # In cubes of 8 voxels a side, so that loops over hands skip many distant points at a time.
+    keys, cube = np.zeros(len(points), dtype=np.int64), 8
     for cell in cells:
-        keys = keys * (cell.max() // CUBE_VOXELS + 1) + cell // CUBE_VOXELS
+        keys = keys * (cell.max() // cube + 1) + cell // cube
     for cell in cells:
-        keys = keys * CUBE_VOXELS + cell % CUBE_VOXELS
+        keys = keys * cube + cell % cube
     _, voxel, count = np.unique(keys, return_inverse=True, return_counts=True)
     if len(count) > most:
         size = " x ".join(f"{length:.2g}" for length in np.ptp(points, axis=0))
@@ -354,7 +351,7 @@ def clean_cloud(
     normals = np.where(away[:, None], -normals, normals)
     if sent.normals is not None:
         given = frame.directions(voxels.mean(unit(sent.normals))[kept])
-        none = np.linalg.norm(given, axis=1) < MIN_LENGTH  # opposite ones in a voxel
+        none = np.linalg.norm(given, axis=1) < 1e-3  # opposite ones in a voxel
         normals = np.where(none[:, None], normals, unit(given)).astype(np.float32)
     return Cloud(points, normals), kept
 
@@ -378,11 +375,11 @@ def smallest_variance_directions(points: Float32, rows: Int64) -> Float32:
                 spread[i, j] = 0.0
                 for k in range(count):
                     spread[i, j] += around[k, i] * around[k, j]
-        for _ in range(JACOBI_SWEEPS):
+        for _ in range(6):  # rounds of Jacobi's method; more change nothing
             for turn in range(3):
                 _jacobi_rotation(spread, axes, turn % 2, 1 if turn == 0 else 2)
             off = abs(spread[0, 1]) + abs(spread[0, 2]) + abs(spread[1, 2])
-            if off <= JACOBI_TOLERANCE * (spread[0, 0] + spread[1, 1] + spread[2, 2]):
+            if off <= 1e-12 * (spread[0, 0] + spread[1, 1] + spread[2, 2]):
                 break
         least = 0
         for d in range(1, 3):
@@ -435,7 +432,7 @@ class CanonicalFrame:
         for offsets in (eyes - origin, points - origin, np.eye(3)):
             level = offsets - (offsets @ z)[:, None] * z  # as seen from above
             length = np.linalg.norm(level, axis=1)
-            if length.max(initial=0.0) >= MIN_LENGTH:
+            if length.max(initial=0.0) >= 1e-3:  # metres; shorter ones have no direction
                 x = level[length.argmax()] / length.max()
                 break
         turn = np.stack([x, np.cross(z, x), z])

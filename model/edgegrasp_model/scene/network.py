@@ -108,18 +108,13 @@ def _layer(
 
 # Range images
 
-SIDE_MULTIPLE = 32  # pixels; the sides of its images are multiples of this
 NEAREST_DEPTH = 0.05  # metres from the viewpoint
-DENSITY_CELLS = 40  # cells across the view in which the density of points is measured
 PIXEL_SPACING = 1.25  # side of a pixel, in distances of sparse points, so that few stay empty
 MAX_HOLE_SPACING = 1.6  # pixels between points up to which holes are filled by interpolation
-MIN_FILLED = 0.93  # of the pixels between two that show something
-COARSER, MAX_COARSENINGS = 1.5, 3  # times as large are pixels of which fewer are filled
-# Metres at the median depth: smaller pixels show noise, and larger ones are divided.
-MIN_PIXEL_SIZE, MAX_PIXEL_SIZE = 0.0015, 0.003
-MAX_POINTS_PER_PIXEL = 2  # more add nothing
+MIN_FILLED = 0.93  # of the pixels between two that show something; else pixels are larger
+# Metres at the median depth: larger pixels are divided, and those of less than half show noise.
+MAX_PIXEL_SIZE = 0.003
 SURFACE_DEPTH = 0.02  # metres; a point nearer by this much hides another of the same pixel
-NORMAL_STRIDE = 2  # pixels from each pixel to the neighbours that give its normal
 
 
 class RangeImage(NamedTuple):
@@ -151,20 +146,21 @@ def range_image(
     low, high = _view(in_view)
     # As many pixels as a large image has with half of its rows and columns.
     finest = float(np.sqrt(4 * (high - low).prod() / np.prod(LARGE_IMAGE)))
-    # Distance at a depth of one metre between neighbours, from the area that points cover.
+    # Distance at a depth of one metre between neighbours, from the area that points cover, in
+    # cells of which 40 lie across the view.
     ahead = in_view[in_view[:, 2] > NEAREST_DEPTH]
-    cell = max(float((high - low).max()) / DENSITY_CELLS, 1e-6)
+    cell = max(float((high - low).max()) / 40, 1e-6)
     place = ((ahead[:, :2] / ahead[:, 2:] - low) / cell).astype(np.int64)
     occupied = len(np.unique(place[:, 0] * 4096 + place[:, 1])) * cell * cell
     spacing = float(np.sqrt(occupied / len(points)))
     depth = max(float(np.median(in_view[:, 2])), NEAREST_DEPTH)
     dense = spacing < MAX_HOLE_SPACING * finest
-    pixel_size = max(finest, MIN_PIXEL_SIZE / depth) if dense else PIXEL_SPACING * spacing
-    for coarsening in range(MAX_COARSENINGS + 1):
+    pixel_size = max(finest, MAX_PIXEL_SIZE / 2 / depth) if dense else PIXEL_SPACING * spacing
+    for growth in (1.0, 1.5, 1.5, 1.5):
+        pixel_size *= growth
         filled, corner = _draw(points, viewpoint, turn, (low, high), pixel_size)
-        if coarsening == MAX_COARSENINGS or _share_filled(~np.isnan(filled[..., 2])) > MIN_FILLED:
+        if _share_filled(~np.isnan(filled[..., 2])) > MIN_FILLED:
             break
-        pixel_size *= COARSER
     coarse = int(np.ceil(depth * pixel_size / MAX_PIXEL_SIZE))
     if (times := min(round(pixel_size / finest), coarse)) > 1:
         pixel_size /= times
@@ -202,10 +198,10 @@ def _draw(
 ) -> tuple[Float32, Float64]:
     """The image (H, W, 3) between `ends` of the view, `pixel` wide at a depth of 1, and corner."""
     low, high = ends
-    sides = (high - low) / pixel
-    width, height = (int(np.ceil(side / SIDE_MULTIPLE)) * SIDE_MULTIPLE for side in sides)
+    sides, multiple = (high - low) / pixel, 2 ** (len(LAYER_WIDTHS) - 1)
+    width, height = (int(np.ceil(side / multiple)) * multiple for side in sides)
     corner = (low + high) / 2 - pixel * np.array([width, height]) / 2
-    some = subsample(points, MAX_POINTS_PER_PIXEL * width * height)
+    some = subsample(points, 2 * width * height)  # more add nothing
     return _fill_holes(_render(some, viewpoint, turn, corner, pixel, (height, width))), corner
 
 
@@ -324,7 +320,7 @@ def _fill_features(points: Float32, up: Float64, known: bool, offset: float, out
                 for d in range(3):
                     middle[d] += points[i, j, d]
     middle /= max(count, 1)
-    s = NORMAL_STRIDE
+    s = 2  # pixels from each pixel to the neighbours that give its normal
     for i in range(height):
         for j in range(width):
             x, y, z = points[i, j, 0], points[i, j, 1], points[i, j, 2]

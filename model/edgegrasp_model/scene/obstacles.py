@@ -13,10 +13,7 @@ from edgegrasp_camera.arrays import Float32, Float64, Floats, Int64
 from edgegrasp_model.options import Box, OrientedBox
 from edgegrasp_model.scene.cloud import CanonicalFrame, pose_matrix
 
-PAIRS_AT_A_TIME = 20_000  # of boxes
-MIN_HALF_EXTENT = 1e-6  # metres, so that the axes of flat boxes have a direction
 _SIGNS = np.array(list(product((-1, 1), repeat=3)))  # (8, 3) of the corners
-_EDGES = np.argwhere(np.triu(_SIGNS @ _SIGNS.T == 1))  # (12, 2) corners that differ in one sign
 
 
 @dataclass(frozen=True)
@@ -32,7 +29,7 @@ class SolidBoxes:
         centers, halves = np.empty((len(shapes), 3)), np.empty((len(shapes), 3, 3))
         for row, shape in enumerate(shapes):
             T_cloud_box, half = box_pose(shape)
-            half = np.maximum(half, MIN_HALF_EXTENT)
+            half = np.maximum(half, 1e-6)  # so that the axes of flat boxes have a direction
             centers[row], halves[row] = T_cloud_box[:3, 3], np.diag(half) @ T_cloud_box[:3, :3].T
         return cls(frame.points(centers), frame.directions(halves))
 
@@ -111,16 +108,17 @@ def separation(ours: SolidBoxes, theirs: SolidBoxes, sweep: Float64 | None = Non
 
 def signed_distance(ours: SolidBoxes, theirs: SolidBoxes) -> Float64:
     """Metres (M,) between boxes, row by row; negative: what they would have to move apart."""
-    distance = separation(ours, theirs)
+    distance, some = separation(ours, theirs), 20_000  # pairs at a time, which bounds the memory
     apart = np.flatnonzero(distance > 0)
-    for start in range(0, len(apart), PAIRS_AT_A_TIME):
-        rows = apart[start : start + PAIRS_AT_A_TIME]
+    edges_of_box = np.argwhere(np.triu(_SIGNS @ _SIGNS.T == 1))  # (12, 2) corners, one sign apart
+    for start in range(0, len(apart), some):
+        rows = apart[start : start + some]
         one, other = ours.take(rows), theirs.take(rows)
         # A corner of a box is nearest to the other box, or two edges are to each other.
         p, q = one.corners(), other.corners()
         least = np.minimum(_corner_distance(p, other), _corner_distance(q, one))
-        edges = q[:, _EDGES[:, 0]], q[:, _EDGES[:, 1]]
-        for first, last in _EDGES:
+        edges = q[:, edges_of_box[:, 0]], q[:, edges_of_box[:, 1]]
+        for first, last in edges_of_box:
             between = _segment_distance(p[:, first, None], p[:, last, None], *edges)
             least = np.minimum(least, between.min(axis=1))
         distance[rows] = least

@@ -33,13 +33,9 @@ MARGIN_DEVIATIONS = 4.0  # standard deviations of its own points; PLANE_NOISE me
 MAX_MARGIN = 0.02  # metres
 GIVEN_PLANE_MARGIN = 0.005  # metres, of a plane that the caller gives
 MAX_BOW = 0.025  # metres by which a bowed support rises or sinks from its plane
-BOW_FITS = 4  # least-squares fits of the bow
-BOW_RIDGE = 1e-6 * np.eye(6)  # keeps the bow small where little of the support is seen
 
 # The fit to points classified as support.
 MIN_PLANE_POINTS = 60
-RANSAC_PLANES, RANSAC_POINTS = 150, 1200  # planes tried, and points that judge them
-MAX_TILT = math.radians(30)  # between the plane's normal and a given `up`
 NEAR_DISTANCE, FAR_WEIGHT = 0.15, 0.1  # metres to an object; weight of points farther away
 MAX_SHARE_BELOW = 0.1  # of the objects' points, below the plane
 REFINE_DISTANCE = 0.08  # metres to an object, of points that refine the plane
@@ -50,7 +46,6 @@ MAX_WORKSPACE_GAP = 0.05  # metres from a given plane up to a workspace that sta
 
 # A cloud that was cropped above its support.
 MIN_SUPPORT_SHARE = 0.2  # of points classified as support, otherwise
-CROPPED_OBJECT_SHARE = 0.8  # of points of objects, from which nothing else is left
 TOUCH_DISTANCE = 0.006  # metres from a plane that the cloud touches
 MIN_UP_COSINE = 0.5  # of the angle between up and where most cameras see it
 ASSUMED_PLANE_GAP = 0.003  # metres from the lowest points down to the assumed plane
@@ -233,7 +228,7 @@ def _assume_support(
         return None
     up, objects = options.known_up, segmentation.number >= 0
     if up is None and in_camera_frame(options):
-        if objects.mean() <= CROPPED_OBJECT_SHARE:
+        if objects.mean() <= 1.0 - MIN_SUPPORT_SHARE:
             return None
         assert seen.viewpoint is not None
         up = up_of_cropped(seen.points[objects], seen.viewpoint, segmentation.up)
@@ -299,7 +294,7 @@ def fit_plane(
     weight: Floats,  # (N,) what each counts
     rng: np.random.Generator,
     up: Float64 | None,  # (3,) unit; None: any tilt will do
-    max_tilt: float = MAX_TILT,  # radians from `up`
+    max_tilt: float = math.radians(30),  # from `up`
 ) -> SupportPlane | None:
     """The plane that holds the most of weighted points, facing the camera (RANSAC).
 
@@ -308,13 +303,14 @@ def fit_plane(
     held = np.flatnonzero(weight > 0)
     if len(held) < MIN_PLANE_POINTS:
         return None
+    # Of 150 planes, the best one by the judgement of 1200 points.
     chosen = rng.choice(
-        held, min(RANSAC_POINTS, len(held)), replace=False, p=weight[held] / weight[held].sum()
+        held, min(1200, len(held)), replace=False, p=weight[held] / weight[held].sum()
     )
     sample = ViewedPoints(seen.points[chosen], seen.viewpoint)
     points = sample.points.astype(np.float64)
     thick = PLANE_NOISE + NOISE_GROWTH * sample.distance() ** 2
-    corners = points[rng.integers(len(points), size=(RANSAC_PLANES, 3))]
+    corners = points[rng.integers(len(points), size=(150, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
     wide = length > 1e-6
@@ -358,10 +354,11 @@ def measure_support(seen: ViewedPoints, plane: SupportPlane, least: float, whole
     if near.sum() < MIN_PLANE_POINTS or (not whole and (height[near] < 1e-4).mean() < 0.2):
         return Support(plane, frame, least)
     terms, bow = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y]), np.zeros(6)
-    for _ in range(BOW_FITS):
+    ridge = 1e-6 * np.eye(6)  # keeps the bow small where little of the support is seen
+    for _ in range(4):
         near = np.abs(height - bow @ terms) < thick
         held = near * terms
-        bow = np.asarray(np.linalg.solve(held @ terms.T + BOW_RIDGE, held @ height))
+        bow = np.asarray(np.linalg.solve(held @ terms.T + ridge, held @ height))
     off = np.abs(height - bow @ terms)[near]
     growth = 1.4826 * float(np.median(off / np.square(distance[near])))
     return Support(plane, frame, least, float(np.median(off)), float(near.mean()), growth, bow)
