@@ -39,7 +39,7 @@ MIN_RISE = 0.004  # metres above the support's margin, of points that are added 
 MIN_CLUSTER_CELLS, MIN_CELL_POINTS = 5, 4  # of cells POINT_REACH wide
 MIN_CONFIDENCE = 0.5  # of an object; below, it is background
 CROPPED_CONFIDENCE = 0.95  # of clusters in a cloud that was cropped above its support
-OVERVIEW_RADIUS = 0.7  # metres around the middle of a cloud, if no camera is known
+USUAL_DISTANCE = 0.7  # metres from a camera to objects and around them, if it is not known
 
 
 class Segmentation(NamedTuple):
@@ -128,13 +128,13 @@ def _views(cloud: CheckedCloud, viewpoints: Float64) -> list[View]:
 def _view_from_above(points: Float32, up: Float64 | None) -> list[View]:
     """The view of points (N, 3) from above the middle one, in an image that turns with them.
 
-    Points farther away than OVERVIEW_RADIUS stay undecided: a room is seen too small.
+    Points farther away than USUAL_DISTANCE stay undecided: a room is seen too small.
     """
     over = np.array([0.0, 0.0, 1.0]) if up is None else up
     beside = points - np.median(points, axis=0)
     beside -= (beside @ over)[:, None] * over
     beside -= beside[np.linalg.norm(beside, axis=1).argmin()]  # there may be none at the median
-    near = np.flatnonzero(np.linalg.norm(beside, axis=1) < OVERVIEW_RADIUS)
+    near = np.flatnonzero(np.linalg.norm(beside, axis=1) < USUAL_DISTANCE)
     some = points[near]
     low, high = np.percentile(some, (1, 99), axis=0)
     eye = (low + high) / 2 + max(1.0, 1.5 * float((high - low).max())) * over

@@ -22,11 +22,10 @@ from edgegrasp_model.scene.cloud import (
     unit,
     usual_up,
 )
-from edgegrasp_model.scene.segment import Segmentation
+from edgegrasp_model.scene.segment import USUAL_DISTANCE, Segmentation
 
 # Noise of depth cameras: metres from a plane, and as much more per squared metre of distance.
 PLANE_NOISE, NOISE_GROWTH = 0.004, 0.006
-DEFAULT_CAMERA_DISTANCE = 0.7  # metres to a camera whose position is not known
 
 # The margin above a plane, up to which points belong to it.
 MARGIN_DEVIATIONS = 4.0  # standard deviations of its own points; PLANE_NOISE metres at least
@@ -39,7 +38,6 @@ MIN_PLANE_POINTS = 60
 NEAR_DISTANCE, FAR_WEIGHT = 0.15, 0.1  # metres to an object; weight of points farther away
 MAX_SHARE_BELOW = 0.1  # of the objects' points, below the plane
 REFINE_DISTANCE = 0.08  # metres to an object, of points that refine the plane
-REFINE_HEIGHTS = (0.008, 0.005, 0.004)  # metres from the plane, of these points, fit by fit
 AREA_CELL = 0.02  # metres, side of the cells that measure areas
 MIN_SUPPORT_AREA = 0.008  # square metres; the top of an object is smaller
 MAX_WORKSPACE_GAP = 0.05  # metres from a given plane up to a workspace that starts above it
@@ -81,7 +79,7 @@ class Support:
         if math.isnan(self.growth):
             return height, np.full_like(height, self.least)
         if seen.viewpoint is None:
-            squared[:] = DEFAULT_CAMERA_DISTANCE**2
+            squared[:] = USUAL_DISTANCE**2
         squared *= np.float32(MARGIN_DEVIATIONS * self.growth)
         return height, np.clip(squared, self.least, max(MAX_MARGIN, self.least), out=squared)
 
@@ -95,7 +93,7 @@ class ViewedPoints(NamedTuple):
     def distance(self) -> Float64:
         """Metres (N,) from the camera."""
         if self.viewpoint is None:
-            return np.full(len(self.points), DEFAULT_CAMERA_DISTANCE)
+            return np.full(len(self.points), USUAL_DISTANCE)
         apart = self.points - self.viewpoint
         return np.asarray(np.sqrt(np.einsum("nd,nd->n", apart, apart)))
 
@@ -206,11 +204,11 @@ def _fit_support(
     # Of the points close to objects: the plane of a bin's floor, not the table's.
     close = part.points[apart < REFINE_DISTANCE]
     near = close[np.abs(heights_over(plane, close)) < MAX_MARGIN].astype(np.float64)
-    for within in REFINE_HEIGHTS:
+    for within in (2.0, 1.25, 1.0):
         if len(near) < MIN_PLANE_POINTS:
             break
         height = heights_over(plane, near)
-        near = near[np.abs(height - np.median(height)) < within]
+        near = near[np.abs(height - np.median(height)) < within * PLANE_NOISE]
         plane = _fit_least_squares(near, plane) if len(near) >= MIN_PLANE_POINTS else plane
     found = measure_support(part, plane, PLANE_NOISE, True)
     places = found.frame.points(part.points)
