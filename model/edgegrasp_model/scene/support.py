@@ -44,7 +44,6 @@ MAX_WORKSPACE_GAP = 0.05  # metres from a given plane up to a workspace that sta
 
 # A cloud that was cropped above its support.
 MIN_SUPPORT_SHARE = 0.2  # of points classified as support, otherwise
-TOUCH_DISTANCE = 0.006  # metres from a plane that the cloud touches
 MIN_UP_COSINE = 0.5  # of the angle between up and where most cameras see it
 ASSUMED_PLANE_GAP = 0.003  # metres from the lowest points down to the assumed plane
 
@@ -270,8 +269,8 @@ def up_of_cropped(
     likely = -planes[:, :3] @ usual > MIN_UP_COSINE
     likely &= (planes[:, :3] @ toward < 0.0) & (planes[:, :3] @ viewpoint + planes[:, 3] < 0.0)
     planes = planes[likely]
-    near = points @ planes[:, :3].T + planes[:, 3] > -TOUCH_DISTANCE
-    places = [len(grid_cells(points[touched], TOUCH_DISTANCE)[1]) for touched in near.T]
+    near = points @ planes[:, :3].T + planes[:, 3] > -PLANE_NOISE
+    places = [len(grid_cells(points[touched], PLANE_NOISE)[1]) for touched in near.T]
     if not places:
         return usual
     weight = -planes[:, :3] @ usual - MIN_UP_COSINE
