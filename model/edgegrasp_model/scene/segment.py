@@ -32,8 +32,7 @@ BACKGROUND, UNDECIDED = -1, -2
 MAX_DEPTH_STEP = 0.035  # metres between neighbours, and between the mean votes of two parts
 MIN_PIXELS = 45  # pixels of an object, in the network's output
 MIN_AREA = 5e-4  # square metres of it, as seen
-VIEW_CELL = 0.01  # metres, in which the views of one object lie in the same place
-MIN_VIEW_OVERLAP = 0.25  # of the smaller one's cells that two views of one object share
+MIN_VIEW_OVERLAP = 0.25  # of the smaller one's cells (POINT_REACH) that two views share
 POINT_REACH = 0.012  # metres from a point to an object, or to its pixel at a depth of 0
 MIN_RISE = 0.004  # metres above the support's margin, of points that are added to an object
 MIN_CLUSTER_CELLS, MIN_CELL_POINTS = 5, 4  # of cells POINT_REACH wide
@@ -272,7 +271,7 @@ def merge_views(points: Float32, number: Int64, confidence: Float64) -> tuple[In
     held = np.flatnonzero(number >= 0)
     if len(held) == 0:
         return number, confidence
-    cell, points_in = grid_cells(points[held], VIEW_CELL)
+    cell, points_in = grid_cells(points[held], POINT_REACH)
     shape = len(confidence), len(points_in)
     lies = coo_array((np.ones(len(held), dtype=np.int32), (number[held], cell)), shape).tocsr()
     lies.data[:] = 1
