@@ -194,7 +194,7 @@ def support_clearance(
     return clearance.astype(np.float32)
 
 
-MIN_SHIFT, MAX_SHIFT = 0.001, 0.008  # metres; for larger shifts another approach point is better
+MAX_SHIFT = 0.008  # metres; for larger shifts another approach point is better
 
 
 def centred_grasps(
@@ -220,7 +220,7 @@ def centred_grasps(
     low, high = extents_between(hands, crop.start[ball], crop.start[ball + 1], pads).T
     middle, width = (low + high) / 2, high - low
     moved = (width > WIDE_SHARE * gripper.max_opening) & (width < gripper.max_opening)
-    moved &= (np.abs(middle) > MIN_SHIFT) & (np.abs(middle) < MAX_SHIFT)
+    moved &= np.abs(middle) < MAX_SHIFT
     further = replace(candidates.take(wide[moved]), opening=width[moved])
     further.T_cloud_hand[:, :3, 3] += middle[moved, None] * further.T_cloud_hand[:, :3, 1]
     return further
