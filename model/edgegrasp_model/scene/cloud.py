@@ -24,6 +24,7 @@ UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 MAX_VIEW_TANGENT = 1.2  # of half a depth camera's field of view
 LARGE_IMAGE = 704, 960  # pixels of an image of which every second row and column may be enough
 FINE_SPACING = 0.00125  # metres between neighbouring pixels of such an image, at most
+HAND_REACH = 0.25  # metres around an object in which a hand at it may collide
 OUTLIER_PERCENT = 0.5  # of the points, beyond each end of a range
 
 Vectors = TypeVar("Vectors", bound=Floats)

@@ -30,6 +30,7 @@ from edgegrasp_model.options import (
 )
 from edgegrasp_model.results import OBSTACLE, SUPPORT, UNLABELLED
 from edgegrasp_model.scene.cloud import (
+    HAND_REACH,
     UP,
     CanonicalFrame,
     CheckedCloud,
@@ -61,7 +62,6 @@ from edgegrasp_model.unseen import DepthMap
 
 SIDE_DEPTH = 0.006  # metres from a side of the workspace within which an object may be cut off
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
-HAND_REACH = 0.25  # metres around an object in which a hand at it may collide
 FOLLOWED_REACH = 0.16  # the same if only known grasps are checked
 FOUND_PLANE_CLEARANCE = 0.0015  # metres that hands stay above a plane that was not given
 MAX_NEAR_DISTANCE = 0.1  # metres from `near` to the object that it names

@@ -12,6 +12,7 @@ from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import SUPPORT_STREAM, DetectOptions, RansacPlane, SupportPlane
 from edgegrasp_model.scene.cloud import (
+    HAND_REACH,
     MAX_DISTANCE,
     OUTLIER_PERCENT,
     CanonicalFrame,
@@ -40,7 +41,6 @@ MAX_SHARE_BELOW = 0.1  # of the objects' points, below the plane
 REFINE_DISTANCE = 0.08  # metres to an object, of points that refine the plane
 AREA_CELL = 0.02  # metres, side of the cells that measure areas
 MIN_SUPPORT_AREA = 0.008  # square metres; the top of an object is smaller
-MAX_WORKSPACE_GAP = 0.05  # metres from a given plane up to a workspace that starts above it
 
 # A cloud that was cropped above its support.
 MIN_SUPPORT_SHARE = 0.2  # of points classified as support, otherwise
@@ -156,7 +156,7 @@ def _given_support(
 ) -> Support:
     """A plane that the caller gives, as the points show it."""
     # A bin's floor is not measured by the table around it; a followed object's workspace is no bin.
-    around = np.inf if options.follows_only else MAX_WORKSPACE_GAP * np.abs(plane.normal)
+    around = np.inf if options.follows_only else HAND_REACH * np.abs(plane.normal)
     over = np.flatnonzero(inside_workspace(seen.points, options.workspace, around))
     sample = ViewedPoints(seen.points[subsample(over)], seen.viewpoint)
     below = float(heights_over(plane, sample.points).min(initial=np.inf))
