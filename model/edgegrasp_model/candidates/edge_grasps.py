@@ -231,7 +231,6 @@ def centred_grasps(
 OUTLINE_RADIUS = 0.016  # metres of surface from which the outline's direction is estimated
 MIN_OUTLINE_OFFSET = 0.002  # metres from a neighbourhood's mean to a point on the outline
 MAX_RIM_DEVIATION = 0.003  # metres, standard deviation across a rim, all of which is outline
-LEAN_ANGLE = np.radians(30.0)  # from vertical
 SURFACE_DROP = 0.006  # metres below an edge from which a surface counts as another one
 SURFACE_GAP = 0.007  # metres without a point, from which a surface counts as ended
 MAX_INSERTION = 0.020  # metres deeper than an edge grasp; more does not hold better
@@ -250,15 +249,15 @@ def outlines(
     viewpoints: Float32 | None,  # (W, 3); None where they are unknown
     rows: Int64,  # (M,) of the points to look at
     *,
-    leaning: bool = False,  # also from four sides, LEAN_ANGLE off above
+    leaning: bool = False,  # also from four sides, 30 degrees off above
 ) -> list[Outline]:
     """The outlines of a cloud from above and, if that is another direction, from each camera."""
-    toward = [np.broadcast_to(UP, points.shape)]
+    toward, lean = [np.broadcast_to(UP, points.shape)], np.radians(30.0)
     toward += [unit(eye - points) for eye in ([] if viewpoints is None else viewpoints)]
     if leaning:
         for turn in np.linspace(0.0, 2 * np.pi, 4, endpoint=False):
-            level = np.sin(LEAN_ANGLE) * np.array([np.cos(turn), np.sin(turn)])
-            way = np.array([*level, np.cos(LEAN_ANGLE)])
+            level = np.sin(lean) * np.array([np.cos(turn), np.sin(turn)])
+            way = np.array([*level, np.cos(lean)])
             toward.append(np.broadcast_to(way.astype(np.float32), points.shape))
     ways = np.stack([each[rows] for each in toward])
     cells = (
@@ -277,8 +276,8 @@ def outlines(
         heading[rows] = least
         is_edge[rows] = (outward > MIN_OUTLINE_OFFSET) | (deviation < MAX_RIM_DEVIATION)
         if found:
-            # Directions closer than that to up show the same outline.
-            is_edge[rows] &= way @ UP < np.cos(LEAN_ANGLE / 2)
+            # Directions within half of that of up show the same outline.
+            is_edge[rows] &= way @ UP < np.cos(lean / 2)
         found.append(Outline(each, heading, is_edge))
     return found
 

@@ -17,9 +17,6 @@ from edgegrasp_model.options import Workspace
 
 MAX_CLOUD_EXTENT = 20.0  # metres; if most of a cloud is wider, it is probably in millimetres
 MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
-OUTLIER_NEIGHBORS = 8
-OUTLIER_DEVIATIONS = 2.5
-NORMAL_NEIGHBORS = 20
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 MAX_VIEW_TANGENT = 1.2  # of half a depth camera's field of view
 LARGE_IMAGE = 704, 960  # pixels of an image of which every second row and column may be enough
@@ -316,17 +313,17 @@ def voxelise(points: Floats, voxel_size: float, most: float = math.inf) -> Voxel
 def inliers_and_neighbours(points: Float32) -> tuple[Bools, Int64]:
     """Which of points (N, 3) are no outliers, (N,), and rows (N, K) of the nearest to each.
 
-    The mean distance of an outlier to those next to it is unusual for the cloud. The first of the
-    rows is the point itself; K is NORMAL_NEIGHBORS, or N where there are fewer.
+    The mean distance of an outlier to the 8 next to it is more than 2.5 standard deviations above
+    that of all points. The first of the rows is the point itself; K is 20, or N where it is less.
     """
-    k = min(NORMAL_NEIGHBORS, len(points))
+    k = min(20, len(points))
     # For a single round of queries a tree that is quickly built is faster.
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
     distance, row = tree.query(points, k=range(1, k + 1))
-    if len(points) <= OUTLIER_NEIGHBORS:
+    if len(points) <= 8:
         return np.ones(len(points), dtype=bool), np.asarray(row)
-    mean = np.asarray(distance)[:, 1 : OUTLIER_NEIGHBORS + 1].mean(axis=1)
-    return mean <= mean.mean() + OUTLIER_DEVIATIONS * mean.std(), np.asarray(row)
+    mean = np.asarray(distance)[:, 1:9].mean(axis=1)
+    return mean <= mean.mean() + 2.5 * mean.std(), np.asarray(row)
 
 
 def clean_cloud(

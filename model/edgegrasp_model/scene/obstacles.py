@@ -13,8 +13,6 @@ from edgegrasp_camera.arrays import Float32, Float64, Floats, Int64
 from edgegrasp_model.options import Box, OrientedBox
 from edgegrasp_model.scene.cloud import CanonicalFrame, pose_matrix
 
-_SIGNS = np.array(list(product((-1, 1), repeat=3)))  # (8, 3) of the corners
-
 
 @dataclass(frozen=True)
 class SolidBoxes:
@@ -49,7 +47,8 @@ class SolidBoxes:
 
     def corners(self) -> Float64:
         """(M, 8, 3)."""
-        corners: Float64 = self.center[:, None] + _SIGNS @ self.half
+        signs = np.array(list(product((-1, 1), repeat=3)))
+        corners: Float64 = self.center[:, None] + signs @ self.half
         return corners
 
     @property
@@ -110,7 +109,8 @@ def signed_distance(ours: SolidBoxes, theirs: SolidBoxes) -> Float64:
     """Metres (M,) between boxes, row by row; negative: what they would have to move apart."""
     distance, some = separation(ours, theirs), 20_000  # pairs at a time, which bounds the memory
     apart = np.flatnonzero(distance > 0)
-    edges_of_box = np.argwhere(np.triu(_SIGNS @ _SIGNS.T == 1))  # (12, 2) corners, one sign apart
+    # Between corners (12, 2) that differ in one sign.
+    edges_of_box = np.array([(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])
     for start in range(0, len(apart), some):
         rows = apart[start : start + some]
         one, other = ours.take(rows), theirs.take(rows)

@@ -64,8 +64,6 @@ SIDE_DEPTH = 0.006  # metres from a side of the workspace within which an object
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 FOLLOWED_REACH = 0.16  # the same if only known grasps are checked
 FOUND_PLANE_CLEARANCE = 0.0015  # metres that hands stay above a plane that was not given
-MAX_NEAR_DISTANCE = 0.1  # metres from `near` to the object that it names
-MAX_AT_DISTANCE = 0.02  # from `at` to its object, as a share of the image's width
 
 
 @dataclass(frozen=True)
@@ -367,11 +365,11 @@ def chosen_objects(
         if target is None:
             continue
         place: Floats = cloud.points
-        most = MAX_NEAR_DISTANCE
+        most = 0.1  # metres
         if name == "at":
             width = _image_width(target, cloud)
             place = np.stack([cloud.row % width, cloud.row // width], axis=1)
-            most = max(MAX_AT_DISTANCE * width, 1.0)
+            most = max(0.02 * width, 1.0)  # pixels
         on = np.flatnonzero(np.isin(number, wanted))
         distance = np.linalg.norm(place[on] - np.asarray(target), axis=1)
         if distance.min(initial=np.inf) <= most:
