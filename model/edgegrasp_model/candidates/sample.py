@@ -36,7 +36,6 @@ from edgegrasp_model.scene.scene import Scene
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
 MAX_APPROACH_POINTS = 64  # of a scene, for each of up to four views; half as many at least
 MIN_PER_OBJECT = 4  # of an object, however many there are; twice as many if there is room
-OVERSAMPLING = 4  # hands checked for collision, in multiples of num_candidates
 SAME_TRANSLATION, SAME_ROTATION = 0.004, math.radians(10)  # within which hands share one score
 OUTCOME_CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
 
@@ -120,7 +119,7 @@ class Sampler:
         options, mode = self.options, self.options.collision.mode
         drawn, outcome = self._constrained(more, last_resort=last_resort)
         passed = np.flatnonzero(outcome == OUTCOME_CODE[Outcome.RETURNED])
-        row = random_rows(passed, OVERSAMPLING * options.num_candidates, self._rng)
+        row = random_rows(passed, 4 * options.num_candidates, self._rng)  # of which many collide
         checked = drawn.take(row)
         free = ~collides(
             self.scene, checked.T_cloud_hand, checked.opening, self.gripper, options.collision
