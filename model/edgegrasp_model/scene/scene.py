@@ -60,7 +60,6 @@ from edgegrasp_model.scene.support import (
 )
 from edgegrasp_model.unseen import DepthMap
 
-SIDE_DEPTH = 0.006  # metres from a side of the workspace within which an object may be cut off
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 FOLLOWED_REACH = 0.16  # the same if only known grasps are checked
 FOUND_PLANE_CLEARANCE = 0.0015  # metres that hands stay above a plane that was not given
@@ -297,19 +296,18 @@ def near_objects_along(plan: Float64, number: Int64) -> Bools:
 def near_workspace_side(
     points: Float32, workspace: Workspace | None, up: ArrayLike, seen: Float32
 ) -> Bools:
-    """Which points (V, 3) lie at a side of the workspace beyond which nothing was seen.
+    """Which points (V, 3) lie within 6 mm of a side of the workspace beyond which nothing was seen.
 
     An object there may be cut off and wider than it looks. Floor and ceiling do not count. `seen`
     (N, 3) are the points of the cloud, some of which may lie outside of the workspace.
     """
     if workspace is None:
         return np.zeros(len(points), dtype=bool)
-    level = np.abs(np.asarray(up)) < np.linalg.norm(up) / 2
+    level, depth = np.abs(np.asarray(up)) < np.linalg.norm(up) / 2, 0.006
     low, high = np.asarray(workspace.min), np.asarray(workspace.max)
     cut_low = level & (seen.min(axis=0) >= low)
     cut_high = level & (seen.max(axis=0) <= high)
-    at_low = (points < low + SIDE_DEPTH) & cut_low
-    at_high = (points > high - SIDE_DEPTH) & cut_high
+    at_low, at_high = (points < low + depth) & cut_low, (points > high - depth) & cut_high
     return np.asarray((at_low | at_high).any(axis=1))
 
 
