@@ -20,7 +20,6 @@ MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more 
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 MAX_VIEW_TANGENT = 1.2  # of half a depth camera's field of view
 LARGE_IMAGE = 704, 960  # pixels of an image of which every second row and column may be enough
-FINE_SPACING = 0.00125  # metres between neighbouring pixels of such an image, at most
 HAND_REACH = 0.25  # metres around an object in which a hand at it may collide
 OUTLIER_PERCENT = 0.5  # of the points, beyond each end of a range
 
@@ -72,8 +71,8 @@ class CheckedCloud:
 def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False) -> CheckedCloud:
     """Check a caller's CloudInput or array of points, and drop the holes of an organised one.
 
-    With `thin`, a large image of something near loses every second row and column. Raises
-    InvalidRequest, which names `cloud`, `normals`, `colors`, `segment_ids` or `view_ids`.
+    With `thin`, a large image whose pixels lie at most 1.25 mm apart loses every second row and
+    column. InvalidRequest names `cloud`, `normals`, `colors`, `segment_ids` or `view_ids`.
     """
     sent = cloud if isinstance(cloud, CloudInput) else CloudInput(cloud)
     points: Any = sent.points
@@ -87,7 +86,7 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
         # A single row of points, such as fused images, is not an image.
         image_size = None if 1 in points.shape[:2] else points.shape[:2]
         large = image_size is not None and np.greater_equal(image_size, LARGE_IMAGE).all()
-        step = 2 if thin and large and _pixel_spacing(points) <= FINE_SPACING else 1
+        step = 2 if thin and large and _pixel_spacing(points) <= 0.00125 else 1
         row = row.reshape(points.shape[:2])[::step, ::step].reshape(-1)
         points = points[::step, ::step].reshape(-1, 3)
         x, y, z = points.T
