@@ -36,7 +36,6 @@ from edgegrasp_model.scene.scene import Scene
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
 MAX_APPROACH_POINTS = 64  # of a scene, for each of up to four views; half as many at least
 MIN_PER_OBJECT = 4  # of an object, however many there are; twice as many if there is room
-SAME_TRANSLATION, SAME_ROTATION = 0.004, math.radians(10)  # within which hands share one score
 OUTCOME_CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
 
 
@@ -209,10 +208,13 @@ class Sampler:
 def distinct_hands(
     T_cloud_hand: Float32, first: Bools, gripper: Gripper, options: DetectOptions
 ) -> Bools:
-    """Hands (E,) that non-maximum suppression keeps whatever their scores; `first` come first."""
+    """Hands (E,) that non-maximum suppression keeps whatever their scores; `first` come first.
+
+    Those within 4 mm and 10 degrees of each other share one score.
+    """
     rule = options.suppression
-    near = 0.0 if rule is None else min(SAME_TRANSLATION, rule.translation)
-    turned = 0.0 if rule is None else min(SAME_ROTATION, rule.rotation)
+    near = 0.0 if rule is None else min(0.004, rule.translation)
+    turned = 0.0 if rule is None else min(math.radians(10), rule.rotation)
     kept, T_cloud_tcp = np.zeros(len(first), dtype=bool), T_cloud_hand @ gripper.T_hand_tcp
     order = np.argsort(~first, kind="stable")
     kept[non_max_suppression(T_cloud_tcp, order, near, turned, len(order))[0]] = True

@@ -19,6 +19,7 @@ MAX_CLOUD_EXTENT = 20.0  # metres; if most of a cloud is wider, it is probably i
 MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 MAX_VIEW_TANGENT = 1.2  # of half a depth camera's field of view
+SUBSAMPLE_SIZE = 6000  # points that represent a cloud in fits, means and views
 LARGE_IMAGE = 704, 960  # pixels of an image of which every second row and column may be enough
 HAND_REACH = 0.25  # metres around an object in which a hand at it may collide
 OUTLIER_PERCENT = 0.5  # of the points, beyond each end of a range
@@ -138,11 +139,8 @@ def _pixel_spacing(image: Floats) -> float:
     return float(np.median(apart)) if len(apart) else math.nan
 
 
-def subsample(rows: NDArray[Scalar], most: int = 6000) -> NDArray[Scalar]:
-    """Rows spread evenly over all of an array, `most` of them or a few more.
-
-    As many as by default represent a cloud in fits, means and views.
-    """
+def subsample(rows: NDArray[Scalar], most: int = SUBSAMPLE_SIZE) -> NDArray[Scalar]:
+    """Rows spread evenly over all of an array, `most` of them or a few more."""
     return rows[:: max(len(rows) // most, 1)]
 
 
