@@ -115,10 +115,7 @@ class SelectedPoints:
 
 
 def select_points(
-    sent: CheckedCloud,
-    options: DetectOptions,
-    counts: dict[str, int],
-    warnings: list[str],
+    sent: CheckedCloud, options: DetectOptions, counts: dict[str, int], warnings: list[str]
 ) -> SelectedPoints:
     """Correct depths, segment, remove the support, and drop what no hand at an object can reach."""
     viewpoints, given = camera_positions(sent, options), _objects_given(sent, options)
