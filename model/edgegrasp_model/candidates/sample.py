@@ -235,12 +235,12 @@ def allowed_directions(
     rise = direction @ UP
     if constraint is None:
         return np.asarray(rise < 0.1)  # not from far below the horizontal
-    allowed = np.zeros(len(direction), dtype=bool)
+    allowed, preset = np.zeros(len(direction), dtype=bool), math.radians(30)
     for cone in constraint.cones:
         axis = in_frame(cone.direction)
         allowed |= direction @ (axis / np.linalg.norm(axis)) >= math.cos(cone.max_angle)
     if constraint.preset == "top-down":
-        allowed |= -rise >= math.cos(math.radians(30))
+        allowed |= -rise >= math.cos(preset)
     if constraint.preset == "side":
-        allowed |= np.abs(rise) <= math.sin(math.radians(30))
+        allowed |= np.abs(rise) <= math.sin(preset)
     return allowed

@@ -41,6 +41,7 @@ from edgegrasp_model.scene.cloud import (
     unit,
     voxelise,
 )
+from edgegrasp_model.scene.network import NEAREST_DEPTH
 from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.segment import (
     BACKGROUND,
@@ -63,6 +64,10 @@ from edgegrasp_model.unseen import DepthMap
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 FOLLOWED_REACH = 0.16  # the same if only known grasps are checked
 FOUND_PLANE_CLEARANCE = 0.0015  # metres that hands stay above a plane that was not given
+NO_OBJECT = (
+    "no object was recognised above the support plane. Send objects: off to look for grasps on "
+    "everything above it."
+)
 
 
 @dataclass(frozen=True)
@@ -155,15 +160,14 @@ def select_points(
             over = height[above], margin[above], math.isnan(support.growth)
             number, certain = objects_above(found, above, plan, *over)
             confidence = dict(enumerate(certain.tolist()))
-        elif viewpoints is not None and (found.number[above] >= 0).any():
+        elif viewpoints is not None and (
+            (found.number >= 0).any() or np.median(seen.distance()) < NEAREST_DEPTH
+        ):
             number, confidence = found.number, dict(enumerate(found.confidence.tolist()))
     if not given:
         number = without_long(number, sent.points, options.max_object_size)
         if counts["above_support"] and not (inside & (number >= 0)).any():
-            warnings.append(
-                "no object was recognised above the support plane. Send objects: off to look for "
-                "grasps on everything above it."
-            )
+            warnings.append(NO_OBJECT)
     number = np.where(inside | (number == BACKGROUND), number, UNDECIDED)
     labels[sent.row] = np.where(number >= 0, number, OBSTACLE)
     labels = labels_of_all_pixels(sent, labels) if options.debug else labels
