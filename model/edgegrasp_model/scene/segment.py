@@ -134,12 +134,11 @@ def _view_from_above(points: Float32, up: Float64 | None) -> list[View]:
     beside -= (beside @ over)[:, None] * over
     beside -= beside[np.linalg.norm(beside, axis=1).argmin()]  # there may be none at the median
     near = np.flatnonzero(np.linalg.norm(beside, axis=1) < USUAL_DISTANCE)
-    some = points[near]
-    low, high = np.percentile(some, (1, 99), axis=0)
-    eye = (low + high) / 2 + max(1.0, 1.5 * float((high - low).max())) * over
-    apart = some - some.mean(axis=0)
-    down = apart[np.linalg.norm(apart, axis=1).argmax()].astype(np.float64)
-    return [View(near, eye, down)]
+    middle = points[near].mean(axis=0, dtype=np.float64)
+    apart = points[near] - middle
+    distance = np.linalg.norm(apart, axis=1)
+    eye = middle + max(1.0, 2.5 * float(np.percentile(distance, 99))) * over
+    return [View(near, eye, apart[distance.argmax()])]
 
 
 def segment(
