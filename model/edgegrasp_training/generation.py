@@ -16,17 +16,7 @@ from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import Sample, Sampler
 from edgegrasp_model.detector import GraspDetector, Prepared
 from edgegrasp_model.gripper import gripper_fields
-from edgegrasp_model.options import (
-    AutoPlane,
-    Box,
-    Collision,
-    DetectOptions,
-    GripperGeometry,
-    OrientedBox,
-    Region,
-    SupportPlane,
-    Workspace,
-)
+from edgegrasp_model.options import DetectOptions, SupportPlane
 from edgegrasp_model.ranking import average_similar_hands
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_sim.camera import Observation, TableView, ViewRange
@@ -270,27 +260,21 @@ def ask(
     cameras = seen_from.sample(streams[CAMERA_STREAM])
     table: TableView = "around" if around else "known"
     observation = simulation.observe_from(cameras, noise, table=table, **seen)
-    support: SupportPlane | AutoPlane = _plane(noise) if around else TABLE_PLANE
-    low, high = map(tuple, observation.workspace.tolist())
-    workspace: Workspace | None = Workspace(min=low, max=high)
+    support, (low, high) = _plane(noise) if around else TABLE_PLANE, observation.workspace.tolist()
+    request: dict[str, Any] = {"support": support, "workspace": {"min": low, "max": high}}
     if around and choice.random() >= GIVEN_SHARE.get(kind, 0.0):
-        support, workspace = AutoPlane(), None
-    aimed = not open_table and not guided and choice.random() < AIMED_SHARE
-    objects = _objects_of(simulation) if aimed else None
-    fields = simulation.gripper
+        request = {}
+    if not open_table and not guided and choice.random() < AIMED_SHARE:
+        request["approach_region"] = request["contact_region"] = _objects_of(simulation)
     few = BIN_APPROACH_POINTS if kind in BINS else APPROACH_POINTS
-    request = DetectOptions(
-        num_approach_points=None if guided else few,
-        seed=int(choice.integers(2**32)),
-        viewpoint=tuple(observation.camera_position.tolist()),
-        support=support,
-        workspace=workspace,
-        approach_region=objects,
-        contact_region=objects,
-        collision=Collision(mode="avoid" if guided else "penalise"),
-        gripper=None if fields is None else GripperGeometry.model_validate(fields),
-    )
-    return observation, request
+    request |= {
+        "num_approach_points": None if guided else few,
+        "seed": int(choice.integers(2**32)),
+        "viewpoint": observation.camera_position.tolist(),
+        "collision": {"mode": "avoid" if guided else "penalise"},
+        "gripper": simulation.gripper,
+    }
+    return observation, DetectOptions.model_validate(request)
 
 
 def _plane(rng: np.random.Generator) -> SupportPlane:
@@ -301,19 +285,21 @@ def _plane(rng: np.random.Generator) -> SupportPlane:
     return SupportPlane(normal=(x, y, z), offset=float((x + y) * MIDDLE + z * height))
 
 
-def _objects_of(simulation: ClutterSimulation) -> Region:
-    """Bounds of the objects, without the obstacles around them."""
-    boxes = simulation.object_bounds + AIM_MARGIN
-    around = []
-    for box in simulation.surroundings.boxes:
-        if box.obstacle:
-            x, y, z = (size / 2 + AROUND_MARGIN for size in box.size)
-            turn = about_z(box.yaw)
-            around.append(OrientedBox(center=box.centre, half_extents=(x, y, z), quaternion=turn))
-    return Region(
-        include=tuple(Box(min=tuple(low), max=tuple(high)) for low, high in boxes.tolist()),
-        exclude=tuple(around),
-    )
+def _objects_of(simulation: ClutterSimulation) -> dict[str, Any]:
+    """The region of the objects' bounds, without the obstacles around them."""
+    boxes = (simulation.object_bounds + AIM_MARGIN).tolist()
+    around = [
+        {
+            "kind": "oriented_box",
+            "center": box.centre,
+            "half_extents": [size / 2 + AROUND_MARGIN for size in box.size],
+            "quaternion": about_z(box.yaw),
+        }
+        for box in simulation.surroundings.boxes
+        if box.obstacle
+    ]
+    include = [{"kind": "box", "min": low, "max": high} for low, high in boxes]
+    return {"include": include, "exclude": around}
 
 
 def label(
