@@ -1,7 +1,7 @@
 """Generate labelled views: observe random clutter, try edge grasps in it, keep the outcomes."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from edgegrasp_sim.camera import Observation, TableView, ViewRange
 from edgegrasp_sim.engine import choose_engine
 from edgegrasp_sim.hand import FINGERTIP
 from edgegrasp_sim.objects import CLUTTER, ObjectSet, SceneKind
-from edgegrasp_sim.poses import about_z
+from edgegrasp_sim.poses import Matrix, about_z
 from edgegrasp_sim.scene import STANDING_IN
 from edgegrasp_sim.sensor import random_sensor
 from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
@@ -35,8 +35,6 @@ from edgegrasp_training.shapes import household_objects, varied_objects
 from edgegrasp_training.views import TABLE as TABLE_PLANE
 from edgegrasp_training.views import LabelledView, load_view
 
-SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM, HAND_STREAM = range(6)
-HOUSEHOLD_STREAM = 6
 APPROACH_POINTS = 12  # few balls with many labels each are the cheapest to train on
 BIN_APPROACH_POINTS = 24  # walls block most hands there
 PACKED, PILE, BIN, TABLE, FULL_BIN, DEEP_BIN, SHELF = SceneKind
@@ -173,36 +171,31 @@ def generate_scene(
 ) -> list[LabelledView]:
     """Generate all views of one scene, of the built-in objects where there are no sets."""
     streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(7)]
+    scene, *of_views, shape, hand, household = streams
     kind = kind_of(options, index)
     # Some scenes are made of the other kind's objects, where there are any.
     source = kind.objects
-    if streams[SCENE_STREAM].random() < OTHER_OBJECTS:
+    if scene.random() < OTHER_OBJECTS:
         other = PILE if source is PACKED else PACKED
         source = other if other in sets else source
-    with TemporaryDirectory() as shapes:
-        drawn = sets.get(source)
-        if drawn is not None and streams[SHAPE_STREAM].random() < VARIED_SHARE:
-            drawn = varied_objects(drawn, Path(shapes), streams[SHAPE_STREAM])
-        household = options.household > streams[HOUSEHOLD_STREAM].random()
-        if household:
-            folder = Path(shapes) / "household"
-            drawn = household_objects(folder, NUM_HOUSEHOLD, streams[HOUSEHOLD_STREAM])
-        gripper = None  # the Panda's
-        if options.gripper == "random":
-            gripper = random_gripper(streams[HAND_STREAM])
-        elif options.gripper != "panda":
-            gripper = gripper_fields(options.gripper)
-        hand = "" if gripper is None else json.dumps(gripper)
+    gripper = None  # the Panda's
+    if options.gripper == "random":
+        gripper = random_gripper(hand)
+    elif options.gripper != "panda":
+        gripper = gripper_fields(options.gripper)
+    _, (low, high), _ = STANDING_IN[kind]
+    sizes, seen_from = (low * WIDER_SCALES[0], high * WIDER_SCALES[1]), VIEWS[kind]
+    drawn = sets.get(source)
+    with TemporaryDirectory() as folder:
+        if options.household > household.random():
+            drawn = household_objects(Path(folder), NUM_HOUSEHOLD, household)
+            sizes = HOUSEHOLD_SCALE
+            seen_from = SIDE_VIEWS if kind in (PACKED, PILE, TABLE) else seen_from
+        elif drawn is not None and shape.random() < VARIED_SHARE:
+            drawn = varied_objects(drawn, Path(folder), shape)
         made_of = None if drawn is None else {kind: drawn}
         with ClutterSimulation(made_of, engine=options.engine, gripper=gripper) as simulation:
-            _, (low, high), _ = STANDING_IN[kind]
-            sizes = low * WIDER_SCALES[0], high * WIDER_SCALES[1]
-            seen_from = VIEWS[kind]
-            if household:
-                sizes = HOUSEHOLD_SCALE
-                seen_from = SIDE_VIEWS if kind in (PACKED, PILE, TABLE) else seen_from
-            views = list(_views(simulation, kind, sizes, seen_from, options, streams))
-    return [replace(view, gripper=hand) for view in views]
+            return list(_views(simulation, kind, sizes, seen_from, options, scene, of_views))
 
 
 def _views(
@@ -211,10 +204,12 @@ def _views(
     sizes: tuple[float, float],  # range of the objects' scales
     seen_from: ViewRange,
     options: GenerationOptions,
-    streams: list[np.random.Generator],
+    rng: np.random.Generator,  # of the objects
+    of_views: Sequence[np.random.Generator],  # of cameras, noise, and requests and grasps
 ) -> Iterator[LabelledView]:
     """The views of one scene, which a network clears meanwhile, if one is given and drawn to."""
-    rng, guide, failures = streams[SCENE_STREAM], None, FAILURES
+    (camera, noise, choice), hand = of_views, simulation.gripper
+    guide, failures = None, FAILURES
     if options.weights is not None and rng.random() < CLEARED_SHARE:
         guide = detector(options.weights)
     for _ in range(options.views_per_scene):
@@ -223,10 +218,12 @@ def _views(
             simulation.reset(kind, rng, count, sizes)
             failures = 0
         models = [model.origin or model for model in simulation.object_models]
-        query = ask(simulation, kind, seen_from, streams, guided=guide is not None)
-        view, best = label(simulation, query, options, streams[CHOICE_STREAM], guide)
+        cameras, guided = seen_from.sample(camera), guide is not None
+        query = ask(simulation, kind, cameras, noise, choice, guided=guided)
+        view, best = label(simulation, query, options, choice, guide)
         yield replace(
             view,
+            gripper="" if hand is None else json.dumps(hand),
             engine=simulation.world.name,
             objects=tuple(model.name for model in models),
             object_digests=tuple(model.digest for model in models),
@@ -239,8 +236,9 @@ def _views(
 def ask(
     simulation: ClutterSimulation,
     kind: SceneKind,
-    seen_from: ViewRange,
-    streams: list[np.random.Generator],
+    cameras: Sequence[Matrix],  # (4, 4) T_world_camera of each
+    noise: np.random.Generator,  # of the observation and what it is said to show
+    choice: np.random.Generator,  # of the rest of the request
     *,
     guided: bool,  # whether a network clears the scene, and has to be asked as a robot asks it
 ) -> Query:
@@ -249,7 +247,6 @@ def ask(
     In bins, on tables and in some other views the cloud holds all that the camera sees, and the
     support is given, not quite where it is, or has to be found.
     """
-    noise, choice = streams[NOISE_STREAM], streams[CHOICE_STREAM]
     open_table = kind in (PACKED, PILE)
     around = not open_table or noise.random() < AROUND_SHARE
     draw, seen = noise.random(), dict[str, Any](noise_std=NOISE_STD)
@@ -257,7 +254,6 @@ def ask(
         seen = {"noise_std": 0.0, "sensor": random_sensor(noise)}
     elif draw < SENSOR_SHARE + OTHER_NOISE:
         seen = {"noise_std": noise.uniform(0.0, MAX_NOISE)}
-    cameras = seen_from.sample(streams[CAMERA_STREAM])
     table: TableView = "around" if around else "known"
     observation = simulation.observe_from(cameras, noise, table=table, **seen)
     support, (low, high) = _plane(noise) if around else TABLE_PLANE, observation.workspace.tolist()
@@ -409,12 +405,11 @@ def _likely(
 
 def _in_object(number: Int64, value: Floats) -> tuple[Int64, Int64]:
     """The place (E,) of each candidate among those of its object, best first, and how many."""
-    order = np.lexsort((-value, number))
-    _, start, row, size = np.unique(
-        number[order], return_index=True, return_inverse=True, return_counts=True
-    )
     place, count = np.empty((2, len(number)), dtype=np.int64)
-    place[order], count[order] = np.arange(len(number)) - start[row], size[row]
+    for each in np.unique(number):
+        mine = np.flatnonzero(number == each)
+        place[mine[np.argsort(-value[mine], kind="stable")]] = np.arange(len(mine))
+        count[mine] = len(mine)
     return place, count
 
 
