@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from edgegrasp_camera.arrays import Float32, Floats, Int64
+from edgegrasp_camera.arrays import Float32, Int64
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import Sample, Sampler
 from edgegrasp_model.detector import GraspDetector, Prepared
@@ -393,24 +393,17 @@ def _likely(
 
     Of scores that are trained on grasps drawn at random the best ones are too high.
     """
-    place, size = _in_object(number, logit)
-    chosen = (place == 0) | (_in_object(number, rating)[0] == 0)
-    likely = rng.permutation(np.flatnonzero(~chosen & (place < LIKELY * size)))
-    other = rng.permutation(np.flatnonzero(~chosen & (place >= LIKELY * size)))
-    left = max(total - int(chosen.sum()), 0)
-    chosen[likely[: round(LIKELY_SHARE * left)]] = True
-    chosen[other[: round((1.0 - LIKELY_SHARE) * left)]] = True
-    return np.flatnonzero(chosen)
-
-
-def _in_object(number: Int64, value: Floats) -> tuple[Int64, Int64]:
-    """The place (E,) of each candidate among those of its object, best first, and how many."""
-    place, count = np.empty((2, len(number)), dtype=np.int64)
+    chosen, likely = np.zeros((2, len(number)), dtype=bool)
     for each in np.unique(number):
         mine = np.flatnonzero(number == each)
-        place[mine[np.argsort(-value[mine], kind="stable")]] = np.arange(len(mine))
-        count[mine] = len(mine)
-    return place, count
+        order = mine[np.argsort(-logit[mine], kind="stable")]
+        likely[order] = np.arange(len(mine)) < LIKELY * len(mine)
+        chosen[[order[0], mine[rating[mine].argmax()]]] = True
+    left = max(total - int(chosen.sum()), 0)
+    for group, share in ((likely, LIKELY_SHARE), (~likely, 1.0 - LIKELY_SHARE)):
+        further = rng.permutation(np.flatnonzero(~chosen & group))
+        chosen[further[: round(share * left)]] = True
+    return np.flatnonzero(chosen)
 
 
 def random_gripper(rng: np.random.Generator) -> dict[str, Any]:
