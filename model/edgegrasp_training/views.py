@@ -4,13 +4,13 @@ import json
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -94,10 +94,9 @@ class LabelledView:
         """The object (N,) that each point belongs to; connected components where unknown."""
         if self.object_of_point is not None:
             return self.object_of_point.astype(np.int64)
-        count = len(self.points)
-        pairs = cKDTree(self.points).query_pairs(TOGETHER, output_type="ndarray")
-        graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
-        return connected_components(graph, directed=False)[1].astype(np.int64)
+        tree = cKDTree(self.points)
+        near = tree.sparse_distance_matrix(tree, TOGETHER, output_type="coo_matrix")
+        return connected_components(near, directed=False)[1].astype(np.int64)
 
     def tried(self) -> Int64:
         """Rows of the candidates that have a label."""
@@ -137,16 +136,11 @@ def split_by_scene(
 
     ValueError: none is left to train on.
     """
-    place = {
-        scene: zlib.crc32(f"{seed} {scene}".encode()) / 2**32 for scene in map(scene_of, paths)
-    }
-    limit = max(validation_share, min(place.values()) + 2**-32)
-    if max(place.values()) < limit:
-        raise ValueError(f"data: got {len(place)} scenes, all kept for validation. Make more")
-    return (
-        [path for path in paths if place[scene_of(path)] >= limit],
-        [path for path in paths if place[scene_of(path)] < limit],
-    )
+    place = [zlib.crc32(f"{seed} {scene_of(path)}".encode()) / 2**32 for path in paths]
+    kept = np.array(place) < max(validation_share, min(place) + 2**-32)
+    if kept.all():
+        raise ValueError(f"data: got {len(set(place))} scenes, all kept for validation. Make more")
+    return list(compress(paths, ~kept)), list(compress(paths, kept))
 
 
 def table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> list[str]:
