@@ -111,15 +111,12 @@ def free_shape(rng: np.random.Generator, index: int) -> str:
 def _surface(rings: Rings) -> tuple[Float64, Int64]:
     """Join neighbouring rings and close the ends by fans: points (P, 3), triangles (F, 3)."""
     count, corners, _ = rings.shape
-    ends = np.array([rings[0].mean(axis=0), rings[-1].mean(axis=0)])
-    points = np.concatenate([rings.reshape(-1, 3), ends])
-    sides = [each.reshape(count - 1, corners, 3) for each in strips(count, corners)]
-    this, last = np.arange(corners), (count - 1) * corners
-    beside = (this + 1) % corners
-    middle = np.full(corners, count * corners)
-    bottom = np.stack([middle, beside, this], axis=1)
-    top = np.stack([middle + 1, last + this, last + beside], axis=1)
-    triangles = np.concatenate([*np.stack(sides, axis=1).reshape(-1, corners, 3), bottom, top])
+    points = np.concatenate([rings.reshape(-1, 3), rings[[0, -1]].mean(axis=1)])
+    sides = np.stack([each.reshape(-1, corners, 3) for each in strips(count, corners)], axis=1)
+    ring, last = np.arange(corners), (count - 1) * corners
+    bottom = np.stack([np.full(corners, count * corners), np.roll(ring, -1), ring], axis=1)
+    top = bottom[:, [0, 2, 1]] + (1, last, last)
+    triangles = np.concatenate([sides.reshape(-1, 3), bottom, top])
     a, b, c = points[triangles].transpose(1, 0, 2)
     outwards = (np.cross(a, b) * c).sum() > 0.0
     return points, triangles if outwards else triangles[:, ::-1]
