@@ -6,11 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from edgegrasp_model.networks.checkpoint import NETWORKS
-from edgegrasp_model.networks.config import (
-    HAND_DESCRIPTION_SIZE,
-    CheckpointMetadata,
-    NetworkConfig,
-)
+from edgegrasp_model.networks.config import HAND_DESCRIPTION_SIZE, CheckpointMetadata, NetworkConfig
 from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
 from edgegrasp_model.networks.hand import HandNet
 from edgegrasp_model.networks.vn_edgegrasp import VNEdgeGraspNet
@@ -23,41 +19,28 @@ LENGTH_UNIT = 1 / 64
 CONSTANT = 1e-6  # standard deviation below which a number of the description counts as constant
 # With PyTorch's initial weights the dozen layers of a ball network would shrink signals to nothing.
 GAIN = 3**0.5
+LOCAL = (32, 64, 128)  # widths of the layers that see a point and its neighbours
+# Of the networks of balls: widths of those, before each maximum over the ball, of the classifier.
 RECIPES = {
     # The paper's network (section IV-B and the authors' release): 3.05 M parameters.
     "edgegrasp": NetworkConfig(
-        architecture="edgegrasp",
-        conv_widths=(32, 64, 128),
-        global_widths_1=(256, 512, 512),
-        global_widths_2=(1024, 1024),
-        classifier_widths=(512, 256, 128),
-        crop_radius=CROP_RADIUS,
+        "edgegrasp", LOCAL, (256, 512, 512), (1024, 1024), (512, 256, 128), crop_radius=CROP_RADIUS
     ),
     # An eighth of the paper's network (0.39 M parameters), for machines without a GPU.
     "edgegrasp-small": NetworkConfig(
-        architecture="edgegrasp",
-        conv_widths=(32, 64, 128),
-        global_widths_1=(128, 128, 128),
-        global_widths_2=(256, 256),
-        classifier_widths=(256, 128),
-        crop_radius=CROP_RADIUS,
+        "edgegrasp", LOCAL, (128, 128, 128), (256, 256), (256, 128), crop_radius=CROP_RADIUS
     ),
     # Scores each edge grasp in the frame of its own hand; 0.13 M parameters.
     "edgegrasp-plus": NetworkConfig(
         architecture="hand",
-        hand_widths=(32, 64, 128),
+        hand_widths=LOCAL,
         classifier_widths=(256, 128),
         description_size=HAND_DESCRIPTION_SIZE,
         crop_radius=CROP_RADIUS,
     ),
     # The paper's rotation-invariant variant, of Vector Neurons: 1.70 M parameters.
     "vn-edgegrasp": NetworkConfig(
-        architecture="vn-edgegrasp",
-        conv_widths=(32, 64, 128),
-        global_widths_1=(128, 128, 128),
-        global_widths_2=(381, 381),
-        classifier_widths=(256, 128, 64),
-        crop_radius=CROP_RADIUS,
+        "vn-edgegrasp", LOCAL, (128, 128, 128), (381, 381), (256, 128, 64), crop_radius=CROP_RADIUS
     ),
 }
 
