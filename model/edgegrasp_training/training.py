@@ -19,27 +19,9 @@ from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandNet
+from edgegrasp_training import examples, recipes
 from edgegrasp_training.evaluation import Evaluation, evaluate_scores, write_model_card
-from edgegrasp_training.examples import (
-    Packed,
-    Rotations,
-    Teacher,
-    TriedGrasps,
-    joined,
-    pack_balls,
-    pack_hands,
-    random_turn,
-    tried_grasps,
-    turned,
-)
 from edgegrasp_training.options import TrainingOptions
-from edgegrasp_training.recipes import (
-    LENGTH_UNIT,
-    build_network,
-    rescaled,
-    set_statistics,
-    start_from,
-)
 from edgegrasp_training.views import load_view
 
 VIEWS_IN_MEMORY = 8000
@@ -64,7 +46,7 @@ class Trainer:
         folder: Path,  # gets `state.pt`, `log.csv` and `NAME.safetensors`, the best so far
         options: TrainingOptions,  # the recipe
         device: torch.device | str = "cpu",  # where the network runs
-        teacher: Teacher | None = None,  # scores further candidates to learn from
+        teacher: examples.Teacher | None = None,  # scores further candidates to learn from
         start: Path | None = None,  # weights to start from; None: random ones
     ) -> None:
         """Set up, and resume from the folder's last state if there is one.
@@ -78,17 +60,17 @@ class Trainer:
         self.metadata, self.folder, self.options, self.device = metadata, folder, options, device
         self.train_paths, self.validation_paths = train_paths, validation_paths
 
-        def read(path: Path, viewpoint_known: bool) -> TriedGrasps:
-            return tried_grasps(load_view(path), metadata.network, viewpoint_known)
+        def read(path: Path, viewpoint_known: bool) -> examples.TriedGrasps:
+            return examples.tried_grasps(load_view(path), metadata.network, viewpoint_known)
 
         self._tried = lru_cache(maxsize=VIEWS_IN_MEMORY)(read)
         if teacher is not None:
             self._soft_labels = lru_cache(maxsize=VIEWS_IN_MEMORY)(teacher.soft_labels)
         generator = torch.Generator().manual_seed(options.seed)
-        self.network = build_network(metadata.network, generator).to(device)
+        self.network = recipes.build_network(metadata.network, generator).to(device)
         self.start = None if start is None else load_checkpoint(start)
         if self.start is not None:
-            start_from(self.network, self.start[0])
+            recipes.start_from(self.network, self.start[0])
         self.average = deepcopy(self.network).requires_grad_(False).eval()
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), options.learning_rate, weight_decay=WEIGHT_DECAY
@@ -150,11 +132,11 @@ class Trainer:
         """Calibrate the best network on all validation views; write it and its card."""
         path = self.folder / f"{self.metadata.name}.safetensors"
         best, saved = load_checkpoint(path)
-        self.average.load_state_dict(rescaled(best, LENGTH_UNIT).state_dict())
+        self.average.load_state_dict(recipes.rescaled(best, recipes.LENGTH_UNIT).state_dict())
         # Mixed once with where it started (Wortsman et al., CVPR 2022).
         if self.start is not None and not saved.training:
             first = deepcopy(self.average)
-            start_from(first, self.start[0])
+            recipes.start_from(first, self.start[0])
             with torch.no_grad():
                 for new, old in zip(self.average.parameters(), first.parameters(), strict=True):
                     new.lerp_(old, self.options.keep)
@@ -209,10 +191,10 @@ class Trainer:
             mean.lerp_(value.detach(), 1.0 - kept)
         return float(loss.detach())
 
-    def _training_batch(self, rng: np.random.Generator) -> Packed:
+    def _training_batch(self, rng: np.random.Generator) -> examples.Packed:
         """Random balls of random views, determined by the seed and the step number alone."""
         count = min(self.options.views_per_step, len(self.train_paths))
-        parts: list[Packed] = []
+        parts: list[examples.Packed] = []
         for index in rng.choice(len(self.train_paths), count, replace=False):
             camera_known, support_known = (rng.random(2) >= UNKNOWN).tolist()
             camera_matters = self.metadata.network.architecture == "hand"
@@ -226,25 +208,25 @@ class Trainer:
             if self.metadata.network.architecture == "edgegrasp":
                 # This network, unlike Vector Neurons, is not equivariant. Without a camera the
                 # detector's frame is upright, but may be turned any way about up.
-                rotations: Rotations = self.options.rotations
+                rotations: examples.Rotations = self.options.rotations
                 if not camera_known and rotations != "any":
                     rotations = "upright"
                 assert isinstance(packed.batch, BallBatch)
-                turn = random_turn(rotations, rng)
-                packed = packed._replace(batch=turned(packed.batch, turn))
+                turn = examples.random_turn(rotations, rng)
+                packed = packed._replace(batch=examples.turned(packed.batch, turn))
             parts.append(packed)
         batches, labels, weights = zip(*parts, strict=True)
-        return Packed(joined(batches), torch.cat(labels), torch.cat(weights))
+        return examples.Packed(examples.joined(batches), torch.cat(labels), torch.cat(weights))
 
     def _packed(
         self,
         path: Path,  # of the view
-        grasps: TriedGrasps,
+        grasps: examples.TriedGrasps,
         count: int | None,  # balls at most; None: all
         rng: np.random.Generator,  # chooses them
         *,
         vary: bool = False,  # choose the points of hands at random too
-    ) -> Packed | None:
+    ) -> examples.Packed | None:
         """Balls of a view whose grasps were tried, or scored by the teacher; None without any."""
         network, balls, taught = self.metadata.network, grasps.balls(), None
         if self.teacher is not None:
@@ -252,9 +234,9 @@ class Trainer:
             balls = np.union1d(balls, taught.candidates.approach_index).astype(np.int64)
         balls = np.sort(rng.choice(balls, min(count or len(balls), len(balls)), replace=False))
         if network.architecture == "hand":
-            packed = pack_hands(grasps, balls, network, rng if vary else None)
+            packed = examples.pack_hands(grasps, balls, network, rng if vary else None)
         else:
-            packed = pack_balls(grasps, balls, network, taught)
+            packed = examples.pack_balls(grasps, balls, network, taught)
         return packed if len(packed.label) else None
 
     def _standardise(self, network: HandNet) -> None:
@@ -262,13 +244,13 @@ class Trainer:
         seen = [self._tried(path, True).seen for path in self.train_paths]
         values = np.concatenate([hands.description.numpy() for hands in seen if hands is not None])
         mean, std = values.mean(axis=0, dtype=np.float64), values.std(axis=0, dtype=np.float64)
-        set_statistics(network, torch.from_numpy(mean), torch.from_numpy(std))
+        recipes.set_statistics(network, torch.from_numpy(mean), torch.from_numpy(std))
         self.average.load_state_dict(network.state_dict())
 
     def _save_average(self, metadata: CheckpointMetadata) -> None:
         """Write the running mean of the weights, for lengths in metres."""
         path = self.folder / f"{metadata.name}.safetensors"
-        save_checkpoint(path, rescaled(self.average, 1.0 / LENGTH_UNIT), metadata)
+        save_checkpoint(path, recipes.rescaled(self.average, 1.0 / recipes.LENGTH_UNIT), metadata)
 
     def _log(self, evaluation: Evaluation, train_loss: float) -> None:
         row = {
