@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -33,7 +33,6 @@ from edgegrasp_model.scene.scene import Surroundings
 from edgegrasp_training.recipes import LENGTH_UNIT
 from edgegrasp_training.views import UNTRIED, UP, LabelledView, load_view
 
-Rotations = Literal["any", "upright", "none"]
 SPARE_POINTS = 2  # factor of points kept per hand, from which each step picks
 TRIED_WEIGHT = 4.0  # weight of a simulated label in the loss; a teacher's score has weight 1
 SHAKEN_SHARE = 0.2  # part of a successful grasp's label that depends on surviving shaking
@@ -231,15 +230,13 @@ def turned(batch: BallBatch, turn: Float32) -> BallBatch:
     )
 
 
-def random_turn(rotations: Rotations, rng: np.random.Generator) -> Float32:
-    """A random rotation (3, 3) of balls: any (paper, section IV-D), about up, or none."""
-    match rotations:
-        case "any":
-            turn = Rotation.random(rng=rng)
-        case "upright":
-            turn = Rotation.from_rotvec(rng.uniform(0.0, 2 * np.pi) * UP)
-        case "none":
-            turn = Rotation.identity()
+def random_turn(rng: np.random.Generator, *, upright: bool) -> Float32:
+    """A random rotation (3, 3) of balls: any (paper, section IV-D), or about up."""
+    turn = (
+        Rotation.from_rotvec(rng.uniform(0.0, 2 * np.pi) * UP)
+        if upright
+        else Rotation.random(rng=rng)
+    )
     return turn.as_matrix().astype(np.float32)
 
 

@@ -18,6 +18,7 @@ from torch import nn
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
+from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
 from edgegrasp_model.networks.hand import HandNet
 from edgegrasp_training import examples, recipes
 from edgegrasp_training.evaluation import Evaluation, evaluate_scores, write_model_card
@@ -205,14 +206,12 @@ class Trainer:
             packed = self._packed(path, grasps, self.options.balls_per_view, rng, vary=True)
             if packed is None:
                 continue
-            if self.metadata.network.architecture == "edgegrasp":
-                # This network, unlike Vector Neurons, is not equivariant. Without a camera the
-                # detector's frame is upright, but may be turned any way about up.
-                rotations: examples.Rotations = self.options.rotations
-                if not camera_known and rotations != "any":
-                    rotations = "upright"
+            # The paper's network, unlike Vector Neurons, is not equivariant. Without a camera the
+            # detector's frame is upright, but may be turned any way about up.
+            upright = self.options.rotations == "none"
+            if isinstance(self.network, EdgeGraspNet) and not (upright and camera_known):
                 assert isinstance(packed.batch, BallBatch)
-                turn = examples.random_turn(rotations, rng)
+                turn = examples.random_turn(rng, upright=upright)
                 packed = packed._replace(batch=examples.turned(packed.batch, turn))
             parts.append(packed)
         batches, labels, weights = zip(*parts, strict=True)
