@@ -174,10 +174,8 @@ class Maker:
         """Objects in a compartment seen from the front, with others around it."""
         wide, deep, high = self.rng.uniform((0.45, 0.25, 0.26), (0.9, 0.45, 0.45))
         board = self.rng.uniform(0.012, 0.03)
-        low = self.box((wide, deep, board), (0, 0, -board / 2))
-        self.box((wide, deep, board), (0, 0, high + board / 2))
-        for height in (-high - 2 * board, 2 * high + 2 * board):
-            self.box((wide, deep, board), (0, 0, height))
+        levels = -board / 2, high + board / 2, -high - 2 * board, 2 * high + 2 * board
+        low, *_ = [self.box((wide, deep, board), (0, 0, level)) for level in levels]
         for side in (-1, 1):
             centre = (side * (wide + board) / 2, 0, high / 2)
             self.box((board, deep, 3 * high + 6 * board), centre)
