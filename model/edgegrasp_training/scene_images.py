@@ -108,7 +108,7 @@ def _make_image(scene: SceneMeshes, casting: o3d.t.geometry.RaycastingScene) -> 
     depth, label, steep = _cast(casting, scene.parts, camera, pose)
     close = (depth < 0.22).mean()
     seen = np.bincount(label.ravel(), minlength=OBJECT + MAX_OBJECTS)[OBJECT:]
-    if close > 0.15 or (scene.centres and (seen > 25).sum() < 1):
+    if close > 0.15 or (scene.centres and not (seen > 25).any()):
         return None
     noisy, label = _faults(scene, depth, label, camera, pose)
     if rng.random() < UNSEEN_WALLS:  # which leaves their rims floating
@@ -116,14 +116,11 @@ def _make_image(scene: SceneMeshes, casting: o3d.t.geometry.RaycastingScene) -> 
         noisy[steep & (label == OTHER) & unseen] = np.nan
     stored = np.nan_to_num(np.clip(noisy / DEPTH_UNIT, 0, 65535)).astype(np.uint16)
     turn, place = pose[:3, :3], pose[:3, 3]
-    centre = np.zeros((MAX_OBJECTS, 3), dtype=np.float32)
-    if scene.centres:
-        centre[: len(scene.centres)] = (np.array(scene.centres) - place) @ turn
-    up = turn[2]
-    plane = np.append(up, -place[2])
+    centre = np.zeros((MAX_OBJECTS, 3))
+    centre[: len(scene.centres)] = (np.reshape(scene.centres, (-1, 3)) - place) @ turn
     intrinsics = np.array([focal, focal, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5])
-    as_float = (intrinsics.astype(np.float32), up.astype(np.float32), plane.astype(np.float32))
-    return SceneImage(stored, label, centre, *as_float)
+    numbers = centre, intrinsics, turn[2], np.append(turn[2], -place[2])
+    return SceneImage(stored, label, *(each.astype(np.float32) for each in numbers))
 
 
 def _draw_pose(scene: SceneMeshes) -> Float64:
