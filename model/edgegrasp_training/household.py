@@ -297,9 +297,9 @@ def _rectangle(x: float, y: float) -> Float64:
 
 
 def lofted(outline: Float64, widths: Numbers, heights: Numbers) -> Float64:
-    """An outline (S, 2) scaled by a width at each height: (R, S, 3)."""
+    """An outline (S, 2) scaled by a width, or two (R, 2), at each height: (R, S, 3)."""
     rings = np.empty((len(widths), len(outline), 3))
-    rings[..., :2] = outline * np.asarray(widths)[:, None, None]
+    rings[..., :2] = outline * np.reshape(widths, (len(widths), 1, -1))
     rings[..., 2] = np.asarray(heights)[:, None]
     return rings
 

@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float64, Int64
-from edgegrasp_training.household import Mesh, strips
+from edgegrasp_training.household import Mesh, lofted, strips
 
 OTHER, SUPPORT, OBJECT = 0, 1, 2  # labels; objects are numbered from OBJECT
 MAX_OBJECTS = 96
@@ -390,14 +390,10 @@ def _open_box(
         rim = wall + (rng.uniform(0.0, 0.03) if rng.random() < 0.5 else 0.0)
         low, behind = -0.01, depth - 0.008
     inner, top = np.array(half), np.array(half) + slope
-    outline = [(inner, low), (top, depth), (top + rim, depth), (top + wall, behind)]
-    outline.append((inner + wall, low))
-    strips = np.array([(0, 1, 3), (0, 3, 2)]) + 2 * np.arange(len(outline) - 1)[:, None, None]
     corners = _ROUND if is_round else np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-    for k in range(len(corners)):
-        ends = corners[k], corners[(k + 1) % len(corners)]
-        points = np.array([(*(end * size), z) for size, z in outline for end in ends])
-        scene.add((points, strips.reshape(-1, 3)))
+    sizes = np.array([inner, top, top + rim, top + wall, inner + wall])
+    rings = lofted(corners, sizes, [low, depth, depth, behind, low])
+    scene.add((rings.reshape(-1, 3), np.concatenate(strips(*rings.shape[:2]))))
     if is_round:
         return
     for _ in range(int(rng.integers(1, 7)) if rng.random() < 0.35 else 0):  # handles and bosses
