@@ -71,7 +71,7 @@ def _bowl(rng: Random) -> list[Mesh]:
         length, thick = rng.uniform(0.08, 0.2), rng.uniform(0.006, 0.012)
         start = np.array([radius - wall, 0.0, depth - thick])
         end = start + np.array([length, 0.0, rng.uniform(0.0, 0.04)])
-        return [*parts, _rod(start, end, thick, thick)]
+        return [*parts, _rod(start, end, thick)]
     return _placed(parts, np.diag([1.0, rng.uniform(0.7, 1.0), 1.0]))
 
 
@@ -146,7 +146,7 @@ def _hammer(rng: Random) -> list[Mesh]:
     thick, span = rng.uniform(0.018, 0.036), rng.uniform(0.07, 0.13)
     poll, claw = np.array([length, span / 2, 0.0]), np.array([length, -span / 2, 0.0])
     middle = (poll + claw) / 2
-    head = [_rod(middle, poll, thick / 2, thick / 2), _rod(middle, claw, thick / 2, thick / 6)]
+    head = [_rod(middle, poll, thick / 2), _rod(middle, claw, thick / 2, thick / 6)]
     return [*_placed(handle, np.diag([length, 1.0, 1.0])), *head]
 
 
@@ -200,19 +200,15 @@ def _clamp(rng: Random) -> list[Mesh]:
     tip = np.array([reach - bar / 2, rng.uniform(-opening / 2, opening / 4), 0.0])
     end = np.array([tip[0], side + rng.uniform(0.02, 0.07), 0.0])
     across = np.array([rng.uniform(0.015, 0.03), 0.0, 0.0])
-    parts += [
-        _rod(tip, end, 0.35 * thick, 0.35 * thick),
-        _rod(end - across, end + across, 3e-3, 3e-3),
-    ]
-    return [*parts, _rod(tip, tip - (0.0, 0.006, 0.0), 0.6 * thick, 0.6 * thick)]
+    parts += [_rod(tip, end, 0.35 * thick), _rod(end - across, end + across, 3e-3)]
+    return [*parts, _rod(tip, tip - (0.0, 0.006, 0.0), 0.6 * thick)]
 
 
 def _pen(rng: Random) -> list[Mesh]:
     radius, length = rng.uniform(0.0035, 0.01), rng.uniform(0.11, 0.18)
     cap = radius * rng.uniform(1.0, 1.2)
-    body = _loft(
-        oval(1.0, int(rng.choice([6, FINE]))), [0.3 * radius, radius, radius], [0, 0.02, length]
-    )
+    outline = oval(1.0, int(rng.choice([6, FINE])))
+    body = _loft(outline, [0.3 * radius, radius, radius], [0, 0.02, length])
     return _placed([body, _solid([cap, cap], [length * rng.uniform(0.6, 0.9), length])], LIE)
 
 
@@ -226,22 +222,19 @@ def _fruit(rng: Random) -> list[Mesh]:
         for angle, way in ((0.0, -1.0), (angles[-1], 1.0)):
             along = way * np.array([-np.sin(angle), np.cos(angle), 0.0])
             centre = bend * np.array([np.cos(angle), np.sin(angle), 0.0])
-            parts.append(
-                _rod(centre, centre + rng.uniform(1.0, 2.5) * radius * along, radius, 0.005)
-            )
+            tip = centre + rng.uniform(1.0, 2.5) * radius * along
+            parts.append(_rod(centre, tip, radius, 0.005))
         return parts
     radius = rng.uniform(0.022, 0.05) if rng.random() < 0.85 else rng.uniform(0.05, 0.09)
     turn = np.linspace(-0.47, 0.47, 10) * np.pi
     stretch = np.array([rng.uniform(0.85, 1.0), rng.uniform(0.85, 1.0), rng.uniform(0.75, 1.1)])
     parts = [_solid(radius * np.cos(turn), radius * np.sin(turn))]
     if kind < 0.3:
-        top = radius * rng.uniform(1.2, 1.9)
-        parts.append(
-            _solid([0.88 * radius, 0.4 * radius, 0.2 * radius], [0.47 * radius, top, 1.08 * top])
-        )
-    parts = _placed(
-        parts, np.diag(stretch * (1.0, 1.0, rng.uniform(1.0, 1.4) if kind > 0.6 else 1.0))
-    )
+        top, radii = radius * rng.uniform(1.2, 1.9), [0.88 * radius, 0.4 * radius, 0.2 * radius]
+        parts.append(_solid(radii, [0.47 * radius, top, 1.08 * top]))
+    if kind > 0.6:
+        stretch[2] *= rng.uniform(1.0, 1.4)
+    parts = _placed(parts, np.diag(stretch))
     return _placed(parts, LIE) if kind > 0.7 else parts
 
 
@@ -353,15 +346,15 @@ def _walls(x: float, y: float, z: float, thick: float) -> list[Mesh]:
     return parts + [_box((thick, y, z), (side * (x - thick) / 2, 0.0, z / 2)) for side in sides]
 
 
-def _rod(start: Float64, end: Float64, first: float, last: float) -> Mesh:
-    """A round rod from one point to another, with the radius at each."""
+def _rod(start: Float64, end: Float64, first: float, last: float = 0.0) -> Mesh:
+    """A round rod from one point to another, with the radius at each; without a last the same."""
     along = end - start
     length = float(np.linalg.norm(along))
     z = along / length
     x = np.cross(z, (0.0, 0.0, 1.0) if abs(z[2]) < 0.9 else (1.0, 0.0, 0.0))
     x /= np.linalg.norm(x)
     frame = np.stack([x, np.cross(z, x), z], axis=1)
-    vertices, faces = _loft(oval(1.0, COARSE), [first, last], [0.0, length])
+    vertices, faces = _loft(oval(1.0, COARSE), [first, last or first], [0.0, length])
     return vertices @ frame.T + start, faces
 
 
