@@ -158,10 +158,8 @@ class Teacher:
             both, clear = retract(both, support, view.hand)
             both = both.take(np.flatnonzero(clear))
         both = both.take(rng.permutation(len(both)))
-        both = both.take(np.argsort(both.approach_index, kind="stable"))
-        _, first = np.unique(both.approach_index, return_index=True)
-        place = np.arange(len(both)) - np.repeat(first, np.diff([*first, len(both)]))
-        return both.take(place < GRASPS_PER_BALL)
+        rows = [np.flatnonzero(both.approach_index == ball)[:GRASPS_PER_BALL] for ball in balls]
+        return both.take(np.concatenate(rows))
 
 
 def pack_balls(
