@@ -9,6 +9,7 @@ are named by kind.
 """
 
 import argparse
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -219,9 +220,8 @@ def picture(maker: Maker, made: Made) -> dict[str, Float64]:
     for number, item in enumerate(maker.objects):
         label[body == item.body.uid] = FIRST + number
     label = on_the_surface(label, true, depth)
-    for number in np.unique(label[label > 1]):
-        if (label == number).sum() < LEAST * label.size:
-            label[label == number] = 0
+    little = np.bincount(label.ravel(), minlength=FIRST) < LEAST * label.size
+    label[little[label] & (label >= FIRST)] = 0
     millimetres = np.rint(1000 * np.nan_to_num(depth)).clip(0, 65535).astype(np.uint16)
     return {
         "depth": millimetres,
@@ -236,12 +236,11 @@ def on_the_surface(label: NDArray[np.uint8], true: Float64, depth: Float64) -> N
     """Labels (H, W) of readings: that of the nearby surface each lies on, 0 without one."""
     off = np.abs(depth - true)
     best, found = off.copy(), label.copy()
-    for down in range(-WINDOW, WINDOW + 1):
-        for right in range(-WINDOW, WINDOW + 1):
-            there = np.abs(depth - np.roll(true, (down, right), axis=(0, 1)))
-            nearer = (off > TOUCHED) & (there < best)
-            best[nearer] = there[nearer]
-            found[nearer] = np.roll(label, (down, right), axis=(0, 1))[nearer]
+    for shift in product(range(-WINDOW, WINDOW + 1), repeat=2):
+        there = np.abs(depth - np.roll(true, shift, axis=(0, 1)))
+        nearer = (off > TOUCHED) & (there < best)
+        best[nearer] = there[nearer]
+        found[nearer] = np.roll(label, shift, axis=(0, 1))[nearer]
     return np.where(best <= TOUCHED, found, 0).astype(np.uint8)
 
 
