@@ -76,20 +76,6 @@ MAX_NOISE = 0.004  # metres
 FREE_SHARE = 0.75  # of the grasps chosen at random, those that are collision-free
 LIKELY, LIKELY_SHARE = 1 / 3, 0.7  # best part of an object's grasps, most of which are tried there
 
-# Of a random hand.
-OPENING = 0.04, 0.14  # metres, as the other ranges
-LENGTH = 0.035, 0.12  # of the fingers, from the palm to their tips
-HALF_WIDTH = 0.005, 0.015  # of a finger
-THICKNESS = 0.006, 0.022  # of a finger at its tip
-ROOT = 0.0, 0.016  # further outward where it is thickest
-PALM_Z = 0.06, 0.09
-BODY = 0.02, 0.035  # half depth of the hand
-INSIDE = 0.007  # from a contact to the fingertips, as in every gripper file
-SWING_SHARE = 0.4  # of the hands, whose fingers swing
-RADIUS = 0.05, 0.11  # of the link that carries such a finger
-REACH = 0.6, 1.0  # outward part of that link in the open hand, in halves of the opening
-STEEPEST = 0.75  # most of it, in radii
-
 Query = tuple[Observation, DetectOptions]  # a view of a scene, and a request for grasps in it
 detector = lru_cache(maxsize=1)(GraspDetector.load)  # loads weights once in a process
 
@@ -409,30 +395,34 @@ def _likely(
 def random_gripper(rng: np.random.Generator) -> dict[str, Any]:
     """The fields of a gripper whose opening, and fingers' length, width and thickness are drawn.
 
-    A finger is a pad, and behind it a root that is no thinner.
+    A finger is a pad, and behind it a root that is no thinner. Metres.
     """
-    opening, length, half, thick = (
-        round(rng.uniform(*span), 4) for span in (OPENING, LENGTH, HALF_WIDTH, THICKNESS)
-    )
-    palm, body, root = (round(rng.uniform(*span), 4) for span in (PALM_Z, BODY, ROOT))
+
+    def draw(least: float, most: float) -> float:
+        return round(rng.uniform(least, most), 4)
+
+    opening, length = draw(0.04, 0.14), draw(0.035, 0.12)  # of a finger, from the palm to its tip
+    half_width, thick = draw(0.005, 0.015), draw(0.006, 0.022)  # of a finger, thick at its tip
+    # The palm's z, half the hand's depth, and what a finger's root has outward beside the pad.
+    palm, body, root = draw(0.06, 0.09), draw(0.02, 0.035), draw(0.0, 0.016)
     tip, pad = palm + length, palm + length * rng.uniform(0.2, 0.6)
     side = max(opening / 2 + thick + rng.uniform(-0.03, 0.02), 0.03)
-    swing = None
-    if rng.random() < SWING_SHARE:
-        radius = rng.uniform(*RADIUS)
-        reach = min(rng.uniform(*REACH) * opening / 2, STEEPEST * radius)
-        swing = {"radius": radius, "reach": reach}
+    contact = tip - 0.007  # as far from the tips as in every gripper file
+    swing: dict[str, float] | None = None
+    if rng.random() < 0.4:  # fingers swing on links, here their length and outward part
+        radius = rng.uniform(0.05, 0.11)
+        swing = {"radius": radius, "reach": min(rng.uniform(0.3, 0.5) * opening, 0.75 * radius)}
     return {
         "name": "random",
         "max_opening": opening,
         "tip_z": tip,
-        "contact_z": tip - INSIDE,
-        "tcp_z": tip - INSIDE,
+        "contact_z": contact,
+        "tcp_z": contact,
         "hand": {"boxes": [[[-body, -side, 0.0], [body, side, palm]]]},
         "finger": {
             "boxes": [
-                [[-half, 0.0, pad], [half, thick, tip]],
-                [[-half, 0.002, palm - 0.005], [half, thick + root, pad]],
+                [[-half_width, 0.0, pad], [half_width, thick, tip]],
+                [[-half_width, 0.002, palm - 0.005], [half_width, thick + root, pad]],
             ]
         },
         "swing": swing,
