@@ -2,8 +2,6 @@
 
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -98,10 +96,9 @@ def benchmark(*, asked: BenchmarkFlags, options: dict[str, Any]) -> None:
     """
     with TemporaryDirectory() as scratch:
         folder = ResultFolder(asked.output or Path(scratch))
-        with interruptible("benchmark", resumes=asked.output is not None):
-            config, fields = _plan(asked, parse_option_flags(options))
-            print(f"engine: {config.engine}")
-            summary = folder.finish(run_rounds(config, asked, fields, folder))
+        config, fields = _plan(asked, parse_option_flags(options))
+        print(f"engine: {config.engine}")
+        summary = folder.finish(run_rounds(config, asked, fields, folder))
         if asked.output is not None and asked.report:
             print(f"report: {write_report(folder, summary)}")
         _print_summary(summary, results.planner_title(folder.manifest()["run"]["planner"]))
@@ -201,18 +198,6 @@ def compare(
         f"{worse}, as many in {figures['scenes'] - better - worse}.",
         soft_wrap=True,
     )
-
-
-@contextmanager
-def interruptible(command: str, *, resumes: bool) -> Iterator[None]:
-    """End the program with a message if workers cannot run or the user interrupts it."""
-    try:
-        yield
-    except RuntimeError as error:
-        sys.exit(f"edgegrasp {command}: {error}")
-    except KeyboardInterrupt:
-        again = "; the same command goes on from there" if resumes else ""
-        sys.exit(f"edgegrasp {command}: interrupted{again}")
 
 
 def run_rounds(

@@ -3,7 +3,6 @@
 import shlex
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +12,7 @@ from rich.progress import Progress, track
 from typer import Argument, Option
 
 from edgegrasp_cli.flags import takes_flags
-from edgegrasp_lab.benchmark import Cluster, interruptible
+from edgegrasp_lab.benchmark import Cluster
 from edgegrasp_training.options import GenerationOptions, TrainingOptions
 
 
@@ -40,10 +39,9 @@ def generate_data(
     print(f"engine: {choose_engine(asked.engine)}")
     missing = len(missing_scenes(output, asked))
     tried = held = 0
-    with interruptible("generate-data", resumes=True):
-        made = generate(output, asked.objects, asked, asked.workers, asked.ray)
-        for _, grasps, successes in track(made, "scenes", total=missing):
-            tried, held = tried + grasps, held + successes
+    made = generate(output, asked.objects, asked, asked.workers, asked.ray)
+    for _, grasps, successes in track(made, "scenes", total=missing):
+        tried, held = tried + grasps, held + successes
     share = f", {100 * held / tried:.1f} % held" if tried else ""
     kept = asked.scenes - missing
     print(f"{missing} scenes made, {kept} kept; {tried} grasps tried{share}.")
@@ -136,16 +134,16 @@ def generate_scenes(
 
     Example: edgegrasp generate-scenes data/scenes --objects OBJECTS --files 110
     """
+    from edgegrasp_sim.workers import run_tasks
     from edgegrasp_training.scene_images import FILE, generate
 
     meshes = sorted(objects.glob("*/train/*_visual.obj"))
     if not meshes:
         raise ValueError(f"objects: got {objects}. Give a folder with */train/*_visual.obj.")
-    part = partial(generate, output, meshes, seed)
     missing = [number for number in range(files) if not (output / FILE.format(number)).exists()]
     # Each worker makes neighbours, which draw from the same objects.
-    with interruptible("generate-scenes", resumes=True), ProcessPoolExecutor(workers) as pool:
-        list(pool.map(part, np.array_split(missing, workers)))  # raises what a part does
+    parts = [part.tolist() for part in np.array_split(missing, workers)]
+    list(run_tasks(partial(partial, generate, output, meshes, seed), parts, workers=workers))
     print(f"{len(list(output.glob('scenes-????.npz')))} files in {output}.")
 
 
@@ -164,8 +162,7 @@ def train_scene(
     """
     from edgegrasp_training import scene_training
 
-    with interruptible("train-scene", resumes=False):
-        scene_training.train(data, run, 60.0 * minutes, seed, start_from, threads, learning_rate)
+    scene_training.train(data, run, 60.0 * minutes, seed, start_from, threads, learning_rate)
     print(f"weights in {run / 'scene.safetensors'}")
 
 

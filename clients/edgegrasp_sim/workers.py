@@ -26,6 +26,10 @@ PR_SET_PDEATHSIG = 1  # of Linux's prctl
 LOCAL_RAY = "local"  # address of a cluster that is started on this machine for the run
 
 
+class WorkerError(RuntimeError):
+    """Processes or a cluster that cannot run tasks."""
+
+
 def run_tasks(
     make_runner: MakeRunner[Task, Result],  # called once in every process
     tasks: Sequence[Task],
@@ -79,7 +83,7 @@ def _in_processes(
         except BrokenProcessPool:
             crashes += 1
             if crashes >= MAX_CRASHES:
-                raise RuntimeError(
+                raise WorkerError(
                     f"worker processes died {crashes} times in a row with {len(missing)} tasks "
                     "left; run with one worker to see why"
                 ) from None
@@ -125,7 +129,7 @@ def _on_ray(
     try:
         ray.init(address=address, log_to_driver=False, logging_level="ERROR", **own)
     except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
-        raise RuntimeError(f"no Ray cluster at {address!r}: {error}") from error
+        raise WorkerError(f"no Ray cluster at {address!r}: {error}") from error
     try:
         most = workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
         made = ray.put(ray.cloudpickle.dumps(make_runner))
@@ -141,6 +145,6 @@ def _on_ray(
     except ray.exceptions.RayTaskError as error:
         raise error.cause from None
     except ray.exceptions.RayError as error:
-        raise RuntimeError(f"a Ray worker died again and again: {error}") from error
+        raise WorkerError(f"a Ray worker died again and again: {error}") from error
     finally:
         ray.shutdown()

@@ -536,7 +536,7 @@ def _gl_context(width: int, height: int) -> Any:
         context = drawing.GLContext(width, height)
         context.make_current()
     except Exception as error:  # ctypes, OpenGL and EGL raise whatever they stumble over
-        raise RuntimeError(
+        raise OSError(
             f"MuJoCo cannot draw images with MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; on "
             "Debian and Ubuntu: apt-get install libegl1 libgl1"
         ) from error
