@@ -20,8 +20,8 @@ from edgegrasp_sim.benchmark import BenchmarkConfig, manifest, run_benchmark
 from edgegrasp_sim.engine import ArmModel
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import CameraRules, load_protocol
-from edgegrasp_sim.report import write_report
-from edgegrasp_sim.results import RATE_LABELS, ResultFolder, over_seeds, percent
+from edgegrasp_sim.report import key_figures, write_report
+from edgegrasp_sim.results import RATE_LABELS, ResultFolder, percent
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
 from edgegrasp_sim.trial import Round
 
@@ -101,7 +101,9 @@ def benchmark(*, asked: BenchmarkFlags, options: dict[str, Any]) -> None:
         summary = folder.finish(run_rounds(config, asked, fields, folder))
         if asked.output is not None and asked.report:
             print(f"report: {write_report(folder, summary)}")
-        _print_summary(summary, results.planner_title(folder.manifest()["run"]["planner"]))
+        planner = results.planner_title(folder.manifest()["run"]["planner"])
+        lines = (f"{name}: {value}" for name, value in key_figures(summary))
+        print(f"{planner}: " + "\n".join(lines))
     if asked.gate is not None:
         if below := results.below_gate(summary, asked.gate):
             sys.exit("edgegrasp benchmark: below the gate: " + "; ".join(below))
@@ -234,30 +236,3 @@ def run_rounds(
                 folder=folder,
                 on_round=on_round,
             )
-
-
-def _print_summary(summary: dict[str, Any], planner: str) -> None:
-    console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
-    trials = f"{summary['attempts']} grasps", f"{summary['objects']} objects"
-    rates = (
-        f"{label} {percent(summary[name])} %, {over_seeds(summary[name])} over seeds "
-        f"({summary['successes']} of {number})"
-        for (name, label), number in zip(RATE_LABELS.items(), trials, strict=True)
-    )
-    console.print(f"{planner}: {', '.join(rates)}")
-    wide = summary["too_wide"]
-    if wide["objects"]:
-        gsr, dr = (percent(wide[f"{name}_of_others"]) for name in RATE_LABELS)
-        console.print(
-            f"{wide['objects']} objects are wider than the hand opens; of the others: "
-            f"GSR {gsr} %, DR {dr} %"
-        )
-    if arm := summary["arm"]:
-        console.print(
-            f"{arm['picks_per_hour']:.0f} picks per hour; a motion out and home takes "
-            f"{arm['motion_seconds']:.1f} s; {arm['touched_on_the_way']} touched something before "
-            f"the pregrasp; {arm['scenes_with_a_reachable_grasp']} of {summary['rounds']} scenes "
-            "had a grasp within reach"
-        )
-    failures = {cause: count for cause, count in summary["failures"].items() if count}
-    console.print(f"failures: {failures}; rounds ended: {summary['round_ends']}")

@@ -78,9 +78,7 @@ def write_report(folder: ResultFolder, summary: dict[str, Any]) -> Path:
         pictures = list(_failure_pictures(folder, rounds))
     title = f"{planner_title(facts['run']['planner'])} on {summary['scene']} scenes"
     parts = [
-        table(_key_figures(summary)),
-        "<h2>Failures</h2>",
-        table([("cause", "times"), *summary["failures"].items()]),
+        table([("figure", ""), *key_figures(summary)]),
         *pictures,
         "<h2>Objects</h2>",
         table(_object_rows(summary)),
@@ -90,6 +88,36 @@ def write_report(folder: ResultFolder, summary: dict[str, Any]) -> Path:
     path = folder.path / "report.html"
     path.write_text(page(title, parts))
     return path
+
+
+def key_figures(summary: dict[str, Any]) -> Iterator[Row]:
+    """The figures of a benchmark, each with its name."""
+    rates = [summary[name] for name in RATE_LABELS]
+    for name, label in RATE_LABELS.items():
+        yield f"{label} % [95 % interval]", percent(summary[name])
+    for seed in rates[0]["by_seed"]:
+        yield f"seed {seed}: GSR, DR", ", ".join(_share(rate["by_seed"][seed]) for rate in rates)
+    yield "mean ± standard deviation over seeds: GSR, DR", ", ".join(map(over_seeds, rates))
+    yield "grasps held", f"{summary['successes']} of {summary['attempts']}"
+    yield "of those another object than the one aimed at", summary["wrong_object_successes"]
+    yield "objects", summary["objects"]
+    if number := (wide := summary["too_wide"])["objects"]:
+        of_others = ", ".join(percent(wide[f"{name}_of_others"]) for name in RATE_LABELS)
+        yield f"without {number} objects wider than the hand opens: GSR, DR", of_others
+    yield "failures", _counted(summary["failures"])
+    yield "ends of rounds", _counted(summary["round_ends"])
+    if times := summary["planning_seconds"]:
+        yield "planning, median", f"{times['median']:.2f} s"
+    if arm := summary["arm"]:
+        reached = f"{arm['scenes_with_a_reachable_grasp']} of {summary['rounds']}"
+        yield "scenes with a grasp within the arm's reach", reached
+        yield "motions that touched something before the pregrasp", arm["touched_on_the_way"]
+        yield "a motion out and home, median", f"{arm['motion_seconds']:.1f} s"
+        yield "picks per hour", f"{arm['picks_per_hour']:.0f}"
+
+
+def _counted(counts: dict[str, int]) -> str:
+    return ", ".join(f"{number} {name}" for name, number in counts.items() if number) or "none"
 
 
 def attempt_title(done: Round, number: int) -> str:
@@ -133,23 +161,6 @@ def image(kind: str, content: bytes, text: str) -> str:
     """An embedded picture of a kind such as png, with alternative text."""
     source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
     return f"<img src='{source}' alt='{escape(text, quote=True)}'>"
-
-
-def _key_figures(summary: dict[str, Any]) -> Iterator[Row]:
-    rates = [summary[name] for name in RATE_LABELS]
-    times, ends = summary["planning_seconds"], summary["round_ends"]
-    yield "", ""
-    for name, label in RATE_LABELS.items():
-        yield f"{label} % [95 % interval]", percent(summary[name])
-    for seed in rates[0]["by_seed"]:
-        yield f"seed {seed}: GSR, DR", ", ".join(_share(rate["by_seed"][seed]) for rate in rates)
-    yield "mean ± standard deviation over seeds: GSR, DR", ", ".join(map(over_seeds, rates))
-    yield "protocol", f"{summary['protocol']}, version {summary['protocol_version']}"
-    yield "rounds", ", ".join(f"{count} ended: {end}" for end, count in ends.items())
-    yield "grasps held", f"{summary['successes']} of {summary['attempts']}"
-    yield "of those another object than the one aimed at", summary["wrong_object_successes"]
-    yield "objects", summary["objects"]
-    yield "planning, median", f"{times['median']:.2f} s" if times else "-"
 
 
 def _object_rows(summary: dict[str, Any]) -> Iterator[Row]:
