@@ -98,7 +98,8 @@ def benchmark(*, asked: BenchmarkFlags, options: dict[str, Any]) -> None:
         folder = ResultFolder(asked.output or Path(scratch))
         config, fields = _plan(asked, parse_option_flags(options))
         print(f"engine: {config.engine}")
-        summary = folder.finish(run_rounds(config, asked, fields, folder))
+        run_rounds(config, asked, fields, folder)
+        summary = folder.finish()
         if asked.output is not None and asked.report:
             print(f"report: {write_report(folder, summary)}")
         planner = results.planner_title(folder.manifest()["run"]["planner"])
@@ -204,35 +205,24 @@ def compare(
 
 def run_rounds(
     config: BenchmarkConfig, asked: BenchmarkFlags, options: dict[str, Any], folder: ResultFolder
-) -> list[Round]:
-    """Run the rounds that a folder lacks, with a progress bar; returns all."""
+) -> None:
+    """Run the rounds that a folder lacks, with a progress bar."""
     from edgegrasp_lab.planners import open_planner  # loads gRPC, which help does without
 
     # Fails on a wrong folder before a server is started, and prepares meshes once for all workers.
     with Console(stderr=True).status("reading objects"):
         config.object_set()
-    scene, tasks = config.scene.value, config.tasks()
     came: list[Round] = []
     with open_planner(asked, config.protocol.planning, options) as planner:
         facts = manifest(config, planner.facts)
         if asked.gate is not None:  # another file fails here, not after hours
             results.below_gate(results.summary_of(facts["run"], []), asked.gate)
         folder.open(facts)
-        finished = sum((done.seed, done.index) in tasks for done in folder.rounds())
         with Progress(*Progress.get_default_columns(), TimeElapsedColumn()) as progress:
-            bar = progress.add_task(scene, total=len(tasks), completed=finished)
-
-            def on_round(done: Round) -> None:
+            kept, total = len(folder.rounds()), len(config.tasks())
+            bar = progress.add_task(config.scene, total=total, completed=kept)
+            for done in run_benchmark(config, planner.make, folder, asked.workers, asked.ray):
                 came.append(done)
                 successes, attempts, objects = results.count(came).sum(axis=1)
-                text = f"{scene} GSR {successes}/{attempts} DR {successes}/{objects}"
+                text = f"{config.scene} GSR {successes}/{attempts} DR {successes}/{objects}"
                 progress.update(bar, advance=1, description=text)
-
-            return run_benchmark(
-                config,
-                planner.make,
-                workers=asked.workers,
-                ray=asked.ray,
-                folder=folder,
-                on_round=on_round,
-            )

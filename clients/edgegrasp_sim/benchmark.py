@@ -2,7 +2,7 @@
 
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import distributions
@@ -72,26 +72,18 @@ class BenchmarkConfig:
 def run_benchmark(
     config: BenchmarkConfig,  # what to run
     make_planner: PlannerFactory,  # called once in every process
-    *,
+    folder: ResultFolder,  # keeps each round as it finishes; opened by the caller
     workers: int | None = 1,  # how many rounds at a time, and
     ray: str | None = None,  # address of a Ray cluster to run them on: see `run_tasks`
-    folder: ResultFolder | None = None,  # keeps each round as it finishes; opened by the caller
-    on_round: Callable[[Round], None] | None = None,  # called as each finishes
-) -> list[Round]:
-    """Run the rounds that `folder` does not hold yet; all, by seed and index. See `run_tasks`."""
+) -> Iterator[Round]:
+    """Run the rounds that `folder` lacks; yields each as it finishes. See `run_tasks`."""
     digest = config.object_set().digest  # fails here on a wrong folder, not in every worker
-    tasks = config.tasks()
-    kept = folder.rounds() if folder is not None else []
-    rounds = {(done.seed, done.index): done for done in kept}
-    missing = [task for task in tasks if task not in rounds]
+    kept = {(done.seed, done.index) for done in folder.rounds()}
+    missing = [task for task in config.tasks() if task not in kept]
     make_runner = partial(RoundRunner, config, make_planner, digest)
-    for task, done in run_tasks(make_runner, missing, workers=workers, ray=ray):
-        rounds[task] = done
-        if folder is not None:
-            folder.add(done)
-        if on_round is not None:
-            on_round(done)
-    return [rounds[task] for task in tasks]
+    for _, done in run_tasks(make_runner, missing, workers=workers, ray=ray):
+        folder.add(done)
+        yield done
 
 
 def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]:

@@ -76,8 +76,9 @@ class ResultFolder:
         table: dict[str, Any] = json.loads(file.read_text())
         return table
 
-    def finish(self, rounds: Sequence[Round]) -> dict[str, Any]:
+    def finish(self) -> dict[str, Any]:
         """Write `attempts.csv` and `summary.json`; returns the summary."""
+        rounds = self.rounds()
         summary = summary_of(self.manifest()["run"], rounds)
         _write(self.path / "summary.json", json.dumps(summary, indent=1) + "\n")
         with (self.path / "attempts.csv").open("w", newline="") as file:

@@ -69,10 +69,19 @@ class Planner:
 """
 
 
+def run_in(path: Path, config: BenchmarkConfig, planner=make_planner, **limits) -> list[Round]:
+    """The rounds of a benchmark that runs, or goes on, in a folder."""
+    folder = ResultFolder(path)
+    folder.open(manifest(config, {"name": "top-down"}))
+    for _ in run_benchmark(config, planner, folder, **limits):
+        pass
+    return folder.rounds()
+
+
 @pytest.fixture(scope="module")
-def alone() -> tuple[BenchmarkConfig, str]:
+def alone(tmp_path_factory) -> tuple[BenchmarkConfig, str]:
     config = BenchmarkConfig(SceneKind.PACKED, 2, (0, 3), TWO_OBJECTS)
-    rounds = run_benchmark(config, make_planner)
+    rounds = run_in(tmp_path_factory.mktemp("alone"), config)
     assert [(done.seed, done.index) for done in rounds] == [(0, 0), (0, 1), (3, 0), (3, 1)]
     return config, attempts_digest(rounds)
 
@@ -84,7 +93,7 @@ def test_rounds_of_a_crashed_worker_are_run_again_and_workers_change_nothing(
     (tmp_path / "dies_once.py").write_text(DIES_ONCE)
     monkeypatch.syspath_prepend(tmp_path)  # workers get it, too
     planner = importlib.import_module("dies_once").Planner
-    rounds = run_benchmark(config, planner, workers=2)
+    rounds = run_in(tmp_path / "rounds", config, planner, workers=2)
     assert (tmp_path / "dies_once.died").exists()
     assert (tmp_path / "dies_once.closed").exists()
     assert attempts_digest(rounds) == digest
@@ -116,20 +125,17 @@ def test_wrong_settings_are_refused(tmp_path: Path) -> None:
             BenchmarkConfig(SceneKind.PILE, rounds, seeds)
     config = BenchmarkConfig(SceneKind.PILE, rounds=1)
     with pytest.raises(FileNotFoundError, match=r"no \*\.urdf, \*\.obj"):
-        run_benchmark(replace(config, objects=tmp_path), make_planner, workers=2)
+        run_in(tmp_path / "rounds", replace(config, objects=tmp_path), workers=2)
     with pytest.raises(ValueError, match="workers is 0"):
-        run_benchmark(config, make_planner, workers=0)
+        run_in(tmp_path / "rounds", config, workers=0)
     with pytest.raises(ValueError, match="returned <class 'int'>; return a PlannedGrasp or None"):
-        run_benchmark(config, lambda: lambda *_: 7)
+        run_in(tmp_path / "rounds", config, lambda: lambda *_: 7)
 
 
 def test_a_killed_run_goes_on_and_changes_nothing(alone, tmp_path) -> None:
     config, digest = alone
     folder = ResultFolder(tmp_path)
-    folder.open(manifest(config, {"name": "top-down"}))
-    process = multiprocessing.get_context("spawn").Process(
-        target=run_benchmark, args=(config, make_planner), kwargs={"folder": folder}
-    )
+    process = multiprocessing.get_context("spawn").Process(target=run_in, args=(tmp_path, config))
     process.start()
     while not list(folder.path.glob("rounds/*.json")):
         assert process.is_alive() or process.exitcode == 0
@@ -138,25 +144,23 @@ def test_a_killed_run_goes_on_and_changes_nothing(alone, tmp_path) -> None:
     process.join()
     kept = len(folder.rounds())
     assert 1 <= kept <= 4
-    again: list[object] = []
-    rounds = run_benchmark(config, make_planner, folder=folder, on_round=again.append)
-    assert len(again) == 4 - kept
-    assert attempts_digest(rounds) == attempts_digest(folder.rounds()) == digest
+    assert len(list(run_benchmark(config, make_planner, folder))) == 4 - kept
+    assert attempts_digest(folder.rounds()) == digest
     with pytest.raises(ValueError, match="different planner"):
         folder.open(manifest(config, {"name": "other"}))
 
 
-def test_a_missing_ray_or_cluster_is_named(alone, monkeypatch) -> None:
+def test_a_missing_ray_or_cluster_is_named(alone, tmp_path, monkeypatch) -> None:
     config, _ = alone
     with pytest.raises(ValueError, match="differ between the machines"):
         RoundRunner(config, make_planner, "another digest")
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ModuleNotFoundError, match=r"ray is not .*edgegrasp\[ray\]"):
-        run_benchmark(config, make_planner, ray="local")
+        run_in(tmp_path, config, ray="local")
     deaf = Mock(init=Mock(side_effect=ConnectionError("nobody answers")))
     monkeypatch.setitem(sys.modules, "ray", deaf)
     with pytest.raises(RuntimeError, match=r"no Ray cluster at '127\.0\.0\.1:1': nobody"):
-        run_benchmark(config, make_planner, ray="127.0.0.1:1")
+        run_in(tmp_path, config, ray="127.0.0.1:1")
 
 
 def test_a_protocol_comes_back_from_a_manifest_or_a_file_beside_its_base(tmp_path: Path) -> None:
@@ -323,7 +327,7 @@ def test_the_folder_holds_a_row_for_every_attempt(tmp_path: Path) -> None:
     for done in ROUNDS:
         folder.add(done)
     assert folder.rounds() == ROUNDS
-    summary = folder.finish(folder.rounds())
+    summary = folder.finish()
     assert json.loads(json.dumps(summary)) == json.loads((folder.path / "summary.json").read_text())
     with (folder.path / "attempts.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -352,7 +356,7 @@ def test_results_of_two_engines_are_kept_apart(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"differ in engine"):
         compare(*folders)
     with pytest.raises(ValueError, match="engine 'pybullet', not 'mujoco'"):
-        below_gate(folders[1].finish(ROUNDS), gate_file(tmp_path))
+        below_gate(folders[1].finish(), gate_file(tmp_path))
 
 
 def gate_file(path: Path) -> Path:
