@@ -5,7 +5,7 @@ A planner is any callable; what runs behind it is up to the caller.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import TypeAlias
 
@@ -80,9 +80,9 @@ class Attempt:
         return np.asarray(self.T_world_hand, np.float32)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Round:
-    """One round of clutter removal."""
+    """One round of clutter removal, as it goes on."""
 
     seed: int  # with `index` it gives the scene, the views and the noise
     index: int  # number of the round
@@ -146,18 +146,17 @@ class RoundDriver:
             # Something in front may hide all of the objects.
             height = crop(seen.cloud, seen.workspace)[:, 2] - seen.table_height
             shown = np.count_nonzero(height > 0.005) >= MIN_SEEN
-            started = time.perf_counter()
+            grasp, started = None, time.perf_counter()
             try:
                 grasp = planner(seen, seed) if shown else None
             except StartCollides:
-                grasp, before = None, self._round.start_collisions
-                self._round = replace(self._round, start_collisions=before + 1)
-            seconds = time.perf_counter() - started
+                self._round.start_collisions += 1
             if grasp is None:
-                self._round = replace(self._round, no_grasp=self._round.no_grasp + 1)
+                self._round.no_grasp += 1
             else:
-                self.execute(grasp, seconds)
-        return replace(self._round, end=end)
+                self.execute(grasp, time.perf_counter() - started)
+        self._round.end = end
+        return self._round
 
     def look(self) -> Observation:
         """Take the next view."""
@@ -195,5 +194,5 @@ class RoundDriver:
             touched_on_the_way=result.touched_on_the_way,
         )
         self._failures = 0 if attempt.success else self._failures + 1
-        self._round = replace(self._round, attempts=(*self._round.attempts, attempt))
+        self._round.attempts += (attempt,)
         return attempt
