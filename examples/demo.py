@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+import trimesh
 
 from edgegrasp_camera.picture import Picture, View
 from edgegrasp_client import Detection, DetectOptions, GraspClient, GraspClientError
@@ -56,7 +56,8 @@ def main(seed: int, output: Path, engine: str | None = None) -> None:
         print(f"Executed the best one in the simulator: {verdict}.")
 
     output.mkdir(parents=True, exist_ok=True)
-    write_ply(output / "scene.ply", seen.cloud, colors)
+    points = trimesh.Trimesh(seen.cloud, vertex_colors=colors, process=False)
+    points.export(output / "scene.ply")
     drawn = over_grpc.grasps[:LISTED]
     title = f"The {len(drawn)} best grasps among {placed} objects. Executed the best: {verdict}."
     view = View.of(crop(seen.cloud, seen.workspace, 0.05), seen.camera_position)
@@ -102,15 +103,6 @@ def report(transport: str, detection: Detection) -> None:
             f"{x:.3f}, {y:.3f}, {z:.3f}    {u:+.2f}, {v:+.2f}, {w:+.2f}"
         )
     print("counts:", ", ".join(f"{name} {count}" for name, count in detection.counts.items()), "\n")
-
-
-def write_ply(path: Path, cloud: NDArray[np.float32], colors: NDArray[np.uint8]) -> None:
-    """Write a cloud, (N, 3) metres, and its colours as a binary PLY file."""
-    axes = "".join(f"property float {axis}\n" for axis in "xyz")
-    shades = "".join(f"property uchar {shade}\n" for shade in ("red", "green", "blue"))
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud)}\n"
-    rows = np.concatenate([cloud.astype("<f4").view(np.uint8), colors], axis=1)
-    path.write_bytes(f"{head}{axes}{shades}end_header\n".encode() + rows.tobytes())
 
 
 if __name__ == "__main__":
