@@ -10,7 +10,6 @@ import numpy as np
 from pydantic import BaseModel
 from rich.console import Console
 from rich.progress import Progress, TimeElapsedColumn
-from rich.table import Table
 from typer import Argument, Option
 
 from edgegrasp_cli.flags import Connection, option_flags, parse_option_flags, takes_flags
@@ -23,7 +22,6 @@ from edgegrasp_sim.protocol import CameraRules, load_protocol
 from edgegrasp_sim.report import key_figures, write_report
 from edgegrasp_sim.results import RATE_LABELS, ResultFolder, percent
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
-from edgegrasp_sim.trial import Round
 
 FAR = 0.5  # metres from the arm's base to the middle of a scene
 LIFT = {"retreat_length": 0.1, "retreat_direction": "up"}  # metres
@@ -188,18 +186,15 @@ def compare(
     figures = results.compare(ResultFolder(first), ResultFolder(second))
     if output is not None:
         output.write_text(json.dumps(figures, indent=1) + "\n")
-    table = Table("", str(first), str(second), "difference, paired")
     for name, label in RATE_LABELS.items():
         row = figures[name]
         difference = {"value": row["difference"], "wilson_95": row["difference_95"]}
-        table.add_row(f"{label} %", *map(percent, (row["first"], row["second"], difference)))
-    console = Console(markup=False, emoji=False)
-    console.print(table)
+        rates = " and ".join(percent(row[run]) for run in ("first", "second"))
+        print(f"{label} %: {rates}; paired difference {percent(difference)}")
     better, worse = figures["second_better"], figures["second_worse"]
-    console.print(
+    print(
         f"{figures['scenes']} scenes: the second removed more objects in {better}, fewer in "
-        f"{worse}, as many in {figures['scenes'] - better - worse}.",
-        soft_wrap=True,
+        f"{worse}, as many in {figures['scenes'] - better - worse}."
     )
 
 
@@ -212,7 +207,7 @@ def run_rounds(
     # Fails on a wrong folder before a server is started, and prepares meshes once for all workers.
     with Console(stderr=True).status("reading objects"):
         config.object_set()
-    came: list[Round] = []
+    counts = np.zeros(len(results.COUNTS), np.int64)
     with open_planner(asked, config.protocol.planning, options) as planner:
         facts = manifest(config, planner.facts)
         if asked.gate is not None:  # another file fails here, not after hours
@@ -222,7 +217,7 @@ def run_rounds(
             kept, total = len(folder.rounds()), len(config.tasks())
             bar = progress.add_task(config.scene, total=total, completed=kept)
             for done in run_benchmark(config, planner.make, folder, asked.workers, asked.ray):
-                came.append(done)
-                successes, attempts, objects = results.count(came).sum(axis=1)
+                counts += results.count([done])[:, 0]
+                successes, attempts, objects = counts
                 text = f"{config.scene} GSR {successes}/{attempts} DR {successes}/{objects}"
                 progress.update(bar, advance=1, description=text)

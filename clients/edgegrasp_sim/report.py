@@ -76,7 +76,8 @@ def write_report(folder: ResultFolder, summary: dict[str, Any]) -> Path:
     pictures: list[str] = []
     if "arm" not in facts["run"]:
         pictures = list(_failure_pictures(folder, rounds))
-    title = f"{planner_title(facts['run']['planner'])} on {summary['scene']} scenes"
+    protocol = f"protocol {summary['protocol']}, version {summary['protocol_version']}"
+    title = f"{planner_title(facts['run']['planner'])} on {summary['scene']} scenes, {protocol}"
     parts = [
         table([("figure", ""), *key_figures(summary)]),
         *pictures,
