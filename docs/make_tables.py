@@ -38,15 +38,13 @@ def _options() -> Rows:
     """Options, then each object that they are made of."""
     yield ["option", "value", "default", "meaning"]
     schema = DetectOptions.model_json_schema()
-    objects, todo = {"DetectOptions": schema}, [schema]
-    while todo:
-        for name in re.findall(r'"#/\$defs/(\w+)"', json.dumps(todo.pop(0)["properties"])):
-            if name not in objects:
-                objects[name] = schema["$defs"][name]
-                todo.append(objects[name])
-    for name, part in objects.items():
-        prefix = "" if name == "DetectOptions" else f"{name}."
+    names = ["DetectOptions"]
+    for name in names:  # which grows by the objects in each
+        part = schema["$defs"].get(name, schema)
         fields = dict(part["properties"])
+        named = dict.fromkeys(re.findall(r'"#/\$defs/(\w+)"', json.dumps(fields)))
+        names += [one for one in named if one not in names]
+        prefix = "" if part is schema else f"{name}."
         if prefix:
             tag = fields.pop("kind", None)
             shown = "object" if tag is None else f'object, `"kind": "{tag["const"]}"`'

@@ -39,11 +39,11 @@ def choose_engine(asked: str | None = None, protocol: str = "") -> str:
     for name in filter(None, (asked, protocol)):
         if name not in ENGINES:
             raise ValueError(f"engine is {name!r}; choose one of {', '.join(ENGINES)}")
-    if asked and not installed(asked):
-        raise ModuleNotFoundError(f"engine {asked} is not installed: pip install {asked}")
     for name in filter(None, (asked, protocol, *ENGINES)):
         if installed(name):
             return name
+        if name == asked:
+            raise ModuleNotFoundError(f"engine {asked} is not installed: pip install {asked}")
     raise ModuleNotFoundError("no physics engine is installed: pip install 'edgegrasp[sim]'")
 
 
