@@ -214,7 +214,7 @@ def run_rounds(
             results.below_gate(results.summary_of(facts["run"], []), asked.gate)
         folder.open(facts)
         with Progress(*Progress.get_default_columns(), TimeElapsedColumn()) as progress:
-            kept, total = len(folder.rounds()), len(config.tasks())
+            kept, total = len(folder.rounds()), config.rounds * len(config.seeds)
             bar = progress.add_task(config.scene, total=total, completed=kept)
             for done in run_benchmark(config, planner.make, folder, asked.workers, asked.ray):
                 counts += results.count([done])[:, 0]

@@ -52,15 +52,6 @@ class RealScene:
         """(R,) number of the object that each point is on, from 1; 0 for the background."""
         return np.maximum(self.labels - FIRST_OBJECT + 1, 0)
 
-    @property
-    def feet(self) -> Float64:
-        """(K, 3) the middle of each object, projected onto the visible support plane."""
-        middles = [
-            np.nanmedian(self.points[self.labels == label], axis=0) for label in self.objects
-        ]
-        height = np.asarray(middles, dtype=np.float64) @ self.normal - self.offset
-        return np.asarray(middles - height[:, None] * self.normal)
-
 
 @dataclass(frozen=True)
 class Segmentation:
@@ -267,7 +258,12 @@ def _objects_held(scene: RealScene, grasps: Sequence[Any]) -> Int64:
 def _compare(scene: RealScene, normal: Array, offset: float) -> PlaneFigures:
     cosine = float(np.clip(np.asarray(normal, dtype=np.float64) @ scene.normal, -1.0, 1.0))
     angle = float(np.degrees(np.arccos(cosine)))
-    apart = float(np.abs(scene.feet @ normal - offset).max())
+    middles = np.array(
+        [np.nanmedian(scene.points[scene.labels == k], axis=0) for k in scene.objects]
+    )
+    height = middles.astype(np.float64) @ scene.normal - scene.offset
+    feet = middles - height[:, None] * scene.normal
+    apart = float(np.abs(feet @ normal - offset).max())
     return PlaneFigures(angle, apart, angle <= MAX_ANGLE and apart <= MAX_OFFSET)
 
 

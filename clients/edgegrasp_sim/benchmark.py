@@ -1,5 +1,6 @@
 """Many rounds of clutter removal, resumable."""
 
+import itertools
 import os
 import platform
 from collections.abc import Callable, Iterator
@@ -64,10 +65,6 @@ class BenchmarkConfig:
             min_opening=self.protocol.round.min_opening,
         )
 
-    def tasks(self) -> list[Task]:
-        """Seed and index of every round, in order."""
-        return [(seed, index) for seed in self.seeds for index in range(self.rounds)]
-
 
 def run_benchmark(
     config: BenchmarkConfig,  # what to run
@@ -79,7 +76,8 @@ def run_benchmark(
     """Run the rounds that `folder` lacks; yields each as it finishes. See `run_tasks`."""
     digest = config.object_set().digest  # fails here on a wrong folder, not in every worker
     kept = {(done.seed, done.index) for done in folder.rounds()}
-    missing = [task for task in config.tasks() if task not in kept]
+    tasks = itertools.product(config.seeds, range(config.rounds))
+    missing = [task for task in tasks if task not in kept]
     make_runner = partial(RoundRunner, config, make_planner, digest)
     for _, done in run_tasks(make_runner, missing, workers=workers, ray=ray):
         folder.add(done)
