@@ -41,6 +41,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared" / "real_scenes"
 IMAGE = 480, 640  # rows and columns
 ENLARGED_NOISE = 0.0003  # metres
+SECONDS, RATES = ("seconds_1", "seconds_2"), ("labels_per_second", "rounds_per_minute")
 BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"  # around the README's table
 
 
@@ -66,28 +67,24 @@ def main() -> None:
         write_table(ROOT / "docs" / "speed.md", table(results))
 
 
-def shipped() -> dict[str, Any]:
+def shipped() -> list[dict[str, Any]]:
     """Time each network in the whole pipeline on a view of each kind of scene, given the table.
 
     Processor seconds on one thread, and seconds of the clock on two.
     """
-    scenes = {str(kind): observe(kind) for kind in CLUTTER}
-    models = ModelCatalogue.load()
-    runs = {
-        (name, scene): partial(models.get(name).detect, seen.cloud, request(seen))
-        for name in WEIGHTS
-        for scene, seen in scenes.items()
-    }
-    results: dict[str, Any] = {name: {} for name in WEIGHTS}
+    scenes, models = {str(kind): observe(kind) for kind in CLUTTER}, ModelCatalogue.load()
+    runs, rows = {}, {}
+    for name, (scene, seen) in itertools.product(WEIGHTS, scenes.items()):
+        key = f"{name}/{scene}"
+        runs[key] = partial(models.get(name).detect, seen.cloud, request(seen))
+        rows[key] = {"model": name, "scene": scene, "points": len(seen.cloud)}
     for threads, clock in ((1, time.process_time), (2, time.perf_counter)):
         torch.set_num_threads(threads)
-        times = interleaved({"/".join(key): run for key, run in runs.items()}, clock=clock)
-        for name, scene in runs:
-            seen = results[name].setdefault(scene, {"points": len(scenes[scene].cloud)})
-            seen[f"seconds_{threads}"] = statistics.median(times[f"{name}/{scene}"])
-            seen[f"stages_{threads}"] = runs[name, scene]().seconds
+        for key, times in interleaved(runs, clock=clock).items():
+            rows[key][f"seconds_{threads}"] = statistics.median(times)
+            rows[key][f"stages_{threads}"] = runs[key]().seconds
     torch.set_num_threads(1)
-    return results
+    return list(rows.values())
 
 
 def camera() -> dict[str, float]:
@@ -134,17 +131,14 @@ def server() -> dict[str, float]:
         return {"ready_seconds": ready, "rest_mb": at_rest, "used_mb": memory(running.pid)}
 
 
-def simulator() -> dict[str, Any]:
-    """The simulator with each kind of scene."""
-    return {str(kind): engines(kind) for kind in CLUTTER}
-
-
-def engines(kind: SceneKind) -> dict[str, dict[str, float]]:
-    """Labels a second and rounds a minute of each engine, all but the start included."""
+def simulator() -> list[dict[str, Any]]:
+    """Labels a second and rounds a minute of each engine and kind, all but the start included."""
     protocol, options = load_protocol("edgegrasp"), GenerationOptions(grasps_per_view=LABELS)
     # Labels, seconds that they took, and seconds of a round.
-    rows: dict[str, list[tuple[float, ...]]] = {name: [] for name in ENGINES if installed(name)}
-    for seed, engine in itertools.product(range(SIMULATED + 1), rows):
+    runs: dict[tuple[SceneKind, str], list[tuple[float, ...]]] = {
+        (kind, engine): [] for kind in CLUTTER for engine in filter(installed, ENGINES)
+    }
+    for seed, (kind, engine) in itertools.product(range(SIMULATED + 1), runs):
         with ClutterSimulation(engine=engine) as simulation:
             start = time.process_time()
             simulation.reset(kind, np.random.default_rng(seed))
@@ -156,16 +150,14 @@ def engines(kind: SceneKind) -> dict[str, dict[str, float]]:
             RoundDriver(simulation, kind, protocol, seed=seed, index=0).run(plan)
             end = time.process_time()
         if seed:  # with the first a process loads and compiles
-            rows[engine].append((len(view.success), labelled - start, end - labelled))
-    results = {}
-    for engine, each in rows.items():
+            runs[kind, engine].append((len(view.success), labelled - start, end - labelled))
+    rows = []
+    for (kind, engine), each in runs.items():
         labels, labelling, rounds = np.sum(each, axis=0).tolist()
-        results[engine] = {
-            "labels_per_second": labels / labelling,
-            "rounds_per_minute": 60 * len(each) / rounds,
-            "labels": labels,
-        }
-    return results
+        rates = {"labels_per_second": labels / labelling}
+        rates["rounds_per_minute"] = 60 * len(each) / rounds
+        rows.append({"engine": engine, "scene": kind.value, "labels": labels, **rates})
+    return rows
 
 
 def observe(kind: SceneKind) -> Observation:
@@ -206,19 +198,17 @@ def camera_table(results: dict[str, Any]) -> str:
 
 def table(results: dict[str, Any]) -> str:
     """The table of all other times, and the machine."""
-    rows = []
-    for name, scenes in results["shipped"].items():
-        for scene, of in scenes.items():
-            times = (f"{1000 * of[key]:.0f} ms" for key in ("seconds_1", "seconds_2"))
-            rows.append((f"`{name}`", scene, *times))
+    rows = [
+        (f"`{row['model']}`", row["scene"], *(f"{1000 * row[key]:.0f} ms" for key in SECONDS))
+        for row in results["shipped"]
+    ]
     head = "from cloud to ranked grasps, support plane given", "scene", "one thread", "two threads"
     lines = views.table(head, rows)
     machine, server = results["machine"], results["server"]
-    rows = []
-    for kind, engines in results["simulator"].items():
-        for engine, of in engines.items():
-            cells = (f"{of[name]:.0f}" for name in ("labels_per_second", "rounds_per_minute"))
-            rows.append((engine, kind, *cells))
+    rows = [
+        (row["engine"], row["scene"], *(f"{row[rate]:.0f}" for rate in RATES))
+        for row in results["simulator"]
+    ]
     head = "simulator", "scene", "labels per second and core", "rounds per minute and core"
     text = (
         f"Processor time on one thread of an {machine['processor']} with "
