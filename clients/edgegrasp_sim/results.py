@@ -12,7 +12,7 @@ from statistics import fmean, median, stdev
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import TypeAdapter
 from scipy.stats import binomtest
 
@@ -216,12 +216,10 @@ def compare(first: ResultFolder, second: ResultFolder) -> dict[str, Any]:
         "second_worse": int((successes[1] < successes[0]).sum()),
     }
     for name, trials in (("grasp_success_rate", attempts), ("declutter_rate", objects)):
-        found = paired_difference(successes, trials, np.random.default_rng(0))
         figures[name] = {
             "first": _share(successes[0], trials[0]),
             "second": _share(successes[1], trials[1]),
-            "difference": found[0] if found else None,
-            "difference_95": found[1] if found else None,
+            **paired_difference(successes, trials, np.random.default_rng(0)),
         }
     return figures
 
@@ -256,22 +254,21 @@ def wilson(successes: int, trials: int) -> tuple[float, float] | None:
 
 
 def paired_difference(
-    numerators: ArrayLike, denominators: ArrayLike, rng: np.random.Generator
-) -> tuple[float, tuple[float, float]] | None:
+    above: NDArray[np.int64], below: NDArray[np.int64], rng: np.random.Generator
+) -> dict[str, Any]:
     """Second ratio of sums minus the first, and its 95 % interval; None if a run has no counts.
 
     Scenes are resampled, so that differences between them cancel out. Counts (2, S): of run and
     scene.
     """
-    above, below = np.asarray(numerators, float), np.asarray(denominators, float)
     if (below.sum(axis=1) == 0).any():
-        return None
+        return {"difference": None, "difference_95": None}
     picks = rng.integers(above.shape[1], size=(RESAMPLES, above.shape[1]))
     with np.errstate(invalid="ignore"):
         ratios = above[:, picks].sum(axis=-1) / below[:, picks].sum(axis=-1)  # (2, resamples)
     low, high = np.nanpercentile(ratios[1] - ratios[0], [2.5, 97.5]).tolist()
     first, second = (above.sum(axis=1) / below.sum(axis=1)).tolist()
-    return second - first, (low, high)
+    return {"difference": second - first, "difference_95": (low, high)}
 
 
 def percent(rate: dict[str, Any]) -> str:
