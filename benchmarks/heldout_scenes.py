@@ -44,7 +44,7 @@ CLEAR = 0.015  # metres between a robot and the objects
 class Made(NamedTuple):
     """A scene at rest; the objects stand on z = 0."""
 
-    support: list[int]  # bodies that carry the objects
+    support: int  # the body that carries the objects
     polar: tuple[float, float]  # degrees from above that the camera looks from
     azimuth: tuple[float, float]  # degrees
     distance: tuple[float, float]  # metres
@@ -140,7 +140,7 @@ class Maker:
         self.room(self.rng.uniform(0.5, 0.9))
         self.background(int(self.rng.integers(1, 4)), 0.2)
         self.drop(int(self.rng.integers(3, 10)), (0.2, 0.18), 0.004, 0.6)
-        return Made([top], (15, 75), (190, 350), (0.5, 1.4), 0.3)
+        return Made(top, (15, 75), (190, 350), (0.5, 1.4), 0.3)
 
     def heap(self) -> Made:
         """Objects in a heap on a table, or on a floor."""
@@ -148,7 +148,7 @@ class Maker:
         self.room(self.rng.choice([0.05, self.rng.uniform(0.5, 0.9)]))
         self.background(int(self.rng.integers(0, 3)), 0.25)
         self.drop(int(self.rng.integers(7, 14)), (0.05, 0.05), 0.16, 0.0)
-        return Made([top], (0, 65), (190, 350), (0.45, 1.2), 0.3)
+        return Made(top, (0, 65), (190, 350), (0.45, 1.2), 0.3)
 
     def tray(self) -> Made:
         """Objects on a tray with a low rim that stands on a table."""
@@ -159,7 +159,7 @@ class Maker:
         self.room(self.rng.uniform(0.5, 0.9))
         self.background(int(self.rng.integers(0, 3)), 0.3)
         self.drop(int(self.rng.integers(3, 9)), (x - 0.05, y - 0.05), 0.01, 0.5)
-        return Made([floor], (0, 65), (190, 350), (0.45, 1.1), max(x, y))
+        return Made(floor, (0, 65), (190, 350), (0.45, 1.1), max(x, y))
 
     def bin(self) -> Made:
         """Objects poured into a bin, with or without a rim, its walls upright or sloped."""
@@ -169,7 +169,7 @@ class Maker:
         self.room(0.3)
         self.drop(int(self.rng.integers(4, 22)), (x / 2, y / 2), deep * 0.6, 0.0)
         near = max(0.45, 1.1 * deep + 0.3)
-        return Made([floor], (0, 35), (0, 360), (near, near + 0.6), max(x, y))
+        return Made(floor, (0, 35), (0, 360), (near, near + 0.6), max(x, y))
 
     def shelf(self) -> Made:
         """Objects in a compartment seen from the front, with others around it."""
@@ -185,7 +185,7 @@ class Maker:
         self.room(1.0)
         half = (wide / 2 - 0.06, deep / 2 - 0.05)
         self.drop(int(self.rng.integers(2, 7)), half, 0.004, 0.6)
-        return Made([low], (55, 88), (245, 295), (0.5, 1.1), wide / 2)
+        return Made(low, (55, 88), (245, 295), (0.5, 1.1), wide / 2)
 
     def walls(self, x: float, y: float, high: float, slope: float, thick: float) -> None:
         """Four walls around half extents x and y, which lean outward by degrees."""
@@ -216,7 +216,7 @@ def picture(maker: Maker, made: Made) -> dict[str, Float64]:
     depth = random_sensor(rng).apply(true, camera, rng)
     heights = np.full(true.shape, np.inf)
     heights[true < FARTHEST * FAR] = points_of(true, T_world_camera, camera)[:, 2]
-    label = (np.isin(body, made.support) & (np.abs(heights) < FLAT)).astype(np.uint8)
+    label = ((body == made.support) & (np.abs(heights) < FLAT)).astype(np.uint8)
     for number, item in enumerate(maker.objects):
         label[body == item.body.uid] = FIRST + number
     label = on_the_surface(label, true, depth)

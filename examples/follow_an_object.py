@@ -6,7 +6,6 @@ usage: python examples/follow_an_object.py [ADDRESS]    needs pip install 'edgeg
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -25,7 +24,7 @@ def camera() -> Iterator[dict[str, np.ndarray]]:
         start = simulation.placements[0]
         for number in range(60):
             x, y, z = start.position
-            simulation.reset_from_poses([replace(start, position=(x + number / 600, y, z))])
+            simulation.move(0, (x + number / 600, y, z), start.quaternion_xyzw)
             yield {"cloud": simulation.observe_from([T_WORLD_CAMERA], rng, table="auto").image}
             time.sleep(1 / 30)
 
