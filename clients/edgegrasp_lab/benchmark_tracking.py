@@ -115,7 +115,7 @@ class SimulatedScene:
         nearer = self.motion.camera * seconds / np.linalg.norm(TARGET - EYE)
         eye = EYE + nearer * (TARGET - EYE)
         seen = self.simulation.observe_from(
-            [look_at(eye, TARGET)], self.rng, noise_std=0.0, sensor=STRUCTURED_LIGHT, table="auto"
+            [look_at(eye, TARGET)], self.rng, noise_std=0.0, faults=[STRUCTURED_LIGHT], table="auto"
         )
         return {"cloud": seen.image, "viewpoint": tuple(eye.tolist())}
 

@@ -57,9 +57,10 @@ class NoiseRules(DepthNoise):
     # Kind of camera whose faults the images have besides; `random`: another before every grasp.
     sensor: Literal["", "random", "structured-light", "stereo", "time-of-flight"] = ""
 
-    def depth_sensor(self, rng: np.random.Generator) -> DepthSensor | None:
-        """The camera of the next view, if it is one with faults."""
-        return random_sensor(rng) if self.sensor == "random" else SENSORS.get(self.sensor)
+    def faults(self, rng: np.random.Generator) -> list[DepthNoise | DepthSensor]:
+        """This noise, and the camera of the next view if it is one with faults."""
+        sensor = random_sensor(rng) if self.sensor == "random" else SENSORS.get(self.sensor)
+        return [self] if sensor is None else [self, sensor]
 
 
 @dataclass(frozen=True, config=STRICT)

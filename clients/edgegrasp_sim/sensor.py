@@ -34,8 +34,8 @@ class DepthNoise:
     correlated_pixels: PositiveInt = 4  # pixels between its independent values, interpolated
     correlated_share: Share = 0.0  # share of the images that have it
 
-    def apply(self, depth: Float64, rng: np.random.Generator) -> Float64:
-        """A noisy copy of a depth image: (height, width) metres."""
+    def apply(self, depth: Float64, camera: Intrinsics, rng: np.random.Generator) -> Float64:
+        """A noisy copy of a depth image of any camera: (height, width) metres."""
         noisy: Float64 = depth
         if self.gamma_shape > 0:
             noisy = noisy * rng.gamma(self.gamma_shape, self.gamma_scale)

@@ -154,8 +154,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         rng_noise: np.random.Generator,  # stream of the noise
         *,
         noise_std: float = NOISE_STD,  # of each coordinate of each point, metres
-        depth_noise: DepthNoise | None = None,  # noise of the images
-        sensor: DepthSensor | None = None,  # what else the camera gets wrong
+        faults: Sequence[DepthNoise | DepthSensor] = (),  # of the images, one after the other
         table: TableView = "known",  # what the cloud holds of the table, see `Observation`
     ) -> Observation:
         """Look at the scene from each of the given poses, (4, 4) each."""
@@ -165,10 +164,8 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         clouds = []
         for T_world_camera in T_world_cameras:
             depth = self.world.render_depth(T_world_camera, CAMERA)
-            if depth_noise is not None:
-                depth = depth_noise.apply(depth, rng_noise)
-            if sensor is not None:
-                depth = sensor.apply(depth, CAMERA, rng_noise)
+            for fault in faults:
+                depth = fault.apply(depth, CAMERA, rng_noise)
             points = crop(points_of(depth, T_world_camera, CAMERA), box, _CROP_MARGIN)
             points = points + rng_noise.normal(0.0, noise_std, size=points.shape)
             clouds.append(crop(points, box).astype(np.float32, order="C"))

@@ -165,8 +165,7 @@ class RoundDriver:
             rules.camera.sample(self._camera, rules.camera.views),
             self._noise,
             noise_std=rules.noise.point_std,
-            depth_noise=rules.noise,
-            sensor=rules.noise.depth_sensor(self._noise),
+            faults=rules.noise.faults(self._noise),
             table=rules.planning.table,
         )
         self.view, self._points = self.view + 1, len(seen.cloud)

@@ -237,7 +237,7 @@ def ask(
     around = not open_table or noise.random() < AROUND_SHARE
     draw, seen = noise.random(), dict[str, Any](noise_std=NOISE_STD)
     if draw < SENSOR_SHARE:  # a camera's faults
-        seen = {"noise_std": 0.0, "sensor": random_sensor(noise)}
+        seen = {"noise_std": 0.0, "faults": [random_sensor(noise)]}
     elif draw < SENSOR_SHARE + OTHER_NOISE:
         seen = {"noise_std": noise.uniform(0.0, MAX_NOISE)}
     table: TableView = "around" if around else "known"
