@@ -63,29 +63,21 @@ class ProtocolError(GraspClientError):
     """The answer is not from a grasp service; the address may be of another one."""
 
 
-_BY_KIND: dict[str, type[GraspClientError]] = {
-    "invalid-request": InvalidRequestError,
-    "unsupported-media-type": InvalidRequestError,
-    "start-collision": StartCollisionError,
-    "unknown-model": UnknownModelError,
-    "payload-too-large": PayloadTooLargeError,
-    "headers-too-large": InvalidRequestError,
-    "unauthenticated": AccessDeniedError,
-    "permission-denied": AccessDeniedError,
-    "detector-failed": ServerFailedError,
-    "disk-full": ServerFailedError,
-    "not-ready": ServerUnavailableError,
-    "overloaded": OverloadedError,
-    "worker-lost": WorkerLostError,
-    "harmful-request": InvalidRequestError,
-    "cancelled": ServerUnavailableError,
-    "request-timeout": DeadlineError,
-    "deadline-exceeded": DeadlineError,
-    # Status codes of gRPC, from something else such as a proxy.
-    "invalid-argument": InvalidRequestError,
-    "resource-exhausted": PayloadTooLargeError,
-    "internal": ServerUnavailableError,
-    "unknown": ServerFailedError,
+# Kinds of errors that a server reports; the last of some are gRPC's codes, as a proxy sends them.
+_KINDS: dict[type[GraspClientError], tuple[str, ...]] = {
+    InvalidRequestError: (
+        *("invalid-request", "unsupported-media-type", "headers-too-large", "harmful-request"),
+        "invalid-argument",
+    ),
+    StartCollisionError: ("start-collision",),
+    UnknownModelError: ("unknown-model",),
+    PayloadTooLargeError: ("payload-too-large", "resource-exhausted"),
+    AccessDeniedError: ("unauthenticated", "permission-denied"),
+    ServerUnavailableError: ("not-ready", "cancelled", "internal"),
+    OverloadedError: ("overloaded",),
+    WorkerLostError: ("worker-lost",),
+    DeadlineError: ("request-timeout", "deadline-exceeded"),
+    ServerFailedError: ("detector-failed", "disk-full", "unknown"),
 }
 
 
@@ -93,7 +85,7 @@ def error_of_kind(
     kind: str, message: str, *where: str, retry_after: float | None = None
 ) -> GraspClientError:
     """The exception for an error reported by the server; `where`: field, value and fix."""
-    error = _BY_KIND.get(kind, ProtocolError)
+    error = next((one for one, kinds in _KINDS.items() if kind in kinds), ProtocolError)
     if issubclass(error, OverloadedError) and retry_after is not None:
         return error(message, retry_after)
     if issubclass(error, InvalidRequestError):
