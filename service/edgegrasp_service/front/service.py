@@ -128,12 +128,10 @@ class GraspService:
         self.admission.resize(call, call.bytes_in)
         job = replace(job, request_id=call.request_id)
         now = time.monotonic()
-        for one in [one for one, (until, _) in self._deaths.items() if until <= now]:
-            del self._deaths[one]
-        if self._deaths:
-            _, deaths = self._deaths.get(await asyncio.to_thread(_digest, job), (0.0, 0))
-            if deaths >= MOST_DEATHS:
-                raise errors.HarmfulRequest()
+        self._deaths = {one: found for one, found in self._deaths.items() if found[0] > now}
+        digest = await asyncio.to_thread(_digest, job) if self._deaths else b""
+        if self._deaths.get(digest, (0.0, 0))[1] >= MOST_DEATHS:
+            raise errors.HarmfulRequest()
         worker = await self.pool.take()
         call.end_stage("wait")
         call.at_work, began = True, time.monotonic()
