@@ -57,7 +57,6 @@ STREAM_GRACE_SECONDS = 10.0  # seconds after which an idle stream yields its pla
 MOST_STREAM_FIELDS = 16  # in a message of a stream, which has three
 # By tag, those of a DetectGraspsStreamRequest.
 STREAM_FIELDS = {0x0A: "request_id", 0x12: "request", 0x19: "timeout"}
-FOREVER = struct.pack("<d", math.inf)  # without a timeout
 
 # Connections
 CALLS = 100  # calls of one connection at a time; further ones wait in the client
@@ -335,7 +334,7 @@ async def _next_request(context: Any) -> dict[str, Any] | None:
     data = await context.read()
     if data is EOF:
         return None
-    fields: dict[str, Any] = {"request_id": b"", "request": b"", "timeout": FOREVER}
+    fields: dict[str, Any] = {"request_id": b"", "request": b""}
     place = 0
     try:
         for _ in range(MOST_STREAM_FIELDS):
@@ -388,8 +387,10 @@ async def _answer(service: GraspService, stream: Call, request: dict[str, Any]) 
 
 def _timeout(request: dict[str, Any]) -> float:
     """The timeout in seconds; raises InvalidRequest unless it is positive and finite, or absent."""
+    if "timeout" not in request:
+        return math.inf
     timeout: float = struct.unpack("<d", request["timeout"])[0]
-    if request["timeout"] is not FOREVER and not 0.0 < timeout < math.inf:
+    if not 0.0 < timeout < math.inf:
         raise InvalidRequest("timeout", str(timeout), "Send seconds, or leave it out.")
     return timeout
 
