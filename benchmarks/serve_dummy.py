@@ -16,7 +16,7 @@ def main() -> None:
         dummy = runpy.run_path(str(Path(__file__).with_name("dummy.py")))
         process.main(sys.argv[1], lambda settings: dummy["DummyCatalogue"]())
         return
-    process.NURSERY = (sys.executable, "-P", __file__)
+    process.NURSERY_COMMAND = (sys.executable, "-P", __file__)
     from edgegrasp_cli.main import main
 
     main()

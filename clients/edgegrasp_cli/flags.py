@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 Flags: TypeAlias = list[inspect.Parameter]
 KEYWORD = inspect.Parameter.KEYWORD_ONLY
-PLAIN = (bool, int, float, str, Path)  # types that a flag takes directly
+PLAIN_TYPES = (bool, int, float, str, Path)  # types that a flag takes directly
 TOKEN_VARIABLE = "EDGEGRASP_CLIENT_TOKEN"
 
 
@@ -150,10 +150,10 @@ def _flag_type(annotation: Any) -> tuple[Any, str | None]:
     if choice is not None:
         other = ["JSON"] if choice in parts and len(parts) > 1 else []
         return str, "|".join([*get_args(choice), *other])
-    if get_origin(annotation) is tuple and parts[-1] is ... and parts[0] in PLAIN:
+    if get_origin(annotation) is tuple and parts[-1] is ... and parts[0] in PLAIN_TYPES:
         return list[parts[0]], None  # type: ignore[valid-type]
     only = parts[0] if len(parts) == 1 else annotation
-    return (only, None) if only in PLAIN else (str, "JSON")
+    return (only, None) if only in PLAIN_TYPES else (str, "JSON")
 
 
 def _default_text(default: Any) -> str:

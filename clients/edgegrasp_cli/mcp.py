@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from edgegrasp_client import Detection, GraspClient
     from edgegrasp_results import ArmPlan
 
-MOST_GRASPS = 20  # in one answer: some 5,000 characters
-IN_BASE = [float(row == column) for row in range(4) for column in range(4)]  # T_base_cloud
-BACK = 0.05  # metres from the pregrasp to the grasp
+MAX_GRASPS = 20  # in one answer: some 5,000 characters
+IDENTITY_POSE = [float(row == column) for row in range(4) for column in range(4)]  # T_base_cloud
+PREGRASP_DISTANCE = 0.05  # metres from the pregrasp to the grasp
 INSTRUCTIONS = (
     "Finds 6-DoF grasps of a parallel-jaw gripper in point clouds and depth images. Lengths are "
     "metres, quaternions xyzw; poses are in the frame of the cloud, that of a depth image in its "
@@ -42,7 +42,7 @@ INSTRUCTIONS = (
     "Read `warnings` before a robot moves."
 )
 
-NumGrasps = Annotated[int, Field(ge=1, le=MOST_GRASPS)]
+NumGrasps = Annotated[int, Field(ge=1, le=MAX_GRASPS)]
 Matrix = Annotated[
     list[list[float]], Field(description="4 x 4: camera to a base frame whose z is up, metres")
 ]
@@ -211,14 +211,14 @@ class _Tools:
         if viewpoint:
             asked["viewpoint"] = viewpoint
         if robot:
-            asked["robot"] = {"T_base_cloud": IN_BASE, **robot}
+            asked["robot"] = {"T_base_cloud": IDENTITY_POSE, **robot}
         if cloud_file is not None:
             return asked | {"cloud": self._path(cloud_file)}
         depth_file, intrinsics, mask_file, scale, pose = image
         view = {"depth": self._path(depth_file), "intrinsics": intrinsics, "depth_scale": scale}
         if pose is not None:
             asked, view["T_cloud_camera"] = {"up": [0.0, 0.0, 1.0], **asked}, pose
-        elif (asked.get("robot") or {}).get("T_base_cloud") is IN_BASE:
+        elif (asked.get("robot") or {}).get("T_base_cloud") is IDENTITY_POSE:
             raise ValueError("robot: give T_base_camera, in the arm's base frame.")
         if mask_file is not None:
             asked = dict(on_mask(pixels(self._path(mask_file)), asked))
@@ -299,7 +299,7 @@ def _short(found: "Detection") -> str:
             "hand_quaternion_xyzw": _digits(quaternion_from_matrix(grasp.T_cloud_hand[:3, :3]), 4),
             "tcp_position": _digits(grasp.T_cloud_tcp[:3, 3], 4),
             "approach_direction": _digits(grasp.approach_direction, 3),
-            "pregrasp_hand_position": _digits(grasp.pregrasp(BACK)[:3, 3], 4),
+            "pregrasp_hand_position": _digits(grasp.pregrasp(PREGRASP_DISTANCE)[:3, 3], 4),
             "width": round(grasp.width, 4),
             "object": grasp.object,
             **({} if grasp.arm is None else {"arm": _short_plan(grasp.arm)}),
@@ -315,7 +315,7 @@ def _short(found: "Detection") -> str:
             "best_score": None if thing.best_score is None else round(thing.best_score, 3),
             "reason": thing.reason,
         }
-        for thing in found.objects[:MOST_GRASPS]
+        for thing in found.objects[:MAX_GRASPS]
     ]
     up = _digits(found.up, 3)
     answer = {"grasps": grasps, "objects": objects, "up": up, "warnings": found.warnings}

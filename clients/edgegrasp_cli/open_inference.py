@@ -32,7 +32,7 @@ from edgegrasp_client.requests import option_of_text, plain_options
 PLATFORM = "edgegrasp"
 VERSION = "1"  # of the tensors' names and meaning
 DTYPES = {"FP32": "<f4", "FP64": "<f8", "UINT16": "<u2", "INT32": "<i4"}
-CONTENTS = {"FP32": "fp32_contents", "FP64": "fp64_contents", "UINT16": "uint_contents"}
+CONTENT_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents", "UINT16": "uint_contents"}
 INPUTS = {"points": ("FP32", [-1, 3]), "depth": ("FP32", [-1, -1]), "intrinsics": ("FP32", [4])}
 OUTPUTS = {  # fields of a Grasp
     "T_cloud_hand": ("FP32", [-1, 4, 4]),  # best first, like all outputs
@@ -41,8 +41,8 @@ OUTPUTS = {  # fields of a Grasp
     "object": ("INT32", [-1]),  # -1: on no object
 }
 # Parameters of the protocol and of Triton's clients that say how to serve, not what to detect.
-NOT_OPTIONS = {"binary_data_output", "headers", "priority", "timeout"}
-NOT_OPTIONS |= {"sequence_id", "sequence_start", "sequence_end"}
+SERVING_PARAMETERS = {"binary_data_output", "headers", "priority", "timeout"}
+SERVING_PARAMETERS |= {"sequence_id", "sequence_start", "sequence_end"}
 STATUS: tuple[tuple[type[Exception], str, int], ...] = (  # the first that fits
     (errors.UnknownModelError, "NOT_FOUND", 404),
     (errors.PayloadTooLargeError, "RESOURCE_EXHAUSTED", 413),
@@ -141,7 +141,7 @@ class Models:
         if version:
             self.check(name, version)
         asked = {key: option_of_text(value) for key, value in parameters.items()}
-        options: Any = {key: value for key, value in asked.items() if key not in NOT_OPTIONS}
+        options: Any = {key: value for key, value in asked.items() if key not in SERVING_PARAMETERS}
         if name != self._default:
             options["model"] = name
         given = set(inputs)
@@ -235,7 +235,7 @@ def _grpc_infer(models: Models, request: Any, call: Any) -> dict[str, Any]:
         raise invalid("raw_input_contents", value, "Give each one.")
     tensors = {}
     for number, each in enumerate(request.inputs):
-        field = CONTENTS.get(each.datatype, "fp32_contents")
+        field = CONTENT_FIELDS.get(each.datatype, "fp32_contents")
         data = raw[number] if raw else getattr(each.contents, field)
         tensors[each.name] = tensor(each.name, each.datatype, each.shape, data)
     kinds = {key: one.WhichOneof("parameter_choice") for key, one in request.parameters.items()}

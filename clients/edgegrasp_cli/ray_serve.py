@@ -25,7 +25,7 @@ from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer, load_catalogue, load_robots
 from edgegrasp_service.worker.process import Answer, Facts, Job, Method
 
-LISTS = ("ListModels", "ListRobots")
+LIST_METHODS = ("ListModels", "ListRobots")
 
 
 def _rpc(method: str) -> Callable[..., Awaitable[Any]]:
@@ -33,7 +33,7 @@ def _rpc(method: str) -> Callable[..., Awaitable[Any]]:
 
     async def rpc(self: Any, request: Any, grpc_context: RayServegRPCContext) -> Any:
         response = getattr(grasp_pb2, f"{method}Response")
-        if method in LISTS:
+        if method in LIST_METHODS:
             return response(**self._listed(method))
         seconds, body = self._settings.max_request_seconds, request.SerializeToString()
         found = await self._answer(Job(cast(Method, method), "grpc", body, seconds))
@@ -63,7 +63,7 @@ class Grasps:
         method = METHODS.get(request.url.path, "")
         if method in ("Live", "Ready"):
             return JSONResponse({"status": method.lower()})
-        if method in LISTS:
+        if method in LIST_METHODS:
             return JSONResponse(self._listed(method))
         if method not in get_args(Method) or request.method != "POST":
             return Response(status_code=404)
@@ -81,7 +81,7 @@ class Grasps:
         return Response(document, found.error.status, media_type="application/problem+json")
 
     DetectGrasps, ScoreGrasps = _rpc("DetectGrasps"), _rpc("ScoreGrasps")
-    ListModels, ListRobots = map(_rpc, LISTS)
+    ListModels, ListRobots = map(_rpc, LIST_METHODS)
 
     def _listed(self, method: str) -> dict[str, Any]:
         if method == "ListModels":

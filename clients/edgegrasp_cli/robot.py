@@ -16,7 +16,7 @@ NO_OFFSET = """
 position = [0.0, 0.0, 0.0]
 quaternion = [0.0, 0.0, 0.0, 1.0]
 """
-TO_EDIT = ("home", "max_velocity", "max_acceleration")  # fields that the command does not set
+FIELDS_TO_EDIT = ("home", "max_velocity", "max_acceleration")  # not set by `add`
 Links = Annotated[str, Option(help="Link of the URDF.")]
 
 
@@ -51,12 +51,12 @@ def add(
     try:
         check(output)
     except EdgeGraspError as error:
-        if getattr(error.__cause__, "field", "") not in TO_EDIT:
+        if getattr(error.__cause__, "field", "") not in FIELDS_TO_EDIT:
             output.unlink()  # it needs other arguments, not an edit
         raise
     finally:
         if output.exists():
-            print(f"{output}: now set T_flange_hand, and {', '.join(TO_EDIT)} if needed.")
+            print(f"{output}: now set T_flange_hand, and {', '.join(FIELDS_TO_EDIT)} if needed.")
 
 
 @robot.command()

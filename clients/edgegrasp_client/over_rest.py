@@ -18,7 +18,7 @@ from edgegrasp_client.requests import Request, cloud_file, npy_bytes
 from edgegrasp_client.results import Answer, StreamAnswer, read_as
 from edgegrasp_results import Detection
 
-MAX_QUERY = 4000  # characters; servers and proxies limit the length of an address
+MAX_QUERY_LENGTH = 4000  # characters; servers and proxies limit the length of an address
 KIND_PREFIX = "urn:edgegrasp:error:"
 
 Call = dict[str, Any]  # arguments of httpx's `request`
@@ -115,7 +115,7 @@ def call_of(request: Request) -> Call:
     else:
         file_format, data = cloud_file(request.cloud)
         media = f"application/x-{file_format}"
-        if not request.arrays and sum(map(len, query.values())) < MAX_QUERY:
+        if not request.arrays and sum(map(len, query.values())) < MAX_QUERY_LENGTH:
             post = {"method": "POST", "url": "/v1/grasps", "headers": {"content-type": media}}
             return {**post, "params": query, "content": data}
         parts["cloud"] = (f"cloud.{file_format}", data, media)

@@ -25,7 +25,7 @@ from edgegrasp_client.connection import seconds_of
 from edgegrasp_client.errors import invalid
 from edgegrasp_client.options import DetectOptions
 
-SAME_POINT = 0.005  # metres: the side of a cell in which the scene repeats the object
+SCENE_CELL = 0.005  # metres: the side of a cell in which the scene repeats the object
 DEPTH_ENCODINGS = {np.dtype(kind).name: name for name, kind in ENCODINGS.items()}  # by dtype
 
 
@@ -45,7 +45,7 @@ class DepthImage(TypedDict):
 
 
 Cloud = Array | str | PathLike[str] | PointCloud2
-BESIDE = ("normals", "colors", "segment_ids", "view_ids")
+PER_POINT_ARRAYS = ("normals", "colors", "segment_ids", "view_ids")
 # Of each array: the dtype that is sent, and the shape of a row.
 ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "normals": ("float32", (3,)),
@@ -85,7 +85,7 @@ class Request:
     ) -> None:
         given, self.scores = dict(fields), to_score is not None
         images: Sequence[DepthImage] | None = given.pop("depth_images", None)
-        beside = {name: given.pop(name, None) for name in BESIDE} | dict(to_score or {})
+        beside = {name: given.pop(name, None) for name in PER_POINT_ARRAYS} | dict(to_score or {})
         self.options = plain_options(given)
         if (cloud is None) == (images is None):
             value = "nothing" if cloud is None else "a cloud beside depth_images"
@@ -182,7 +182,7 @@ def object_in_scene(
     clouds = [np.asarray(each, np.float32).reshape(-1, 3) for each in (object_points, scene_points)]
     wanted, scene = (each[np.isfinite(each).all(axis=1)] for each in clouds)
     digits = np.array([2**42, 2**21, 1])  # one number of three, each below 5 km
-    cells = [np.floor(each / SAME_POINT).astype(np.int64) @ digits for each in (wanted, scene)]
+    cells = [np.floor(each / SCENE_CELL).astype(np.int64) @ digits for each in (wanted, scene)]
     rest = scene[~np.isin(cells[1], cells[0])]
     segment_ids = np.repeat(np.array([1, 0], np.int32), [len(wanted), len(rest)])
     return np.concatenate([wanted, rest]), segment_ids

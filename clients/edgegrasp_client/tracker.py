@@ -12,10 +12,10 @@ from edgegrasp_client.client import GraspClient
 from edgegrasp_client.options import DetectOptions, Previous
 from edgegrasp_results import DetectedObject, Detection
 
-FOLLOWED = 4  # grasps on one object, of which the first is the one to keep
-MOST = 64  # objects that a request may name
-FOUND = ("auto", "ransac")  # kinds of support that are looked for
-DROP = 0.7  # share of a grasp's score when it was found, below which others are looked for
+GRASPS_PER_OBJECT = 4  # grasps on one object, of which the first is the one to keep
+MAX_OBJECTS = 64  # objects that a request may name
+SEARCHED_SUPPORTS = ("auto", "ransac")  # kinds of support that are looked for
+MIN_SCORE_SHARE = 0.7  # share of a grasp's first score, below which others are looked for
 
 
 class GraspTracker:
@@ -72,7 +72,7 @@ class GraspTracker:
         previous: dict[str, Any] = {"next_id": self._next_id, "search": self._searching}
         if last is not None:
             object_ = last.grasps[0].object
-            grasps = [grasp for grasp in last.grasps if grasp.object == object_][:FOLLOWED]
+            grasps = [grasp for grasp in last.grasps if grasp.object == object_][:GRASPS_PER_OBJECT]
             previous["gripper"] = last.gripper.name
             previous["grasps"] = [
                 {"id": one.id, "T_cloud_hand": one.T_cloud_hand.ravel(), "object": one.object}
@@ -82,7 +82,7 @@ class GraspTracker:
                 {"number": one.number, "surface": one.surface, "confidence": one.confidence}
                 for one in sorted(self._objects.values(), key=lambda one: one.number != object_)
                 if self._searching or one.number == object_
-            ][:MOST]
+            ][:MAX_OBJECTS]
             if not self._searching:
                 plane = last.support and {
                     "normal": last.support.normal.tolist(),
@@ -90,7 +90,7 @@ class GraspTracker:
                 }
                 asked = options.get("support", "auto")
                 kind = asked.get("kind") if isinstance(asked, Mapping) else asked
-                options |= {"support": plane if kind in FOUND else asked, "up": last.up}
+                options |= {"support": plane if kind in SEARCHED_SUPPORTS else asked, "up": last.up}
             if options.keys() & {"at", "near"} and object_ in self._objects:
                 options |= {"at": None, "near": self._objects[object_].center}
         return cast("DetectOptions", options | {"previous": cast("Previous", previous)})
@@ -110,7 +110,7 @@ class GraspTracker:
         if detection.grasps:
             self._last, score = detection, detection.grasps[0].score
             self._score = score if self._searching else self._score
-            if score < DROP * self._score:
+            if score < MIN_SCORE_SHARE * self._score:
                 self._since = self._every
 
 

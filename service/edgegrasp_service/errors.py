@@ -9,7 +9,7 @@ from edgegrasp_camera import PayloadTooLarge as PayloadTooLarge
 from edgegrasp_camera import UnsupportedMediaType as UnsupportedMediaType
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, StartCollision, UnknownModel
 
-STOPPING = "The server is stopping. Try another one."  # the message of a NotReady
+STOPPING_MESSAGE = "The server is stopping. Try another one."  # the message of a NotReady
 
 
 class Unauthenticated(InvalidRequest):

@@ -96,10 +96,10 @@ CALL: ContextVar[Call | None] = ContextVar("call", default=None)  # of the runni
 
 # Logs: JSON lines, written by a thread so that logging never delays a request
 
-MAX_WAITING = 4096  # queued records; further ones are dropped
+MAX_WAITING_LINES = 4096  # queued records; further ones are dropped
 STOP_SECONDS = 1.0
-LONG = ("DetectGraspsStream", "HealthWatch", "Reflection")  # their duration means nothing
-PROBES = ("Live", "Ready", "HealthCheck", "Metrics")  # called every few seconds; not logged
+UNTIMED_METHODS = ("DetectGraspsStream", "HealthWatch", "Reflection")  # of any duration
+PROBE_METHODS = ("Live", "Ready", "HealthCheck", "Metrics")  # called every few seconds; not logged
 LOGGED = ("request_id", "transport", "method", "code", "peer", "token", "bytes_in", "bytes_out")
 
 requests = logging.getLogger("edgegrasp_service.requests")
@@ -110,7 +110,7 @@ def log_call(call: Call) -> None:
     if call.facts.traceback:
         fault = {"traceback": call.facts.traceback}
         requests.error("%s failed with %s", call.method, call.facts.options, extra=fault)
-    level = logging.DEBUG if call.method in PROBES else logging.INFO
+    level = logging.DEBUG if call.method in PROBE_METHODS else logging.INFO
     if call.problem is not None and call.problem.status >= 500:
         level = logging.WARNING
     if not requests.isEnabledFor(level):
@@ -153,7 +153,7 @@ class LogQueue(logging.handlers.QueueHandler):
     """Passes lines to a writer thread; a failing stream does not stop the server."""
 
     def __init__(self, stream: TextIO | None) -> None:
-        self._lines: queue.Queue[str | None] = queue.Queue(MAX_WAITING)
+        self._lines: queue.Queue[str | None] = queue.Queue(MAX_WAITING_LINES)
         super().__init__(self._lines)
         self.setFormatter(JsonFormatter())
         self.dropped = 0  # lines lost as the disk is full, or the stream closed or not read
@@ -244,7 +244,7 @@ class Metrics:
             self._results.labels(call.code).inc()
         else:
             self._requests.labels(call.transport, call.method, call.code).inc()
-            if call.method not in LONG:
+            if call.method not in UNTIMED_METHODS:
                 self._seconds.labels(call.transport, call.method).observe(call.seconds)
         for stage, seconds in call.stages.items():
             self._stages.labels(stage).observe(seconds)

@@ -11,7 +11,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-TIMEOUT = 2.0  # seconds
+TIMEOUT_SECONDS = 2.0
 NAMES = ("host", "http_port", "tls_certificate", "tls_client_ca")
 REQUEST = b"GET /health/ready HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
 
@@ -59,9 +59,9 @@ def is_ready(
 def _connect(host: str, port: int) -> socket.socket:
     if not host.startswith("unix:"):
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
-        return socket.create_connection((host, port), TIMEOUT)
+        return socket.create_connection((host, port), TIMEOUT_SECONDS)
     connection = socket.socket(socket.AF_UNIX)
-    connection.settimeout(TIMEOUT)
+    connection.settimeout(TIMEOUT_SECONDS)
     connection.connect(f"{host.removeprefix('unix:')}/http.sock")
     return connection
 

@@ -18,8 +18,8 @@ from edgegrasp_service.worker.process import Answer, Job, pack
 
 logger = logging.getLogger(__name__)
 
-MAX_LINE = 4096  # bytes of an outcome, and more
-MAX_OUTCOMES = 64 * 2**20  # bytes at which their file takes no more
+MAX_LINE_BYTES = 4096  # bytes of an outcome, and more
+MAX_OUTCOMES_BYTES = 64 * 2**20  # bytes at which their file takes no more
 
 
 class Recorder:
@@ -103,10 +103,10 @@ def append_line(path: Path, line: bytes) -> None:
         with os.fdopen(descriptor, "r+b", buffering=0) as file:
             fcntl.flock(file, fcntl.LOCK_EX)  # workers write one at a time
             end = file.seek(0, os.SEEK_END)
-            if end > MAX_OUTCOMES:
+            if end > MAX_OUTCOMES_BYTES:
                 raise PayloadTooLarge("outcomes", "more than the file takes", "Move the file away.")
-            start = file.seek(max(0, end - MAX_LINE))
-            end = start + file.read(MAX_LINE).rfind(b"\n") + 1
+            start = file.seek(max(0, end - MAX_LINE_BYTES))
+            end = start + file.read(MAX_LINE_BYTES).rfind(b"\n") + 1
             file.truncate(end)
             file.seek(end)
             if file.write(line) != len(line):

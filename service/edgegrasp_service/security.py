@@ -12,7 +12,7 @@ import grpc
 from edgegrasp_service.errors import InvalidSettings, Unauthenticated
 from edgegrasp_service.settings import Settings
 
-HEADER = "authorization"
+TOKEN_HEADER = "authorization"
 
 TOKEN_FIX = "Send `authorization: Bearer TOKEN` with a token of this server."
 ADMIN_FIX = "Send an admin token; where the server has none, send its process SIGHUP instead."
@@ -49,7 +49,7 @@ class Tokens:
         found = self.known.get(_digest(text.strip()))
         if found is None or scheme.lower() != "bearer":
             value = "a token that this server does not know" if authorization else "nothing"
-            raise Unauthenticated(HEADER, value, TOKEN_FIX)
+            raise Unauthenticated(TOKEN_HEADER, value, TOKEN_FIX)
         return found
 
 

@@ -23,15 +23,15 @@ from edgegrasp_service.front.http import HttpMiddleware, HttpProtocol, create_ro
 from edgegrasp_service.front.service import GraspService, Places
 from edgegrasp_service.observability import LogQueue, Metrics, start_logging, write_line
 from edgegrasp_service.recording import check_outcomes
-from edgegrasp_service.settings import UNIX, Settings
-from edgegrasp_service.worker.process import PIECE, Nursery, WorkerPool
+from edgegrasp_service.settings import UNIX_PREFIX, Settings
+from edgegrasp_service.worker.process import PIECE_BYTES, Nursery, WorkerPool
 
 logger = logging.getLogger(__name__)
 
 # Connections of HTTP
 HEALTH_PLACES = 16  # beside max_connections, never held by requests to /v1/
 BACKLOG = 1024  # waiting to be accepted; beyond that a client retries after a second
-ACCEPTED = 16  # in one turn of the event loop
+MAX_ACCEPTED_AT_ONCE = 16  # in one turn of the event loop
 KEEP_ALIVE_SECONDS = 75  # longer than clients keep theirs: no request meets a closing one
 
 NOTICE_SECONDS = 0.25  # seconds; requests that arrive this soon after a stop are still answered
@@ -123,7 +123,7 @@ class Server:
             lifespan="off",
             http=partial(HttpProtocol, self._settings, places),  # type: ignore[arg-type]
             ws="none",
-            backlog=ACCEPTED,
+            backlog=MAX_ACCEPTED_AT_ONCE,
             server_header=False,
             proxy_headers=False,
             timeout_keep_alive=KEEP_ALIVE_SECONDS,
@@ -219,7 +219,7 @@ def warn(settings: Settings) -> None:
     try:
         local = ipaddress.ip_address(settings.host).is_loopback
     except ValueError:
-        local = settings.host == "localhost" or settings.host.startswith(UNIX)
+        local = settings.host == "localhost" or settings.host.startswith(UNIX_PREFIX)
     if not local and settings.tls_certificate is None:
         logger.warning("%s: others can reach this server, and nothing is encrypted", settings.host)
     if not local and not (settings.token_file or settings.tls_client_ca):
@@ -232,8 +232,8 @@ def warn(settings: Settings) -> None:
 def _listen(host: str, port: int) -> socket.socket:
     family, place = socket.AF_INET6 if ":" in host else socket.AF_INET, f"{host}:{port}"
     address: Any = (host, port)
-    if host.startswith(UNIX):
-        family, place = socket.AF_UNIX, f"{host.removeprefix(UNIX)}/http.sock"
+    if host.startswith(UNIX_PREFIX):
+        family, place = socket.AF_UNIX, f"{host.removeprefix(UNIX_PREFIX)}/http.sock"
         address = place
         with socket.socket(socket.AF_UNIX) as trying:  # a stale socket goes
             if trying.connect_ex(place) == errno.ECONNREFUSED:
@@ -247,7 +247,7 @@ def _listen(host: str, port: int) -> socket.socket:
         # for 40 ms.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         # What nobody reads stays in this process, which counts it, and not in the kernel.
-        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, PIECE)
+        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, PIECE_BYTES)
     return listening
 
 

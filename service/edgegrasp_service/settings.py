@@ -11,11 +11,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from edgegrasp_service.errors import InvalidSettings
 
 MIB = 2**20
-UNIX = "unix:"  # prefix of a host that is a folder of sockets
+UNIX_PREFIX = "unix:"  # prefix of a host that is a folder of sockets
 PREFIX = "EDGEGRASP_"
 CONFIG_VARIABLE = PREFIX + "CONFIG"
 NOT_SETTINGS = (CONFIG_VARIABLE, PREFIX + "CLIENT_")  # the latter belong to the client's commands
-LISTS = ("weights", "grippers", "robots", "allowed_hosts")
+LIST_SETTINGS = ("weights", "grippers", "robots", "allowed_hosts")
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 Count = Annotated[int, Field(ge=1)]
@@ -160,7 +160,7 @@ def _read_environment() -> dict[str, Any]:
             continue
         name = variable.removeprefix(PREFIX).lower()
         try:
-            fields[name] = json.loads(text) if name in LISTS else text
+            fields[name] = json.loads(text) if name in LIST_SETTINGS else text
         except ValueError:
             raise InvalidSettings(f"{variable}: got {text!r}. Write lists as JSON.") from None
     return fields

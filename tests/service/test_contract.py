@@ -22,7 +22,7 @@ import edgegrasp_service.errors
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import STATUS, kind_of
-from edgegrasp_service.front.http import DOCUMENT
+from edgegrasp_service.front.http import OPENAPI_DOCUMENT
 
 OPTIONS = {"seed": 5, "num_approach_points": 20, "top_k": 7}
 
@@ -114,7 +114,7 @@ def test_a_form_of_camera_files(http) -> None:
 
 def check(answer: httpx.Response, name: str) -> Any:
     """The JSON of an answer, which is as its schema says."""
-    jsonschema.validate(answer.json(), DOCUMENT | {"$ref": f"#/components/schemas/{name}"})
+    jsonschema.validate(answer.json(), OPENAPI_DOCUMENT | {"$ref": f"#/components/schemas/{name}"})
     return answer.json()
 
 

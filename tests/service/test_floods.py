@@ -29,7 +29,7 @@ from tests.programs import run
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client import DeadlineError, GraspClient, InvalidRequestError
-from edgegrasp_service.front.http import PAGES
+from edgegrasp_service.front.http import MAX_PAGES_AT_ONCE
 from edgegrasp_service.server import HEALTH_PLACES
 
 from .conftest import PATIENCE
@@ -328,8 +328,8 @@ async def test_answers_of_pages_are_given_up_too(serve) -> None:
 
 
 async def test_pages_that_nobody_reads_keep_no_place_from_another_client(running) -> None:
-    with connections(running.server.http_url, 2 * PAGES, PAGE):
-        await running.until(lambda: running.server.service.in_flight >= PAGES)
+    with connections(running.server.http_url, 2 * MAX_PAGES_AT_ONCE, PAGE):
+        await running.until(lambda: running.server.service.in_flight >= MAX_PAGES_AT_ONCE)
         for path in ("/health/ready", "/openapi.json"):
             assert (await running.http().get(path)).status_code == 200
 

@@ -17,7 +17,7 @@ from tests.cloud_files import npy
 from edgegrasp_client import GraspClient, InvalidRequestError
 from edgegrasp_lab.replay import answer_again
 from edgegrasp_service.errors import DiskFull, InvalidSettings
-from edgegrasp_service.front.http import DOCUMENT
+from edgegrasp_service.front.http import OPENAPI_DOCUMENT
 from edgegrasp_service.front.service import Admission
 from edgegrasp_service.recording import Recorder, append_line, check_outcomes
 from edgegrasp_service.settings import Settings
@@ -100,7 +100,7 @@ def test_outcomes_are_appended_until_the_file_is_full(start_dummy, cloud, tmp_pa
         start_dummy("--outcomes-file", str(file)) as server,
         httpx.Client(base_url=server.http_url) as http,
     ):
-        jsonschema.validate(TRIED, DOCUMENT["components"]["schemas"]["TriedGrasp"])
+        jsonschema.validate(TRIED, OPENAPI_DOCUMENT["components"]["schemas"]["TriedGrasp"])
         assert http.post("/v1/outcomes", json=TRIED).json() == {}
         assert http.post("/v1/outcomes", json={**TRIED, "held": False}).is_success
         first, second = map(json.loads, file.read_text().splitlines())

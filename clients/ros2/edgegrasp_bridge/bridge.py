@@ -26,8 +26,8 @@ from edgegrasp_results import Detection
 Lookup = Callable[[str, str, Any], Float64]
 """lookup(target, source, stamp): T_target_source (4, 4), as tf2 has it; stamp None: the latest."""
 
-OPTION = "options."  # prefix of the parameters that are options of a detection
-DEPTHS = ("16UC1", "mono16", "32FC1")  # encodings of depths: millimetres, or metres
+OPTION_PREFIX = "options."  # prefix of the parameters that are options of a detection
+DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")  # encodings of depths: millimetres, or metres
 ENCODINGS = {  # of sensor_msgs/Image: type of a value, channels
     **dict.fromkeys(("mono8", "8UC1"), ("u1", 1)),
     **dict.fromkeys(("rgb8", "bgr8", "8UC3"), ("u1", 3)),
@@ -38,7 +38,7 @@ ENCODINGS = {  # of sensor_msgs/Image: type of a value, channels
 }
 DELETE_ALL, LINE_LIST = 3, 5  # of visualization_msgs/Marker
 LINE_WIDTH = 0.003  # metres
-KEPT = 30  # images or clouds that a mask may still be of
+KEPT_MESSAGES = 30  # images or clouds that a mask may still be of
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def parameters() -> dict[str, Any]:
     """Names and defaults of the node's parameters; of an option: empty text, the server's."""
     own = {each.name: each.default for each in fields(Settings)}
     own["joint_names"] = list(Settings.joint_names)
-    return own | {f"{OPTION}{name}": "" for name in DetectOptions.__annotations__}
+    return own | {f"{OPTION_PREFIX}{name}": "" for name in DetectOptions.__annotations__}
 
 
 def read_parameters(given: Mapping[str, Any]) -> tuple[Settings, dict[str, Any]]:
@@ -82,8 +82,8 @@ def read_parameters(given: Mapping[str, Any]) -> tuple[Settings, dict[str, Any]]
     own = {each.name: given[each.name] for each in fields(Settings)}
     options = {}
     for name, value in given.items():
-        if name.startswith(OPTION) and not (isinstance(value, str) and value == ""):
-            options[name.removeprefix(OPTION)] = option_of_text(value)
+        if name.startswith(OPTION_PREFIX) and not (isinstance(value, str) and value == ""):
+            options[name.removeprefix(OPTION_PREFIX)] = option_of_text(value)
     return Settings(**own), options
 
 
@@ -107,7 +107,7 @@ class Inbox:
     """The messages that came last, and which of them belong together."""
 
     def __init__(self) -> None:
-        self._sources = {field: deque[Any](maxlen=KEPT) for field in ("cloud", "depth")}
+        self._sources = {field: deque[Any](maxlen=KEPT_MESSAGES) for field in ("cloud", "depth")}
         self._cameras: dict[str, Any] = {}  # by their frames
         self._mask: Any = None
         self._joints: dict[str, float] = {}
@@ -379,7 +379,7 @@ def _depth_images(scene: Scene, lookup: Lookup) -> list[dict[str, Any]]:
     """The images of a scene with their cameras, whose poses are in the frame of its header."""
     images: list[dict[str, Any]] = []
     for depth, camera in ((scene.depth, scene.camera), *scene.others):
-        image = {"depth": image_array(depth, DEPTHS), "intrinsics": camera_matrix(camera)}
+        image = {"depth": image_array(depth, DEPTH_ENCODINGS), "intrinsics": camera_matrix(camera)}
         pose = lookup(scene.header.frame_id, depth.header.frame_id, depth.header.stamp)
         images.append(image | {"T_cloud_camera": pose})
     return images
@@ -403,4 +403,4 @@ def _points(scene: Scene) -> Any:
     if scene.cloud is not None:
         return read_point_cloud2(scene.cloud).points
     camera = intrinsics_of(camera_matrix(scene.camera))
-    return unproject(metres(image_array(scene.depth, DEPTHS)), camera)
+    return unproject(metres(image_array(scene.depth, DEPTH_ENCODINGS)), camera)

@@ -38,28 +38,28 @@ from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
 from edgegrasp_service import errors
 from edgegrasp_service.front.service import MAX_HEADERS, GraspService, Places
-from edgegrasp_service.observability import LONG, REQUEST_ID_HEADER, Call, network_of
-from edgegrasp_service.settings import UNIX, Settings
+from edgegrasp_service.observability import REQUEST_ID_HEADER, UNTIMED_METHODS, Call, network_of
+from edgegrasp_service.settings import UNIX_PREFIX, Settings
 from edgegrasp_service.worker.process import Job, Method
 
 logger = logging.getLogger(__name__)
 
 SERVICE = grasp_pb2.DESCRIPTOR.services_by_name["GraspService"]
-HEALTH = health.SERVICE_NAME
-CHECK = f"/{HEALTH}/Check"
+HEALTH_SERVICE = health.SERVICE_NAME
+HEALTH_CHECK = f"/{HEALTH_SERVICE}/Check"
 STATES = health_pb2.HealthCheckResponse.ServingStatus
 REFLECTION = tuple(f"grpc.reflection.{version}.ServerReflection" for version in ("v1", "v1alpha"))
 
-WATCHERS = 64  # of health, and readers of the interface by reflection
+MAX_WATCHERS = 64  # of health, and readers of the interface by reflection
 WATCH_SECONDS = 1.0  # seconds between two looks at the health
 STREAM_IDLE_SECONDS = 300.0  # for which a stream may stay open without a message
 STREAM_GRACE_SECONDS = 10.0  # seconds after which an idle stream yields its place to another one
-MOST_STREAM_FIELDS = 16  # in a message of a stream, which has three
+MAX_STREAM_FIELDS = 16  # in a message of a stream, which has three
 # By tag, those of a DetectGraspsStreamRequest.
 STREAM_FIELDS = {0x0A: "request_id", 0x12: "request", 0x19: "timeout"}
 
 # Connections
-CALLS = 100  # calls of one connection at a time; further ones wait in the client
+MAX_CALLS_PER_CONNECTION = 100  # calls of one connection at a time; further ones wait in the client
 LOOKAHEAD_BYTES = 2**20  # buffered bytes of a message that is not being read yet; 87,000 points
 SPARE_BYTES = 2**20  # an excess up to this is refused with field, value and fix
 SPARE_CONNECTIONS = 4  # times max_connections are accepted before the oldest are closed
@@ -67,7 +67,7 @@ TRIM_SECONDS = 0.05  # seconds between two checks for too many connections
 DESCRIPTORS = Path("/proc/self/fd")
 LAST_RECEIVED = struct.Struct("52xI")  # of struct tcp_info: tcpi_last_data_recv, milliseconds
 
-DOMAIN = "edgegrasp"  # of google.rpc.ErrorInfo
+ERROR_DOMAIN = "edgegrasp"  # of google.rpc.ErrorInfo
 ERROR_METADATA = "edgegrasp-error-bin"  # trailing: an ErrorDetail
 STATUS_METADATA = "grpc-status-details-bin"  # trailing: a google.rpc.Status
 
@@ -85,9 +85,9 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
 
     def __init__(self, service: GraspService) -> None:
         self._service = service
-        names = (SERVICE.full_name, HEALTH, *REFLECTION)
+        names = (SERVICE.full_name, HEALTH_SERVICE, *REFLECTION)
         self._reflection = reflection.aio.ReflectionServicer(names)  # type: ignore[attr-defined]
-        self._watchers = Places(WATCHERS)
+        self._watchers = Places(MAX_WATCHERS)
         self._streams = Places(service.settings.max_streams, STREAM_GRACE_SECONDS)
         ours: dict[str, Behaviour] = {
             "DetectGrasps": partial(self._answer, "DetectGrasps"),
@@ -100,8 +100,8 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         # By path: what a method is called in metrics and the log, and what it does.
         self._behaviours: dict[str, tuple[str, Behaviour]] = {
             **{f"/{SERVICE.full_name}/{name}": (name, does) for name, does in ours.items()},
-            CHECK: ("HealthCheck", self._check_health),
-            f"/{HEALTH}/Watch": ("HealthWatch", self._watch_health),
+            HEALTH_CHECK: ("HealthCheck", self._check_health),
+            f"/{HEALTH_SERVICE}/Watch": ("HealthWatch", self._watch_health),
         }
         for name in REFLECTION:
             self._behaviours[f"/{name}/ServerReflectionInfo"] = "Reflection", self._reflect
@@ -109,14 +109,14 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         self.server.add_generic_rpc_handlers((self,))
         # It has a queue of its own: no other calls come before it.
         self.server.add_registered_method_handlers(  # type: ignore[attr-defined]
-            HEALTH, {"Check": self._handler(CHECK)}
+            HEALTH_SERVICE, {"Check": self._handler(HEALTH_CHECK)}
         )
         self.address, self._port = self._listen()
 
     def _listen(self) -> tuple[str, int]:
         """Open the port; returns its address and number, 0 for a socket."""
         settings, tls = self._service.settings, self._service.tls
-        sockets = settings.host.startswith(UNIX)
+        sockets = settings.host.startswith(UNIX_PREFIX)
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
         place = f"{settings.host}/grpc.sock" if sockets else f"{host}:{settings.grpc_port}"
         try:
@@ -165,9 +165,9 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                 if len(metadata) > MAX_HEADERS:
                     value, fix = f"{len(metadata)} entries", f"Send at most {MAX_HEADERS}."
                     raise errors.HeadersTooLarge("metadata", value, fix)
-                if not path.startswith(f"/{HEALTH}/"):
+                if not path.startswith(f"/{HEALTH_SERVICE}/"):
                     self._service.authorize(call, headers.get("authorization"))
-                if method in LONG:
+                if method in UNTIMED_METHODS:
                     await context.send_initial_metadata(name)
                 await behave(call, context)
             except errors.Cancelled:
@@ -235,7 +235,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                         reading.cancel()
                         reading = None
                 if stopping.done():
-                    raise errors.NotReady(errors.STOPPING)
+                    raise errors.NotReady(errors.STOPPING_MESSAGE)
         finally:
             for task in (stopping, reading, *ahead):
                 if task is not None:
@@ -265,7 +265,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(WATCH_SECONDS):
                         await self._service.stopping.wait()
-        raise errors.NotReady(errors.STOPPING)
+        raise errors.NotReady(errors.STOPPING_MESSAGE)
 
     async def _reflect(self, call: Call, context: Any) -> None:
         async def requests() -> AsyncIterator[Any]:
@@ -296,7 +296,7 @@ async def _abort(call: Call, context: Any, problem: errors.Problem) -> NoReturn:
     call.problem = problem
     code = grpc.StatusCode[problem.code]
     reason = problem.kind.upper().replace("-", "_")
-    details: list[Any] = [ErrorInfo(reason=reason, domain=DOMAIN)]
+    details: list[Any] = [ErrorInfo(reason=reason, domain=ERROR_DOMAIN)]
     if problem.retry_after is not None:
         delay = duration.from_milliseconds(int(problem.retry_after * 1000))
         details.append(RetryInfo(retry_delay=delay))
@@ -337,7 +337,7 @@ async def _next_request(context: Any) -> dict[str, Any] | None:
     fields: dict[str, Any] = {"request_id": b"", "request": b""}
     place = 0
     try:
-        for _ in range(MOST_STREAM_FIELDS):
+        for _ in range(MAX_STREAM_FIELDS):
             if place == len(data):
                 return fields | {"request_id": fields["request_id"].decode()}
             name, place = STREAM_FIELDS[data[place]], place + 1
@@ -408,7 +408,7 @@ def _bounds(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.compression_enabled_algorithms_bitset", 1),
         ("grpc.so_reuseport", 0),
         # One call is accepted per turn of the event loop: few may wait before a health check.
-        ("grpc.max_concurrent_streams", CALLS),
+        ("grpc.max_concurrent_streams", MAX_CALLS_PER_CONNECTION),
         ("grpc.max_allowed_incoming_connections", SPARE_CONNECTIONS * settings.max_connections),
         ("grpc.server_handshake_timeout_ms", int(settings.read_seconds * 1000)),
         ("grpc.max_connection_idle_ms", 300_000),

@@ -30,7 +30,7 @@ from edgegrasp_service import errors
 from edgegrasp_service.front.service import MAX_HEADERS, GraspService, Place, Places
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics, network_of
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.process import PIECE, Job, Method
+from edgegrasp_service.worker.process import PIECE_BYTES, Job, Method
 
 logger = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ LINGER_SECONDS = 5.0  # seconds for a refused client to read its answer
 MANY_PIECES, SMALL_PIECE = 1024, 16  # more chunks than this, smaller than this, are refused
 
 # Pages
-PAGES = 16  # sent at a time
+MAX_PAGES_AT_ONCE = 16  # sent at a time
 PAGE_GRACE_SECONDS = 10.0  # seconds after which a page yields its place to another one
 
 ASSETS = "/docs/assets"  # of fastapi_offline
@@ -53,8 +53,8 @@ CONTENT_POLICY = (  # what a page may load, and who may show it
 POLICIES = {"/docs": CONTENT_POLICY.format(" 'unsafe-inline'")}
 POLICY = CONTENT_POLICY.format("")
 CHALLENGE = 'Bearer realm="edgegrasp"'
-TIMEOUT = "X-Request-Timeout"
-NUMBER = re.compile(r"\d{1,9}(\.\d*)?|\.\d+|\d{1,9}(\.\d*)?[eE][+-]?\d{1,2}", re.ASCII)
+TIMEOUT_HEADER = "X-Request-Timeout"
+TIMEOUT_NUMBER = re.compile(r"\d{1,9}(\.\d*)?|\.\d+|\d{1,9}(\.\d*)?[eE][+-]?\d{1,2}", re.ASCII)
 
 WORK: dict[str, Method] = {  # answered by workers
     "/v1/grasps": "DetectGrasps",
@@ -75,10 +75,10 @@ METHODS = {
     "/openapi.json": "Docs",
 }
 # Without a token: probes need none, and the pages hold no secrets.
-PUBLIC = ("Live", "Ready", "Docs")
+PUBLIC_METHODS = ("Live", "Ready", "Docs")
 
 # The contract, written by hand as grasp.proto is.
-DOCUMENT = json.loads(Path(grasp_pb2.__file__).with_name("openapi.json").read_text())
+OPENAPI_DOCUMENT = json.loads(Path(grasp_pb2.__file__).with_name("openapi.json").read_text())
 
 
 class HttpMiddleware:
@@ -87,7 +87,7 @@ class HttpMiddleware:
     def __init__(self, app: ASGIApp, service: GraspService) -> None:
         self._app = app
         self._service = service
-        self._pages = Places(PAGES, PAGE_GRACE_SECONDS)
+        self._pages = Places(MAX_PAGES_AT_ONCE, PAGE_GRACE_SECONDS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request, or refuse it."""
@@ -116,8 +116,8 @@ class HttpMiddleware:
                     message = {**message, "headers": [*message.get("headers", []), *extra]}
                 async with self._service.sending(len(body)):
                     # In pieces: each is sent once the client has taken most of those before.
-                    for place in range(0, len(body), PIECE):
-                        piece = body[place : place + PIECE]
+                    for place in range(0, len(body), PIECE_BYTES):
+                        piece = body[place : place + PIECE_BYTES]
                         await send({**message, "body": piece, "more_body": True})
                     await send({**message, "body": b""} if body else message)
 
@@ -157,7 +157,7 @@ class HttpMiddleware:
         if not served and call.method not in ("Live", "Ready"):
             fix = "Use an address of the server, or name it in the setting allowed_hosts."
             raise InvalidRequest("Host", brief(host), fix)
-        if call.method not in PUBLIC:
+        if call.method not in PUBLIC_METHODS:
             self._service.authorize(call, headers.get("authorization"))
         if (encoding := headers.get("content-encoding", "identity").lower()) != "identity":
             fix = "Send the body as it is; .npz and .pcd files may be compressed inside."
@@ -198,7 +198,7 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
         Route("/health/live", JSONResponse({"status": "live"}), methods=["GET"]),
         Route("/health/ready", ready),
         Route("/metrics", read_metrics),
-        Route("/openapi.json", JSONResponse(DOCUMENT), methods=["GET"]),
+        Route("/openapi.json", JSONResponse(OPENAPI_DOCUMENT), methods=["GET"]),
         Route("/docs", page, methods=["GET"]),
         Route("/", index, methods=["GET"]),
         Mount(ASSETS, StaticFiles(packages=[("fastapi_offline", "static")])),
@@ -267,12 +267,12 @@ async def _disconnected(receive: Receive, call: Call) -> None:
 
 def requested_timeout(headers: Headers) -> float:
     """The timeout in the header, seconds; infinity without one."""
-    text = headers.get(TIMEOUT)
+    text = headers.get(TIMEOUT_HEADER)
     if text is None:
         return math.inf
-    timeout = float(text) if NUMBER.fullmatch(text) else math.nan
+    timeout = float(text) if TIMEOUT_NUMBER.fullmatch(text) else math.nan
     if not 0.0 < timeout < math.inf:
-        raise InvalidRequest(TIMEOUT, brief(text), "Send seconds, such as 2.5, or leave it out.")
+        raise InvalidRequest(TIMEOUT_HEADER, brief(text), "Send seconds, such as 2.5, or none.")
     return timeout
 
 
@@ -315,7 +315,7 @@ class HttpProtocol(HttpToolsProtocol):
     def connection_made(self, transport: Any) -> None:
         """Take a place, and wait for the first headers."""
         super().connection_made(transport)
-        transport.max_size = PIECE  # read in one turn of the event loop
+        transport.max_size = PIECE_BYTES  # read in one turn of the event loop
         self.on_message_begin()  # as far as limits are concerned
         try:
             owner = network_of(self.client[0] if self.client else "")

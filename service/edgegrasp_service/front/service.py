@@ -21,17 +21,17 @@ from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service import errors
 from edgegrasp_service.observability import CALL, Call, Metrics, log_call
 from edgegrasp_service.recording import Recorder
-from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens
+from edgegrasp_service.security import ADMIN_FIX, TOKEN_HEADER, ServerTls, Tokens
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.process import MOST_DEATHS, Answer, Job, WorkerPool
+from edgegrasp_service.worker.process import MAX_DEATHS, Answer, Job, WorkerPool
 
 logger = logging.getLogger(__name__)
 
-MOST_HARMFUL = 1000  # requests remembered that killed workers
+MAX_HARMFUL = 1000  # requests remembered that killed workers
 HARMFUL_SECONDS = 600.0  # seconds for which a request that killed workers is refused
-LATEST = 15  # latest service times, whose median is the pace; one slow request does not change it
+LATEST_TIMES = 15  # service times, whose median is the pace; one slow request does not change it
 SEND_SECONDS = 1.0  # seconds for the errors of abandoned requests to be sent
-MARGIN = 1.5  # the wait is estimated from a median, and half of the requests take longer
+WAIT_FACTOR = 1.5  # the wait is estimated from a median, and half of the requests take longer
 
 MAX_HEADERS = 64  # or entries of gRPC's metadata
 
@@ -64,7 +64,7 @@ class GraspService:
     def loaded(self) -> WorkerPool:
         """The workers; raises NotReady while weights are loading or the server is stopping."""
         if self.stopping.is_set():
-            raise errors.NotReady(errors.STOPPING)
+            raise errors.NotReady(errors.STOPPING_MESSAGE)
         if not self.pool.models:
             raise errors.NotReady("Weights are still loading. Try again in some seconds.")
         return self.pool
@@ -130,7 +130,7 @@ class GraspService:
         now = time.monotonic()
         self._deaths = {one: found for one, found in self._deaths.items() if found[0] > now}
         digest = await asyncio.to_thread(_digest, job) if self._deaths else b""
-        if self._deaths.get(digest, (0.0, 0))[1] >= MOST_DEATHS:
+        if self._deaths.get(digest, (0.0, 0))[1] >= MAX_DEATHS:
             raise errors.HarmfulRequest()
         worker = await self.pool.take()
         call.end_stage("wait")
@@ -185,7 +185,7 @@ class GraspService:
             _, before = self._deaths.pop(digest, (0.0, 0))
             until = time.monotonic() + HARMFUL_SECONDS
             self._deaths[digest] = until, before + answer.facts.deaths
-            if len(self._deaths) > MOST_HARMFUL:
+            if len(self._deaths) > MAX_HARMFUL:
                 del self._deaths[next(iter(self._deaths))]
         elif answer.error is None:
             self._deaths.pop(digest, None)
@@ -216,7 +216,7 @@ class GraspService:
                 way.
         """
         if call is not None and not call.is_admin:  # however its path is spelled
-            raise errors.PermissionDenied(HEADER, "no token of an administrator", ADMIN_FIX)
+            raise errors.PermissionDenied(TOKEN_HEADER, "no token of an administrator", ADMIN_FIX)
         self.loaded()
         if self._reloading.locked():
             raise errors.ReloadFailed("A reload is under way already. Try again later.")
@@ -275,7 +275,7 @@ class Admission:
         self.calls: list[Call] = []  # of the requests in the server, in the order they came
         self._bytes_beside = 0  # held, but not by those
         self._freed = asyncio.Event()  # set when a request frees bytes or its place
-        self.service_seconds: deque[float] = deque(maxlen=LATEST)  # of workers' latest jobs
+        self.service_seconds: deque[float] = deque(maxlen=LATEST_TIMES)  # of workers' latest jobs
 
     @asynccontextmanager
     async def admit(self, call: Call, size: int) -> AsyncIterator[None]:
@@ -287,7 +287,7 @@ class Admission:
         remaining = call.deadline - asyncio.get_running_loop().time()
         if remaining <= 0.0:
             raise errors.DeadlineExceeded()
-        if self.calls and (wait := self._estimated_wait) * MARGIN > remaining:
+        if self.calls and (wait := self._estimated_wait) * WAIT_FACTOR > remaining:
             raise self._overloaded(
                 f"{len(self.calls)} requests come first, which take about {wait:.3g} s, and "
                 f"the deadline is {remaining:.3g} s away"

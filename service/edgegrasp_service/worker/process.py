@@ -34,13 +34,13 @@ from edgegrasp_service import errors
 from edgegrasp_service.settings import Settings
 
 # -P: nothing is imported from the folder the server was started in.
-NURSERY = (sys.executable, "-P", "-m", "edgegrasp_service.worker.process")
+NURSERY_COMMAND = (sys.executable, "-P", "-m", "edgegrasp_service.worker.process")
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 # Freed memory is kept for the next request: the system hands out new pages slowly.
 KEPT_MEMORY = {"MALLOC_TRIM_THRESHOLD_": str(2**26), "MALLOC_MMAP_THRESHOLD_": str(2**24)}
 
-MOST_DEATHS = 3  # dead workers after which a request is refused; a crash counts as so many
-CRASHES = {signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL}
+MAX_DEATHS = 3  # dead workers after which a request is refused; a crash counts as so many
+CRASH_SIGNALS = {signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL}
 STATUS_SECONDS = 1.0  # seconds to learn how a worker ended
 START_SECONDS = 20.0  # seconds for a worker to fork, if it need not load
 BEAT_SECONDS = 3.0  # seconds between two checks that a worker is alive
@@ -51,8 +51,8 @@ RETRY_SECONDS = 1.0  # seconds after a worker or the nursery failed to start
 ORPHAN_SECONDS = 10.0  # seconds after its deadline at which a worker ends itself if nobody kills it
 ENDED = struct.Struct("=ii")  # the nursery's message about a worker: process id and wait status
 LOST = "The worker of this request died or ran out of memory. Try again, or send fewer points."
-HEADER = struct.Struct(">QQ")  # bytes of a message's JSON, and of the body that follows it
-PIECE = 2**16  # bytes of a body that the front reads or writes at a time
+MESSAGE_HEADER = struct.Struct(">QQ")  # bytes of a message's JSON, and of the body that follows it
+PIECE_BYTES = 2**16  # bytes of a body that the front reads or writes at a time
 
 logger = logging.getLogger(__name__)
 
@@ -114,7 +114,7 @@ def pack(message: Any) -> Sequence[bytes | bytearray]:
     fields = dict(vars(message))
     body = fields.pop("body", b"")
     text = json.dumps([type(message).__name__, fields], default=vars).encode()
-    return HEADER.pack(len(text), len(body)) + text, body
+    return MESSAGE_HEADER.pack(len(text), len(body)) + text, body
 
 
 def unpack(text: bytes, body: bytes) -> Any:
@@ -130,17 +130,17 @@ def unpack(text: bytes, body: bytes) -> Any:
 
 def receive(file: BinaryIO) -> Any:
     """The next message; None at the end."""
-    head = file.read(HEADER.size)
-    if len(head) < HEADER.size:
+    head = file.read(MESSAGE_HEADER.size)
+    if len(head) < MESSAGE_HEADER.size:
         return None
-    length, body_length = HEADER.unpack(head)
+    length, body_length = MESSAGE_HEADER.unpack(head)
     return unpack(file.read(length), file.read(body_length))
 
 
 async def received(reader: asyncio.StreamReader) -> Any:
     """As `receive`, in the front."""
     try:
-        length, body_length = HEADER.unpack(await reader.readexactly(HEADER.size))
+        length, body_length = MESSAGE_HEADER.unpack(await reader.readexactly(MESSAGE_HEADER.size))
         text = await reader.readexactly(length)
         return unpack(text, await reader.readexactly(body_length))
     except (asyncio.IncompleteReadError, OSError):
@@ -168,7 +168,7 @@ class WorkerPool:
         nursery: "Nursery | None",  # that loads already
     ) -> None:
         self._settings = settings
-        self.command: Sequence[str] = ()  # in place of NURSERY
+        self.command: Sequence[str] = ()  # in place of NURSERY_COMMAND
         self._replaced = replaced
         self._launched = nursery
         self.models: list[dict[str, Any]] = []  # facts of loaded weights; empty before `start`
@@ -272,9 +272,9 @@ class WorkerPool:
                     worker.kill()  # it ran out of memory: its state cannot be trusted
             self._workers.discard(worker)  # `take` skips it
             if await worker.nursery.crashed(worker.pid):
-                deaths = MOST_DEATHS
+                deaths = MAX_DEATHS
         finally:
-            error = errors.WorkerLost(LOST) if deaths < MOST_DEATHS else errors.HarmfulRequest()
+            error = errors.WorkerLost(LOST) if deaths < MAX_DEATHS else errors.HarmfulRequest()
             worker.finish(Answer(b"", Facts(deaths=deaths), errors.report(error)))
             worker.close()
         if worker.nursery is self._nursery:
@@ -317,13 +317,13 @@ class WorkerPool:
 
 
 class Nursery:
-    """The process that loads the weights and then forks workers; `command` replaces NURSERY."""
+    """The process that loads the weights and then forks workers; `command` in place of its own."""
 
     def __init__(self, settings: Settings, command: Sequence[str] = ()) -> None:
         self._control, theirs = socket.socketpair()
         with theirs:
             environment = KEPT_MEMORY | os.environ | dict.fromkeys(ONE_THREAD, "1")
-            words = [*(command or NURSERY), settings.model_dump_json()]
+            words = [*(command or NURSERY_COMMAND), settings.model_dump_json()]
             self._process = subprocess.Popen(words, stdin=theirs.fileno(), env=environment)
         self._writer: asyncio.StreamWriter | None = None  # once it has loaded
         # Whether each ended worker, by process id, ended by itself.
@@ -339,7 +339,7 @@ class Nursery:
         with contextlib.suppress(asyncio.IncompleteReadError, OSError):
             while True:
                 pid, status = ENDED.unpack(await self._reader.readexactly(ENDED.size))
-                crashed = os.WIFSIGNALED(status) and os.WTERMSIG(status) in CRASHES
+                crashed = os.WIFSIGNALED(status) and os.WTERMSIG(status) in CRASH_SIGNALS
                 if not self._crashed[pid].done():
                     self._crashed[pid].set_result(crashed or os.WIFEXITED(status))
 
@@ -398,8 +398,8 @@ class _Worker:
         try:
             with contextlib.suppress(OSError):  # if it has died, that becomes the answer
                 for part in pack(replace(job, remaining=deadline - loop.time())):
-                    for place in range(0, len(part), PIECE):
-                        self._writer.write(memoryview(part)[place : place + PIECE])
+                    for place in range(0, len(part), PIECE_BYTES):
+                        self._writer.write(memoryview(part)[place : place + PIECE_BYTES])
                         await self._writer.drain()
             return await asyncio.shield(answer)
         except asyncio.CancelledError:

@@ -18,10 +18,10 @@ from edgegrasp_model import request_cloud
 from edgegrasp_model.options import DetectOptions, parse_options
 from edgegrasp_model.request_cloud import options_of_texts
 from edgegrasp_service.errors import STATUS
-from edgegrasp_service.front.http import DOCUMENT
+from edgegrasp_service.front.http import OPENAPI_DOCUMENT
 from edgegrasp_service.worker.answer import plain_options as options_from_message
 
-SCHEMAS = DOCUMENT["components"]["schemas"]
+SCHEMAS = OPENAPI_DOCUMENT["components"]["schemas"]
 OPTIONS = DetectOptions.model_json_schema()
 OPTIONS_BY_NAME: dict[str, Any] = {"DetectOptions": OPTIONS, **OPTIONS["$defs"]}
 NAMES = {"SupportPlane": "Support", "Linkage": "Swing"}  # of messages that are called otherwise
@@ -67,7 +67,7 @@ def test_errors() -> None:
     """ErrorDetail has the fields of a problem document that a gRPC status does not hold."""
     ours = set(SCHEMAS["Problem"]["properties"]) - {"type", "title", "status", "detail"}
     assert ours == set(fields("ErrorDetail")) - {"kind"}
-    told = {int(status) for path in DOCUMENT["paths"].values() for status in statuses(path)}
+    told = {int(status) for path in OPENAPI_DOCUMENT["paths"].values() for status in statuses(path)}
     assert told - {200} == {status for _, status in STATUS.values()} - {499}
 
 
@@ -91,7 +91,7 @@ def parts(value: Any) -> Iterator[dict[str, Any]]:
 
 
 def test_generators_of_clients_find_nothing_to_stumble_over() -> None:
-    for part in parts(DOCUMENT):
+    for part in parts(OPENAPI_DOCUMENT):
         assert "/properties/" not in str(part.get("$ref", ""))
         assert "type" in part.get("default", {"type": ""})  # a field of that name: no value
 
