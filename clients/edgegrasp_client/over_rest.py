@@ -20,6 +20,9 @@ from edgegrasp_results import Detection
 
 MAX_QUERY_LENGTH = 4000  # characters; servers and proxies limit the length of an address
 KIND_PREFIX = "urn:edgegrasp:error:"
+# What statuses mean that come from something else, such as a proxy.
+FOREIGN_KINDS = {413: "payload-too-large", 429: "overloaded"}
+FOREIGN_KINDS |= dict.fromkeys((500, 502, 503, 504), "internal")
 
 Call = dict[str, Any]  # arguments of httpx's `request`
 Part = tuple[str | None, bytes, str]  # of a form: file name, content, media type
@@ -172,17 +175,12 @@ def _described(problem: Mapping[str, Any], response: httpx.Response) -> GraspCli
 
 def _foreign(response: httpx.Response) -> GraspClientError:
     """The exception for an answer from something else, such as a proxy."""
-    status = response.status_code
+    status, retry_after = response.status_code, response.headers.get("retry-after", "")
+    seconds = float(retry_after) if retry_after.isdecimal() else None  # it may also be a date
+    kind = "overloaded" if status == 503 and seconds is not None else FOREIGN_KINDS.get(status, "")
     what = f"{response.request.url} answered {status} {response.reason_phrase}"
-    if status == httpx.codes.REQUEST_ENTITY_TOO_LARGE:
-        return errors.PayloadTooLargeError(f"{what}.")
-    retry_after = response.headers.get("retry-after", "")  # may also be a date, which is ignored
-    if status == httpx.codes.TOO_MANY_REQUESTS or (status == 503 and retry_after.isdecimal()):
-        seconds = float(retry_after) if retry_after.isdecimal() else 1.0
-        return errors.OverloadedError(f"{what}.", seconds)
-    if status in (500, 502, 503, 504):
-        return errors.ServerUnavailableError(f"{what}.")
-    return errors.ProtocolError(f"{what}, which is not the answer of a grasp service.")
+    what += "." if kind else ", which is not the answer of a grasp service."
+    return error_of_kind(kind, what, retry_after=seconds)
 
 
 def _ssl_context(tls: Tls | None) -> ssl.SSLContext | bool:
