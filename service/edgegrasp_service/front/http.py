@@ -17,7 +17,7 @@ from fastapi.openapi.docs import get_swagger_ui_html
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
+from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Mount, Route, Router
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -207,10 +207,8 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
         found = {name: load_gripper(name) for name in gripper_names()}
         found |= {file.stem: load_gripper(file) for file in settings.grippers}
         grippers = JSONResponse(jsonable_encoder(found))
-        page_file = FileResponse(PLAYGROUND_FILES / "index.html")
         routes += [
             Route(PLAYGROUND.rstrip("/"), index, methods=["GET"]),
-            Route(PLAYGROUND, page_file, methods=["GET"]),
             Route(f"{PLAYGROUND}grippers.json", grippers, methods=["GET"]),
         ]
         if (folder := settings.samples) is not None:
@@ -218,7 +216,7 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
                 why = f"samples: got {str(folder)!r}, which is not a folder."
                 raise errors.InvalidSettings(why)
             routes.append(Mount(f"{PLAYGROUND}samples", StaticFiles(directory=folder)))
-        routes.append(Mount(PLAYGROUND, StaticFiles(directory=PLAYGROUND_FILES)))
+        routes.append(Mount(PLAYGROUND, StaticFiles(directory=PLAYGROUND_FILES, html=True)))
     return Router(routes, redirect_slashes=False)
 
 
