@@ -19,14 +19,7 @@ from datetime import UTC, datetime
 from functools import lru_cache, partial
 from typing import Any, TextIO
 
-from prometheus_client import (
-    CollectorRegistry,
-    Counter,
-    Gauge,
-    Histogram,
-    ProcessCollector,
-    generate_latest,
-)
+import prometheus_client as prometheus
 
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import Problem
@@ -221,11 +214,11 @@ class Metrics:
 
     def __init__(self, models: Callable[[], Sequence[dict[str, Any]]]) -> None:
         self._models = models
-        self.registry = CollectorRegistry()
-        ProcessCollector(registry=self.registry)
-        counter = partial(Counter, namespace="edgegrasp", registry=self.registry)
-        histogram = partial(Histogram, namespace="edgegrasp", registry=self.registry)
-        self._gauge = partial(Gauge, namespace="edgegrasp", registry=self.registry)
+        self.registry = prometheus.CollectorRegistry()
+        prometheus.ProcessCollector(registry=self.registry)
+        counter = partial(prometheus.Counter, namespace="edgegrasp", registry=self.registry)
+        histogram = partial(prometheus.Histogram, namespace="edgegrasp", registry=self.registry)
+        self._gauge = partial(prometheus.Gauge, namespace="edgegrasp", registry=self.registry)
         calls = ("transport", "method")
         self._requests = counter("requests", "requests answered", (*calls, "code"))
         seconds = partial(histogram, buckets=SECONDS)
@@ -262,4 +255,4 @@ class Metrics:
         for facts in self._models():
             shown = facts | {"default": str(facts.get("default", False)).lower()}
             self._model_info.labels(*(str(shown.get(name, "")) for name in MODEL_LABELS)).set(1.0)
-        return generate_latest(self.registry)
+        return prometheus.generate_latest(self.registry)

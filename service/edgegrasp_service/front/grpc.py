@@ -23,12 +23,7 @@ from google.protobuf import any as any_message
 from google.protobuf import duration
 from google.protobuf.message import DecodeError
 from google.protobuf.wrappers_pb2 import BytesValue
-from google.rpc.error_details_pb2 import (  # type: ignore[import-untyped]
-    BadRequest,
-    ErrorInfo,
-    RetryInfo,
-)
-from google.rpc.status_pb2 import Status  # type: ignore[import-untyped]
+from google.rpc import error_details_pb2, status_pb2  # type: ignore[import-untyped]
 from grpc import aio
 from grpc.aio import EOF  # type: ignore[attr-defined]  # not in its stubs
 from grpc_health.v1 import health, health_pb2
@@ -296,14 +291,14 @@ async def _abort(call: Call, context: Any, problem: errors.Problem) -> NoReturn:
     call.problem = problem
     code = grpc.StatusCode[problem.code]
     reason = problem.kind.upper().replace("-", "_")
-    details: list[Any] = [ErrorInfo(reason=reason, domain=ERROR_DOMAIN)]
+    details: list[Any] = [error_details_pb2.ErrorInfo(reason=reason, domain=ERROR_DOMAIN)]
     if problem.retry_after is not None:
         delay = duration.from_milliseconds(int(problem.retry_after * 1000))
-        details.append(RetryInfo(retry_delay=delay))
+        details.append(error_details_pb2.RetryInfo(retry_delay=delay))
     if problem.field:
-        violation = BadRequest.FieldViolation(field=problem.field, description=problem.detail)
-        details.append(BadRequest(field_violations=[violation]))
-    status = Status(
+        violation = {"field": problem.field, "description": problem.detail}
+        details.append(error_details_pb2.BadRequest(field_violations=[violation]))
+    status = status_pb2.Status(
         code=code.value[0],
         message=problem.detail,
         details=[any_message.pack(detail) for detail in details],
