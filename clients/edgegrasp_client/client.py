@@ -22,28 +22,16 @@ from typing import Any, Concatenate, ParamSpec
 from typing_extensions import Unpack
 
 from edgegrasp_camera.arrays import Array
-from edgegrasp_client.connection import (
-    DEFAULT_ADDRESS,
-    FEW_RETRIES,
-    RETRIES,
-    Tls,
-    is_rest,
-    retry_delay,
-    seconds_of,
-)
-from edgegrasp_client.errors import (
-    DeadlineError,
-    GraspClientError,
-    ServerUnavailableError,
-    WorkerLostError,
-    invalid,
-)
+from edgegrasp_client import errors
+from edgegrasp_client.connection import RETRIES, Tls, is_rest, retry_delay, seconds_of
+from edgegrasp_client.errors import GraspClientError, invalid
 from edgegrasp_client.over_grpc import GrpcTransport
 from edgegrasp_client.over_rest import RestTransport
 from edgegrasp_client.requests import Cloud, Request, RequestFields, StreamRequest
 from edgegrasp_client.results import Answer, Model, Robot, StreamAnswer
 from edgegrasp_results import Detection, Grasp, Scoring
 
+DEFAULT_ADDRESS = "127.0.0.1:50051"
 POLL_SECONDS = 0.1
 CLOSED = "This client is closed. Make a new one."
 
@@ -177,7 +165,7 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
         end = time.monotonic() + seconds_of(timeout)
         while not await self.ready(timeout=max(POLL_SECONDS, end - time.monotonic())):
             if time.monotonic() >= end:
-                raise DeadlineError(f"The server was not ready within {timeout:g} s.")
+                raise errors.DeadlineError(f"The server was not ready within {timeout:g} s.")
             await asyncio.sleep(POLL_SECONDS)
 
     async def close(self) -> None:
@@ -206,13 +194,12 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
                 answer = await call(left)
                 self._answered = True
                 return answer
-            except ServerUnavailableError as error:
-                # A server that never answered is probably not there at all.
-                delay = retry_delay(error, attempt, RETRIES if self._answered else FEW_RETRIES)
+            except errors.ServerUnavailableError as error:
+                delay = retry_delay(error, attempt, self._answered)
                 if not self._retry or delay is None or time.monotonic() + delay >= end:
                     raise
                 # The request itself may have killed the worker, so it is retried only once.
-                attempt += RETRIES if isinstance(error, WorkerLostError) else 1
+                attempt += RETRIES if isinstance(error, errors.WorkerLostError) else 1
             await asyncio.sleep(delay)
             left = self._seconds(max(end - time.monotonic(), 0.0))
 

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 from edgegrasp_client.errors import OverloadedError, ServerUnavailableError, invalid
 
-DEFAULT_ADDRESS = "127.0.0.1:50051"
 HTTP_OVER_UNIX = "http+unix:"
 
-# Of a call while the server is away: as long as a restart takes, or before its first answer.
+# Of a call while the server is away: as long as a restart takes; few before its first answer, since
+# it is probably not there.
 RETRIES, FEW_RETRIES = 8, 4
 FIRST_DELAY, LONGEST_DELAY = 0.1, 2.0  # seconds; each is twice the one before
 STOP_SECONDS = 15.0  # for a local server to drain
@@ -52,7 +52,7 @@ def seconds_of(timeout: float) -> float:
     return min(seconds, LONGEST_TIMEOUT)
 
 
-def retry_delay(error: ServerUnavailableError, attempt: int, retries: int) -> float | None:
+def retry_delay(error: ServerUnavailableError, attempt: int, answered: bool) -> float | None:
     """Seconds to wait after a failed attempt, counted from 0; None after the last one.
 
     Delays double and are randomised, so that clients refused together do not return together.
@@ -61,7 +61,7 @@ def retry_delay(error: ServerUnavailableError, attempt: int, retries: int) -> fl
     jittered = random.uniform(longest / 2, longest)
     if isinstance(error, OverloadedError):
         return error.retry_after + jittered
-    return jittered if attempt < retries else None
+    return jittered if attempt < (RETRIES if answered else FEW_RETRIES) else None
 
 
 def token_metadata(token: str | None) -> tuple[tuple[str, str], ...]:
