@@ -3,6 +3,7 @@
 import json
 import os
 import tomllib
+from collections import ChainMap
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -125,11 +126,8 @@ def load_settings(config: Path | None = None, **given: object) -> Settings:
     sources = {"a flag": given, "the environment": _read_environment()}
     if path is not None:
         sources[str(path)] = _read_file(path)
-    merged: dict[str, Any] = {}
-    for fields in reversed(sources.values()):
-        merged |= fields
     try:
-        return Settings(**merged)
+        return Settings(**ChainMap(*sources.values()))
     except ValidationError as error:
         raise InvalidSettings(_sentence(error, sources)) from None
 
