@@ -212,8 +212,7 @@ class _Work:
                 raise
             why = f"{error.value} take longer than the deadline allows. Send fewer, or allow more."
             raise errors.DeadlineExceeded(f"{error.field}: {why}") from None
-        points = cloud.points
-        self.facts.points = points.size // 3 if isinstance(points, np.ndarray) else 0
+        self.facts.points = np.asarray(cloud.points).size // 3
         return detector, cloud, options, given
 
     def _within_deadline(self, most: int, seconds: float) -> int:
