@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from edgegrasp_camera.arrays import Bools, Float32, Float64
+from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.scene.cloud import (
     LARGE_IMAGE,
@@ -158,8 +158,15 @@ def range_image(
     pixel_size = max(finest, MAX_PIXEL_SIZE / 2 / depth) if dense else PIXEL_SPACING * spacing
     for growth in (1.0, 1.5, 1.5, 1.5):
         pixel_size *= growth
-        filled, corner = _draw(points, viewpoint, turn, (low, high), pixel_size)
-        if _share_filled(~np.isnan(filled[..., 2])) > MIN_FILLED:
+        sides, multiple = (high - low) / pixel_size, 2 ** (len(LAYER_WIDTHS) - 1)
+        width, height = (int(np.ceil(side / multiple)) * multiple for side in sides)
+        corner = (low + high) / 2 - pixel_size * np.array([width, height]) / 2
+        some = subsample(points, 2 * width * height)  # more add nothing
+        filled = _fill_holes(_render(some, viewpoint, turn, corner, pixel_size, (height, width)))
+        seen = ~np.isnan(filled[..., 2])
+        beside, above = seen[:, :-2] & seen[:, 2:], seen[:-2] & seen[2:]
+        between = np.append(seen[:, 1:-1][beside], seen[1:-1][above])
+        if between.sum() >= MIN_FILLED * len(between):
             break
     coarse = int(np.ceil(depth * pixel_size / MAX_PIXEL_SIZE))
     if (times := min(round(pixel_size / finest), coarse)) > 1:
@@ -191,25 +198,6 @@ def _view(points: Float64) -> tuple[Float64, Float64]:
     edge = 0.02 * (high - low) + 1e-3
     low, high = np.maximum(low - edge, -MAX_VIEW_TANGENT), np.minimum(high + edge, MAX_VIEW_TANGENT)
     return low.round(9), high.round(9)
-
-
-def _draw(
-    points: Float32, viewpoint: Float64, turn: Float64, ends: tuple[Float64, Float64], pixel: float
-) -> tuple[Float32, Float64]:
-    """The image (H, W, 3) between `ends` of the view, `pixel` wide at a depth of 1, and corner."""
-    low, high = ends
-    sides, multiple = (high - low) / pixel, 2 ** (len(LAYER_WIDTHS) - 1)
-    width, height = (int(np.ceil(side / multiple)) * multiple for side in sides)
-    corner = (low + high) / 2 - pixel * np.array([width, height]) / 2
-    some = subsample(points, 2 * width * height)  # more add nothing
-    return _fill_holes(_render(some, viewpoint, turn, corner, pixel, (height, width))), corner
-
-
-def _share_filled(seen: Bools) -> float:
-    """Share of the pixels (H, W) between two that show something that do so as well."""
-    beside, above = seen[:, :-2] & seen[:, 2:], seen[:-2] & seen[2:]
-    both = np.count_nonzero(beside & seen[:, 1:-1]) + np.count_nonzero(above & seen[1:-1])
-    return both / max(np.count_nonzero(beside) + np.count_nonzero(above), 1)
 
 
 def _enlarged(depth: Float32, times: int, corner: Float64, pixel_size: float) -> Float32:

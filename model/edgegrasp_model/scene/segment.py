@@ -90,7 +90,23 @@ def segment_cloud(
     points = cloud.points
     number, confidence, seen_up = np.full(len(points), UNDECIDED), np.empty(0), np.zeros(3)
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
-    views = _view_from_above(points, up) if viewpoints is None else _views(cloud, viewpoints)
+    if viewpoints is None:
+        views = [_view_from_above(points, up)]
+    elif len(viewpoints) > 1:
+        assert cloud.view_ids is not None
+        seen = [np.flatnonzero(cloud.view_ids == view) for view in range(len(viewpoints))]
+        views = [
+            CameraView(rows, viewpoint, None)
+            for rows, viewpoint in zip(seen, viewpoints, strict=True)
+            if len(rows)
+        ]
+    else:
+        down = None
+        if cloud.image_size is not None:
+            row = subsample(cloud.row, 5000) // cloud.image_size[1]
+            sight = unit(subsample(points, 5000) - viewpoints[0])
+            down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
+        views = [CameraView(slice(None), viewpoints[0], down)]
     for rows, viewpoint, down in views:
         own = segment(points[rows], viewpoint, up, down)
         number[rows] = np.where(own.number >= 0, own.number + len(confidence), own.number)
@@ -102,7 +118,7 @@ def segment_cloud(
     return Segmentation(number, objects, support, confidence, unit(seen_up))
 
 
-class View(NamedTuple):
+class CameraView(NamedTuple):
     """What one camera sees of N points."""
 
     rows: Int64 | slice  # of its points
@@ -110,21 +126,7 @@ class View(NamedTuple):
     down: Float64 | None  # (3,) downward in the image; None: unknown
 
 
-def _views(cloud: CheckedCloud, viewpoints: Float64) -> list[View]:
-    """The views of a cloud from its cameras (W, 3)."""
-    if len(viewpoints) > 1:
-        assert cloud.view_ids is not None
-        rows = [np.flatnonzero(cloud.view_ids == view) for view in range(len(viewpoints))]
-        return [View(*each, None) for each in zip(rows, viewpoints, strict=True) if len(each[0])]
-    down = None
-    if cloud.image_size is not None:
-        row = subsample(cloud.row, 5000) // cloud.image_size[1]
-        sight = unit(subsample(cloud.points, 5000) - viewpoints[0])
-        down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
-    return [View(slice(None), viewpoints[0], down)]
-
-
-def _view_from_above(points: Float32, up: Float64 | None) -> list[View]:
+def _view_from_above(points: Float32, up: Float64 | None) -> CameraView:
     """The view of points (N, 3) from above the middle one, in an image that turns with them.
 
     Points farther away than USUAL_DISTANCE stay undecided: a room is seen too small.
@@ -138,7 +140,7 @@ def _view_from_above(points: Float32, up: Float64 | None) -> list[View]:
     apart = points[near] - middle
     distance = np.linalg.norm(apart, axis=1)
     eye = middle + max(1.0, 2.5 * float(np.percentile(distance, 99))) * over
-    return [View(near, eye, apart[distance.argmax()])]
+    return CameraView(near, eye, apart[distance.argmax()])
 
 
 def segment(
