@@ -1,5 +1,8 @@
 """Worker processes: the front's pool of them, their messages, and the nursery they fork from.
 
+usage: python -m edgegrasp_service.worker.process SETTINGS    as JSON; standard input: the pool's
+socket
+
 `WorkerPool` runs jobs, replaces dead processes and reloads. `main` runs the nursery. It imports and
 loads what a worker needs, then forks a worker whenever the pool asks for one; that takes
 milliseconds, and memory is shared until written to. The nursery never has a second thread. A
@@ -30,10 +33,8 @@ from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service import errors
 from edgegrasp_service.settings import Settings
 
-# Takes the settings as JSON, and the pool's socket as standard input. -P: nothing is imported from
-# the folder the server was started in.
-RUN_NURSERY = f"import sys; from {__name__} import main; main(sys.argv[1])"
-NURSERY_COMMAND = (sys.executable, "-P", "-c", RUN_NURSERY)
+# -P: nothing is imported from the folder the server was started in.
+NURSERY_COMMAND = (sys.executable, "-P", "-m", "edgegrasp_service.worker.process")
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 # Freed memory is kept for the next request: the system hands out new pages slowly.
 KEPT_MEMORY = {"MALLOC_TRIM_THRESHOLD_": str(2**26), "MALLOC_MMAP_THRESHOLD_": str(2**24)}
@@ -520,3 +521,9 @@ def limited_memory(most: int) -> Iterator[None]:
 def _send(to: socket.socket, message: object) -> None:
     for part in pack(message):
         to.sendall(part)
+
+
+if __name__ == "__main__":
+    from edgegrasp_service.worker import process  # whose messages workers make
+
+    process.main(sys.argv[1])
