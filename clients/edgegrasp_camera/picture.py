@@ -74,10 +74,14 @@ class View:
         if len(np.unique(rows)) < 2 or len(np.unique(columns)) < 2:
             return None
         x, y, z = points[rows, columns].T.astype(np.float64)
-        (fx, cx), (fy, cy) = np.polyfit(x / z, columns, 1), np.polyfit(y / z, rows, 1)
-        view = cls((points.shape[0], points.shape[1]), fx, fy, cx, cy)
-        away = view.project(points[rows, columns])[0] - np.stack([columns, rows], axis=1)
-        return view if np.abs(away).max() < 1.0 else None
+        numbers, worst = [], 0.0
+        for slope, pixel in ((x / z, columns), (y / z, rows)):
+            system = np.stack([slope, np.ones_like(slope)], axis=1)
+            (focal, middle), *_ = np.linalg.lstsq(system, pixel)
+            worst = max(worst, float(np.abs(system @ (focal, middle) - pixel).max()))
+            numbers += [float(focal), float(middle)]
+        fx, cx, fy, cy = numbers
+        return cls((points.shape[0], points.shape[1]), fx, fy, cx, cy) if worst < 1.0 else None
 
     def project(self, points: ArrayLike) -> tuple[Float64, Float64]:
         """Columns and rows (..., 2), and distances along the line of sight (...), metres."""
