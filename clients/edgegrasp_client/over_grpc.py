@@ -2,6 +2,7 @@
 
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping, Sequence
 from dataclasses import astuple
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -190,8 +191,8 @@ def fill(message: Message, value: object, path: str = "") -> None:
             try:
                 if not field.is_repeated:
                     setattr(message, name, part)
-                elif name.startswith(("T_", "surface")):  # in JSON also row by row
-                    getattr(message, name).extend(np.ravel(part).tolist())
+                elif name.startswith(("T_", "surface")) and all(isinstance(r, list) for r in part):
+                    getattr(message, name).extend(chain(*part))  # in JSON also row by row
                 else:
                     getattr(message, name).extend(part)
             except (TypeError, ValueError) as error:
@@ -227,18 +228,24 @@ def _target(message: Any, value: Any, path: str) -> tuple[Any, Any]:
             if not isinstance(value, Sequence) or len(value) != len(names):
                 raise invalid(path, repr(value)[:80], f"Give a list: {', '.join(names)}.")
             return message, dict(zip(names, value, strict=True))
+        case "Shape" | "Obstacle":
+            kind = fields.pop("kind", None)
+            if kind not in names:
+                fix = f"Set its kind to one of {', '.join(names)}."
+                raise invalid(path, repr(value if kind is None else kind)[:80], fix)
+            return getattr(message, kind), fields
         case "Support" | "Suppression" if value is None:
             return message, {"disabled": True}
         case "Support" if value == "none":
             return message, {"disabled": True}
-        case "Shape" | "Obstacle" | "Support":
-            kinds = {name: getattr(message, name) for name in names}
-            if message.DESCRIPTOR.name == "Support":
-                kinds = {"plane": message, "auto": message.auto, "ransac": message.ransac}
-            kind = value if isinstance(value, str) else str(fields.pop("kind", "plane"))
-            if not isinstance(value, Mapping | str) or kind not in kinds:
-                raise invalid(path, repr(value)[:80], f"Set its kind to one of {', '.join(kinds)}.")
-            return kinds[kind], fields
+        case "Support":
+            kind = value if isinstance(value, str) else fields.pop("kind", "plane")
+            if kind in ("auto", "ransac"):
+                return getattr(message, kind), fields
+            if kind != "plane" or {"auto", "ransac"} & fields.keys():
+                fix = "Set its kind to one of auto, plane, ransac, none."
+                raise invalid(path, repr(kind)[:80], fix)
+            return message, fields if isinstance(value, Mapping) else value
         case "HandPose":
             return message, {names[0]: value}
         case "Collision" | "GripperChoice" if isinstance(value, str):
