@@ -66,7 +66,10 @@ class ProtocolError(GraspClientError):
 # Kinds of errors that a server reports; the last of some are gRPC's codes, as a proxy sends them.
 _KINDS: dict[type[GraspClientError], tuple[str, ...]] = {
     InvalidRequestError: (
-        *("invalid-request", "unsupported-media-type", "headers-too-large", "harmful-request"),
+        "invalid-request",
+        "unsupported-media-type",
+        "headers-too-large",
+        "harmful-request",
         "invalid-argument",
     ),
     StartCollisionError: ("start-collision",),

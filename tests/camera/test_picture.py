@@ -20,6 +20,12 @@ def test_the_nearest_point_is_seen_at_a_pixel() -> None:
     assert view.rows_of_pixels(points)[1, 1] == 1
 
 
+def test_an_image_whose_points_lie_in_a_line_has_no_camera() -> None:
+    line = np.ones((24, 32, 3)) * (0.0, 1.0, 1.0)
+    line[..., 1] *= np.arange(24)[:, None] / 30
+    assert View.of_image(line) is None
+
+
 @pytest.mark.parametrize("behind", [False, True])
 def test_what_the_cloud_hides_of_a_hand_is_faint(behind: bool) -> None:
     """A wall, and a hand that points down before or behind it."""

@@ -155,6 +155,7 @@ OPTIONS: list[tuple[dict[str, Any], str]] = [
     ({"workspace": {"min": [0, 0, 0], "max": [1, 1, 1], "mid": 3}}, "workspace.mid"),
     ({"workspace": [1, 2]}, "workspace"),
     ({"support": {"kind": "cylinder"}}, "support"),
+    ({"approach_region": {"include": ["box"]}}, "approach_region.include.0"),
     ({"approach_region": {"include": [{"kind": "cube"}]}}, "approach_region.include.0"),
     ({"approach_region": [{"kind": "mask", "mask": [True]}]}, "approach_region"),
     (mask(np.ones((3, 4), np.float32)), "contact_region.include.0.mask"),

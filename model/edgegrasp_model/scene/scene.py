@@ -62,7 +62,7 @@ from edgegrasp_model.scene.support import (
 from edgegrasp_model.unseen import DepthMap
 
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
-FOLLOWED_REACH = 0.16  # the same if only known grasps are checked
+FOLLOWED_REACH = 0.16  # metres around an object, as HAND_REACH, if only known grasps are checked
 FOUND_PLANE_CLEARANCE = 0.0015  # metres that hands stay above a plane that was not given
 NO_OBJECT = (
     "no object was recognised above the support plane. Send objects: off to look for grasps on "
@@ -157,8 +157,8 @@ def select_points(
     number, confidence = number[above], dict[int, float]()
     if found is not None and not given:
         if support is not None:
-            over = height[above], margin[above], math.isnan(support.growth)
-            number, certain = objects_above(found, above, plan, *over)
+            cut_off = math.isnan(support.growth)
+            number, certain = objects_above(found, above, plan, height, margin, cut_off)
             confidence = dict(enumerate(certain.tolist()))
         elif viewpoints is not None and (
             (found.number >= 0).any() or np.median(seen.distance()) < NEAREST_DEPTH
@@ -205,7 +205,7 @@ def build_scene(
 ) -> Scene | None:
     """Voxelise the selected points, remove outliers, estimate normals, and find the regions.
 
-    None if too few points are left to make a surface; InvalidRequest: there are too many voxels.
+    None if there is no object; InvalidRequest: there are too many voxels.
     """
     sent, support, viewpoints = selected.sent, selected.support, selected.viewpoints
     obstacles = options.collision.obstacles

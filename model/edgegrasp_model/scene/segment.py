@@ -112,7 +112,7 @@ def segment_cloud(
         number[rows] = np.where(own.number >= 0, own.number + len(confidence), own.number)
         objects[rows], support[rows] = own.object, own.support
         confidence = np.concatenate([confidence, own.confidence])
-        seen_up += own.up
+        seen_up += own.up * len(own.number)
     if len(views) > 1:
         number, confidence = merge_views(points, number, confidence)
     return Segmentation(number, objects, support, confidence, unit(seen_up))
@@ -149,7 +149,7 @@ def segment(
     up: Float64 | None,  # (3,) unit, away from gravity; None: unknown
     down: Float64 | None,  # (3,) downward in the image, used if `up` is unknown
 ) -> Segmentation:
-    """Segment points seen by one camera; `up` is as long as pixels agree about it."""
+    """Segment points seen by one camera."""
     image, (network, _) = range_image(points, viewpoint, up, down), shipped()
     up_in_view = None if up is None else image.turn @ up
     features = scene_features(image.points, up_in_view, image.footprint)
@@ -169,7 +169,7 @@ def run_network(
     points: Float32,  # (H, W, 3) camera frame, metres; NaN where nothing was seen
     footprint: float,  # width of a pixel at a depth of one metre, metres
 ) -> tuple[Pixels, Float64]:
-    """A network's output for a range image, and its pixels' ways up, summed (3,); camera frame."""
+    """A network's output for a range image, and its estimate of up (3,); camera frame."""
     with torch.inference_mode(), one_thread():
         output = network(torch.from_numpy(features)[None])
         classes = output.classes[0].softmax(dim=0).contiguous().numpy()
@@ -180,7 +180,7 @@ def run_network(
     seen_up = ways[:, ~np.isnan(seen[..., 2])].sum(axis=1).astype(np.float64)
     if not seen_up.any():  # nothing was seen: assume toward the camera
         seen_up = np.array([0.0, 0.0, -1.0])
-    return Pixels(seen, classes, votes, links, 2 * footprint), seen_up
+    return Pixels(seen, classes, votes, links, 2 * footprint), unit(seen_up)
 
 
 @contextmanager
@@ -292,13 +292,13 @@ def objects_above(
     found: Segmentation,  # of N points
     above: Int64,  # (M,) which of them rise above the support
     plan: Float64,  # (M, 2) places along it, metres
-    height: Float32,  # (M,) metres over it
-    margin: Float32,  # (M,) metres over it that belong to it
+    height: Float32,  # (N,) metres over it
+    margin: Float32,  # (N,) metres over it that belong to it
     cut_off: bool,  # the cloud ends above the support
 ) -> tuple[Int64, Float64]:
     """The object (M,) of each point above the support, and the confidence (O,) of each object."""
     likely = (found.object + found.support)[above] > MIN_CONFIDENCE
-    number = with_raised_points(found.number[above], plan, height, margin, likely)
+    number = with_raised_points(found.number[above], plan, height[above], margin[above], likely)
     if not cut_off and (number >= 0).any():
         return number, found.confidence
     first = len(found.confidence)
