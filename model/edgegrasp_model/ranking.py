@@ -93,6 +93,8 @@ def select(
     if (rule := options.suppression) is not None:
         near = rule.translation, rule.rotation
         order, dropped = non_max_suppression(T_cloud_tcp, order, *near, options.top_k)
+        if options.order == "score":  # of an object whose first one was near another object's
+            order = objects_first(order, order, rating, scene.object_of_point[contact])
     order = order[: options.top_k]
     outcome[dropped] = OUTCOME_CODE[Outcome.SUPPRESSED]
     outcome[order] = OUTCOME_CODE[Outcome.RETURNED]
