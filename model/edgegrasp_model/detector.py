@@ -28,11 +28,12 @@ from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import Collision, DetectOptions
 from edgegrasp_model.results import NoGrasp, Pace
-from edgegrasp_model.scene.cloud import check_cloud, seen_from_origin
+from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_model.scene.scene import (
     MAX_VOXELS,
     Scene,
     SelectedPoints,
+    assumed_viewpoint,
     build_scene,
     select_points,
 )
@@ -133,16 +134,9 @@ class GraspDetector:
                 f"the weights were trained for the gripper {self.gripper.name!r}: their scores are "
                 f"uncalibrated for {gripper.name!r}; use them for ranking only."
             )
-        if options.viewpoint is None and seen_from_origin(sent.points, options.up):
-            warnings.append(
-                "viewpoint is not given: the camera is assumed at the origin, as the whole cloud "
-                "lies in front of it; if the camera is elsewhere, send its position."
-            )
-            options = options.model_copy(update={"viewpoint": (0.0, 0.0, 0.0)})
-        elif options.viewpoint is None and sent.normals is None:
-            warnings.append(
-                "viewpoint is not given: normals are oriented upward; send the camera's position."
-            )
+        if options.viewpoint is None:
+            eye = assumed_viewpoint(sent.points, options, warnings)
+            options = options.model_copy(update={"viewpoint": eye})
         previous, followed, choice = options.previous, None, options.objects
         if previous is not None:
             options = tracking.narrowed(options, gripper.name, sent.points)

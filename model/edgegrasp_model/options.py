@@ -607,8 +607,9 @@ class DetectOptions(Strict):
     seed: Integer = Field(default=0, ge=0, lt=2**63)
     """seed of every random choice"""
     viewpoint: Viewpoint | None = None
-    """camera position, metres; normals are oriented towards it. If there are several, `view_ids`
-    beside the cloud says which one saw each point"""
+    """camera position, metres. If there are several, `view_ids` beside the cloud says which one saw
+    each point. null: the origin if the whole cloud lies in front of it, else a place above the
+    cloud from which the least of it is hidden"""
     up: Direction | None = None
     """direction away from gravity; any length but zero; null: the support plane's normal; without
     it estimated in a camera's frame, else +z"""

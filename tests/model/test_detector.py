@@ -357,7 +357,7 @@ def convinced(logit: float) -> GraspDetector:
         ((0.04, 0.06, 0.08), {"collision": {"obstacles": LID}}, "blocked"),
         ((0.04, 0.06, 0.03), {"collision": {"margin": 0.05}}, "blocked"),  # by the support
         ((0.04, 0.06, 0.08), {"viewpoint": (1.0, 0.0, 0.04)}, "hidden"),
-        ((0.04, 0.06, 0.08), {"viewpoint": None}, None),  # nobody can say
+        ((0.04, 0.06, 0.08), {"viewpoint": None}, "hidden"),  # from where it is assumed
     ],
 )
 def test_an_object_without_a_good_grasp_has_a_reason(size, options, reason) -> None:

@@ -11,7 +11,13 @@ from tests.checks import bounded_memory, refusal
 
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.results import SUPPORT
-from edgegrasp_model.scene.cloud import CloudInput, check_cloud, voxelise
+from edgegrasp_model.scene.cloud import (
+    CloudInput,
+    check_cloud,
+    likely_viewpoint,
+    unit,
+    voxelise,
+)
 from edgegrasp_model.scene.scene import build_scene, select_points
 from edgegrasp_model.scene.segment import BACKGROUND, Segmentation
 from edgegrasp_model.scene.support import ViewedPoints, find_support, heights_over
@@ -130,6 +136,19 @@ def test_a_voxel_downsampled_cloud_without_a_viewpoint_keeps_its_objects(seed: i
     found = detector().detect(voxelise(cloud, 0.004).mean(cloud))
     assert standing(found, boxes, np.eye(4)) == {0, 1, 2, 3}
     assert_grasped(found, boxes, np.eye(4))
+
+
+@pytest.mark.parametrize("seed", [3, 8])
+def test_a_shelf_seen_from_the_front_without_a_viewpoint_keeps_its_objects(seed: int) -> None:
+    boxes, pose = boxes_on_table(seed), camera(1.1, -1.5, 0.9)
+    board, back = box((0, 0, 0.4), (0.5, 0.3, 0.01)), box((0, 0.35, 0.2), (0.5, 0.01, 0.25))
+    cloud = seen_in_world([table(0.5, 0.3), board, back, *boxes], pose)
+    found = detector().detect(cloud)
+    assert standing(found, boxes, np.eye(4)) == {0, 1, 2, 3}
+    assert_grasped(found, boxes, np.eye(4))
+    middle = np.median(cloud, axis=0)
+    ways = unit(np.stack([likely_viewpoint(cloud, (0, 0, 1)), pose[:3, 3]]) - middle)
+    assert ways[0] @ ways[1] > np.cos(np.radians(30))
 
 
 @pytest.mark.parametrize("polar", [0.05, 0.4])
@@ -604,6 +623,4 @@ def test_the_flat_top_of_an_object_is_no_table_by_which_depths_are_scaled() -> N
     assert "are used as sent" in warnings[0]
     np.testing.assert_allclose(left[:, 2], 0.07, atol=0.001)
     with refusal("options.viewpoint"):  # which scaling needs
-        select_points(
-            check_cloud(top.astype(np.float32)), parse_options({"support": PLANE}), {}, []
-        )
+        detector().detect(top, parse_options({"support": PLANE}))

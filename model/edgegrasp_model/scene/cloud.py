@@ -19,6 +19,7 @@ MAX_CLOUD_EXTENT = 20.0  # metres; if most of a cloud is wider, it is probably i
 MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 MAX_VIEW_TANGENT = 1.2  # of half a depth camera's field of view
+USUAL_DISTANCE = 0.8  # metres from a camera to objects and around them, if it is not known
 SUBSAMPLE_SIZE = 6000  # points that represent a cloud in fits, means and views
 LARGE_IMAGE = 704, 960  # pixels of an image of which every second row and column may be enough
 HAND_REACH = 0.25  # metres around an object in which a hand at it may collide
@@ -50,13 +51,13 @@ class CheckedCloud:
         points = self.points.take(place, axis=0)  # many times faster than indexing
         return replace(self, points=points, row=self.row[place], **arrays)
 
-    def projection(self, frame: "CanonicalFrame", eyes: Float64 | None) -> Float64 | None:
+    def projection(self, frame: "CanonicalFrame", eyes: Float64) -> Float64 | None:
         """The projection (3, 4) of canonical points into the image of one camera that was sent.
 
         By direct linear transformation; None without such an image. `eyes` (W, 3) are the cameras,
         canonical frame.
         """
-        if self.image_size is None or eyes is None or len(eyes) > 1:
+        if self.image_size is None or len(eyes) > 1:
             return None
         row, (height, width) = subsample(self.row, 1000), self.image_size
         x = (2 * (row % width) + 1)[:, None] / width - 1
@@ -188,6 +189,69 @@ def seen_from_origin(points: Float32, up: ArrayLike | None) -> bool:
     middle = points.mean(axis=0, dtype=np.float64)
     upward = 0.0 if up is None else np.dot(up, middle) / np.linalg.norm(up)
     return bool(upward <= 0.5 * np.linalg.norm(middle))
+
+
+def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64:
+    """The place (3,) above points (N, 3) from which the least is hidden: where their camera was.
+
+    Of places from which nothing is hidden, the one that is nearest to USUAL_DISTANCE and to 30
+    degrees off `up` (3,). It turns and moves with the cloud.
+    """
+    some = subsample(points, 20_000)
+    apart = np.linalg.norm(some - np.median(some, axis=0), axis=1)
+    some = some[np.linalg.norm(some - some[apart.argmin()], axis=1) < USUAL_DISTANCE]
+    near = subsample(some)
+    frame = CanonicalFrame.of_scene(near, up, None)
+    seen = frame.points(near)
+    middle = np.median(seen, axis=0)
+
+    def cost(eye: Float64) -> float:
+        distance = float(np.linalg.norm(eye - middle))
+        z = (middle - eye) / distance
+        x = unit(np.cross(z, (0.0, 0.0, 1.0) if abs(z[2]) < 0.99 else (1.0, 0.0, 0.0)))
+        axes = np.stack([x, np.cross(z, x), z])
+        unusual = (np.arccos(-z[2]) - 0.5) ** 2 + np.log(distance / USUAL_DISTANCE) ** 2
+        return float(_hidden_share(seen, eye, axes, 0.011 / distance) + 0.012 * unusual)
+
+    # Places spread evenly over half of a sphere, then around the best one.
+    z, turn = 1.0 - (np.arange(60) + 0.5) / 60, np.pi * (3.0 - np.sqrt(5.0)) * np.arange(60)
+    level = np.sqrt(1.0 - z * z)
+    ways = np.stack([level * np.cos(turn), level * np.sin(turn), z], axis=1)
+    eye, step = min(middle + USUAL_DISTANCE * ways, key=cost), 0.2
+    while step > 0.01:
+        eye = min(eye + step * (np.indices((3, 3, 3)).reshape(3, -1).T - 1), key=cost)
+        step *= 0.7
+    return frame.points_in_cloud(eye).astype(np.float64)
+
+
+@compiled("contract")
+def _hidden_share(points: Float64, eye: Float64, axes: Float64, cell: float) -> float:
+    """Share of points (N, 3) that lie behind others, as seen from a place (3,).
+
+    By cells of a tangent in an image with `axes` (3, 3), rows right, down and forward. Points 15 mm
+    behind others are seen, those 45 mm behind them are hidden, and those between count in part.
+    """
+    nearest, half = np.full((144, 144), np.inf), 72
+    cells, away = np.full((len(points), 2), -1), np.empty(len(points))
+    hidden = 0.0
+    for n in range(len(points)):
+        a, b, c = points[n, 0] - eye[0], points[n, 1] - eye[1], points[n, 2] - eye[2]
+        x = axes[0, 0] * a + axes[0, 1] * b + axes[0, 2] * c
+        y = axes[1, 0] * a + axes[1, 1] * b + axes[1, 2] * c
+        z = axes[2, 0] * a + axes[2, 1] * b + axes[2, 2] * c
+        if z < 0.05:  # behind the camera
+            hidden += 1.0
+            continue
+        i, j = np.floor(x / z / cell) + half, np.floor(y / z / cell) + half
+        if 0 <= i < len(nearest) and 0 <= j < len(nearest):
+            cells[n, 0], cells[n, 1] = int(i), int(j)
+            away[n] = np.sqrt(a * a + b * b + c * c)
+            nearest[cells[n, 0], cells[n, 1]] = min(nearest[cells[n, 0], cells[n, 1]], away[n])
+    for n in range(len(points)):
+        if cells[n, 0] >= 0:
+            behind = (away[n] - nearest[cells[n, 0], cells[n, 1]] - 0.015) / 0.03
+            hidden += min(max(behind, 0.0), 1.0)
+    return hidden / len(points)
 
 
 def usual_up(forward: Float64) -> Float64:
@@ -328,20 +392,17 @@ def clean_cloud(
     voxels: Voxels,  # of these points
     middles: Float32,  # (V, 3) the voxels' mean points, canonical frame, metres
     frame: "CanonicalFrame",
-    eyes: Float64 | None,  # (W, 3) the cameras, canonical frame
+    eyes: Float64,  # (W, 3) the cameras, canonical frame
 ) -> tuple["Cloud", Bools]:
     """The voxels without outliers, and a mask (V,) of them.
 
-    Normals are as given, else estimated and turned to the camera: without one, to a place one metre
-    above the middle.
+    Normals are as given, else estimated and turned to the camera.
     """
     kept, near = inliers_and_neighbours(middles)
     points, normals = middles[kept], smallest_variance_directions(middles, near)[kept]
-    seen_from = (points.min(axis=0) + points.max(axis=0)) / 2 + UP
-    if eyes is not None:
-        seen_from = eyes.astype(np.float32)
-        if len(eyes) > 1 and sent.view_ids is not None:
-            seen_from = seen_from[voxels.commonest(sent.view_ids)[kept]]
+    seen_from = eyes.astype(np.float32)
+    if len(eyes) > 1 and sent.view_ids is not None:
+        seen_from = seen_from[voxels.commonest(sent.view_ids)[kept]]
     away = np.einsum("nd,nd->n", normals, seen_from - points) < 0
     normals = np.where(away[:, None], -normals, normals)
     if sent.normals is not None:

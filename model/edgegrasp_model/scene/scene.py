@@ -38,6 +38,8 @@ from edgegrasp_model.scene.cloud import (
     Voxels,
     clean_cloud,
     inside_workspace,
+    likely_viewpoint,
+    seen_from_origin,
     unit,
     voxelise,
 )
@@ -113,7 +115,7 @@ class SelectedPoints:
     number: Int64  # (M,) number of each one's object, or BACKGROUND or UNDECIDED
     support: Support | None
     up: Float64  # (3,) unit, away from gravity, cloud frame
-    viewpoints: Float64 | None  # (W, 3) the cameras
+    viewpoints: Float64  # (W, 3) the cameras
     labels: Int64  # (R,) of the rows of the cloud as sent, as in `DebugInfo`
     confidence: dict[int, float]  # of each object that the network found
     corrected: Float32 | None = None  # (N, 3) all points, if their depths were corrected
@@ -144,7 +146,7 @@ def select_points(
     if needed and len(sent.points) > 0:
         found = segment_cloud(sent, viewpoints, options.known_up)
         found = found if sent.segment_ids is None else found._replace(number=number)
-    seen = ViewedPoints(sent.points, None if viewpoints is None else viewpoints.mean(axis=0))
+    seen = ViewedPoints(sent.points, viewpoints.mean(axis=0))
     support = find_support(seen, inside, found, options, warnings)
     above_all = np.ones(len(inside), np.float32), np.zeros(len(inside), np.float32)
     height, margin = above_all if support is None else support.heights(seen)
@@ -160,9 +162,7 @@ def select_points(
             cut_off = math.isnan(support.growth)
             number, certain = objects_above(found, above, plan, height, margin, cut_off)
             confidence = dict(enumerate(certain.tolist()))
-        elif viewpoints is not None and (
-            (found.number >= 0).any() or np.median(seen.distance()) < NEAREST_DEPTH
-        ):
+        elif (found.number >= 0).any() or np.median(seen.distance()) < NEAREST_DEPTH:
             number, confidence = found.number, dict(enumerate(found.confidence.tolist()))
     if not given:
         number = without_long(number, sent.points, options.max_object_size)
@@ -175,7 +175,7 @@ def select_points(
         number = chosen_objects(number, sent, options, warnings)
     kept = near_objects_along(plan, number)
     near, number = sent.take(kept), number[kept]
-    up = _up(options, seen, support, None if viewpoints is None else found)
+    up = _up(options, seen, support, found)
     return SelectedPoints(near, number, support, up, viewpoints, labels, confidence, corrected)
 
 
@@ -212,9 +212,8 @@ def build_scene(
     if len(sent.points) == 0 or not (selected.number >= 0).any():
         counts |= {"voxels": 0, "kept": 0}
         return None
-    eye = None if viewpoints is None else viewpoints[0]
-    frame = CanonicalFrame.of_scene(sent.points, selected.up, eye)
-    eyes = None if viewpoints is None else frame.points(viewpoints)
+    frame = CanonicalFrame.of_scene(sent.points, selected.up, viewpoints[0])
+    eyes = frame.points(viewpoints)
     projection = sent.projection(frame, eyes)
     voxels = voxelise(canonical := frame.points(sent.points), voxel_size, max_voxels)
     middles = voxels.mean(canonical)
@@ -242,7 +241,7 @@ def build_scene(
         object_of_point=number,
         support=None if support is None else _plane_under_hands(support.plane, frame, spare),
         at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, sent.points),
-        viewpoints=None if eyes is None else eyes.astype(np.float32),
+        viewpoints=eyes.astype(np.float32),
         confidence=selected.confidence,
         P_image_cloud=projection,
         obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
@@ -267,17 +266,14 @@ def _up(
     support: Support | None,
     segmentation: Segmentation | None,
 ) -> Float64:
-    """Unit vector (3,) away from gravity: as sent, else the support's normal, else estimated.
-
-    +z if none of these is known, or there is no camera.
-    """
+    """Unit vector (3,) away from gravity: as sent, else the support's normal, else estimated."""
     if options.up is not None:
         return unit(np.asarray(options.up, dtype=np.float64))
     if support is not None:
         return np.asarray(support.frame.T_canonical_cloud[2, :3])
     if segmentation is not None:
         return segmentation.up
-    if seen.viewpoint is not None and in_camera_frame(options) and len(seen.points) > 0:
+    if in_camera_frame(options) and len(seen.points) > 0:
         return up_of_cropped(seen.points, seen.viewpoint, None)
     return np.array([0.0, 0.0, 1.0])
 
@@ -312,10 +308,37 @@ def near_workspace_side(
     return np.asarray((at_low | at_high).any(axis=1))
 
 
-def camera_positions(sent: CheckedCloud, options: DetectOptions) -> Float64 | None:
-    """The camera positions (W, 3) of the request, if any."""
-    if options.viewpoint is None:
-        return None
+def assumed_viewpoint(
+    points: Float32, options: DetectOptions, warnings: list[str]
+) -> tuple[float, float, float]:
+    """Where the camera is assumed to be that saw points (N, 3), if a request does not say it.
+
+    InvalidRequest: the place is needed to the millimetre.
+    """
+    if seen_from_origin(points, options.up):
+        warnings.append(
+            "viewpoint is not given: the camera is assumed at the origin, as the whole cloud "
+            "lies in front of it; if the camera is elsewhere, send its position."
+        )
+        return 0.0, 0.0, 0.0
+    if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
+        fix = "Send the camera's position: depths are corrected along its rays."
+        raise InvalidRequest("options.viewpoint", "nothing", fix)
+    if options.robot is not None and options.robot.avoid_unseen:
+        fix = "Send the option viewpoint, or depth images with their poses."
+        raise InvalidRequest("options.robot.avoid_unseen", "true, without a camera's position", fix)
+    inside = inside_workspace(points, options.workspace, HAND_REACH)
+    up = UP if options.known_up is None else options.known_up
+    x, y, z = likely_viewpoint(points[inside] if inside.any() else points, up).tolist()
+    warnings.append(
+        f"viewpoint is not given: the camera is assumed at ({x:.2f}, {y:.2f}, {z:.2f}), from where "
+        "the least of the cloud is hidden; send its position."
+    )
+    return x, y, z
+
+
+def camera_positions(sent: CheckedCloud, options: DetectOptions) -> Float64:
+    """The camera positions (W, 3) of the request."""
     viewpoints = np.asarray(options.viewpoint, dtype=np.float64).reshape(-1, 3)
     if len(viewpoints) == 1:
         return viewpoints

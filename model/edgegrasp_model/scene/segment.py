@@ -38,7 +38,6 @@ MIN_RISE = 0.004  # metres above the support's margin, of points that are added 
 MIN_CLUSTER_CELLS, MIN_CELL_POINTS = 5, 4  # of cells POINT_REACH wide
 MIN_CONFIDENCE = 0.5  # of an object; below, it is background
 CROPPED_CONFIDENCE = 0.95  # of clusters in a cloud that was cropped above its support
-USUAL_DISTANCE = 0.7  # metres from a camera to objects and around them, if it is not known
 
 
 class Segmentation(NamedTuple):
@@ -83,16 +82,14 @@ def confidences(mean: Float64) -> Float64:
 
 def segment_cloud(
     cloud: CheckedCloud,  # N points
-    viewpoints: Float64 | None,  # (W, 3) of the cameras; None: they are unknown
+    viewpoints: Float64,  # (W, 3) of the cameras
     up: Float64 | None,  # (3,) unit, away from gravity; None: unknown
 ) -> Segmentation:
     """Segment a cloud view by view; an object seen in several views gets one number."""
     points = cloud.points
     number, confidence, seen_up = np.full(len(points), UNDECIDED), np.empty(0), np.zeros(3)
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
-    if viewpoints is None:
-        views = [_view_from_above(points, up)]
-    elif len(viewpoints) > 1:
+    if len(viewpoints) > 1:
         assert cloud.view_ids is not None
         seen = [np.flatnonzero(cloud.view_ids == view) for view in range(len(viewpoints))]
         views = [
@@ -124,23 +121,6 @@ class CameraView(NamedTuple):
     rows: Int64 | slice  # of its points
     viewpoint: Float64  # (3,)
     down: Float64 | None  # (3,) downward in the image; None: unknown
-
-
-def _view_from_above(points: Float32, up: Float64 | None) -> CameraView:
-    """The view of points (N, 3) from above the middle one, in an image that turns with them.
-
-    Points farther away than USUAL_DISTANCE stay undecided: a room is seen too small.
-    """
-    over = np.array([0.0, 0.0, 1.0]) if up is None else up
-    beside = points - np.median(points, axis=0)
-    beside -= (beside @ over)[:, None] * over
-    beside -= beside[np.linalg.norm(beside, axis=1).argmin()]  # there may be none at the median
-    near = np.flatnonzero(np.linalg.norm(beside, axis=1) < USUAL_DISTANCE)
-    middle = points[near].mean(axis=0, dtype=np.float64)
-    apart = points[near] - middle
-    distance = np.linalg.norm(apart, axis=1)
-    eye = middle + max(1.0, 2.5 * float(np.percentile(distance, 99))) * over
-    return CameraView(near, eye, apart[distance.argmax()])
 
 
 def segment(

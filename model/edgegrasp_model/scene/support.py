@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
-from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import SUPPORT_STREAM, DetectOptions, RansacPlane, SupportPlane
 from edgegrasp_model.scene.cloud import (
@@ -23,7 +22,7 @@ from edgegrasp_model.scene.cloud import (
     unit,
     usual_up,
 )
-from edgegrasp_model.scene.segment import USUAL_DISTANCE, Segmentation
+from edgegrasp_model.scene.segment import Segmentation
 
 # Noise of depth cameras: metres from a plane, and as much more per squared metre of distance.
 PLANE_NOISE, NOISE_GROWTH = 0.004, 0.006
@@ -73,12 +72,10 @@ class Support:
         The noise of depth cameras grows with the square of the distance.
         """
         height, squared = np.empty((2, len(seen.points)), dtype=np.float32)
-        eye = np.zeros(3) if seen.viewpoint is None else seen.viewpoint
-        _heights(seen.points, self.frame.T_canonical_cloud, self.bow, eye, height, squared)
+        T, eye = self.frame.T_canonical_cloud, seen.viewpoint
+        _heights(seen.points, T, self.bow, eye, height, squared)
         if math.isnan(self.growth):
             return height, np.full_like(height, self.least)
-        if seen.viewpoint is None:
-            squared[:] = USUAL_DISTANCE**2
         squared *= np.float32(MARGIN_DEVIATIONS * self.growth)
         return height, np.clip(squared, self.least, max(MAX_MARGIN, self.least), out=squared)
 
@@ -87,12 +84,10 @@ class ViewedPoints(NamedTuple):
     """N points and their viewpoint."""
 
     points: Float32  # (N, 3) metres
-    viewpoint: Float64 | None  # (3,) the camera, or the mean of several; None: unknown
+    viewpoint: Float64  # (3,) the camera, or the mean of several
 
     def distance(self) -> Float64:
         """Metres (N,) from the camera."""
-        if self.viewpoint is None:
-            return np.full(len(self.points), USUAL_DISTANCE)
         apart = self.points - self.viewpoint
         return np.asarray(np.sqrt(np.einsum("nd,nd->n", apart, apart)))
 
@@ -139,8 +134,7 @@ def find_support(
                 "no support plane is seen: objects are returned without one, and hands may reach "
                 "under them. Send support, or up in the cloud's frame."
             )
-    eye = seen.viewpoint
-    if found is not None and eye is not None and heights_over(found.plane, eye) < 0:
+    if found is not None and heights_over(found.plane, seen.viewpoint) < 0:
         warnings.append(
             "the viewpoint lies below the support plane: check viewpoint, up and support."
         )
@@ -227,7 +221,6 @@ def _assume_support(
     if up is None and in_camera_frame(options):
         if objects.mean() <= 1.0 - MIN_SUPPORT_SHARE:
             return None
-        assert seen.viewpoint is not None
         up = up_of_cropped(seen.points[objects], seen.viewpoint, segmentation.up)
     elif up is None:
         if segmentation.up[2] <= 0:
@@ -312,9 +305,7 @@ def fit_plane(
     length = np.linalg.norm(normals, axis=1)
     wide = length > 1e-6
     normals, origin = normals[wide] / length[wide, None], corners[wide, 0]
-    # Toward the camera, else up, else +z.
-    toward = np.broadcast_to(np.array([0.0, 0.0, 1.0]) if up is None else up, origin.shape)
-    toward = toward if seen.viewpoint is None else seen.viewpoint - origin
+    toward = seen.viewpoint - origin
     normals = np.where((np.einsum("td,td->t", normals, toward) < 0)[:, None], -normals, normals)
     if up is not None:
         level = normals @ up >= math.cos(max_tilt + 1e-9)
@@ -383,15 +374,12 @@ def _heights(
 
 
 def correct_depth_scale(
-    sent: CheckedCloud, plane: SupportPlane, viewpoints: Float64 | None, warnings: list[str]
+    sent: CheckedCloud, plane: SupportPlane, viewpoints: Float64, warnings: list[str]
 ) -> CheckedCloud:
     """Scale every view about its camera so that its support lies in the given plane.
 
     `viewpoints` (W, 3), metres, are the cameras; the cloud's `view_ids` are their rows.
     """
-    if viewpoints is None:
-        fix = "Send the camera's position: depths are corrected along its rays."
-        raise InvalidRequest("options.viewpoint", "nothing", fix)
     several = len(viewpoints) > 1 and sent.view_ids is not None
     points = sent.points.copy()
     for number, viewpoint in enumerate(viewpoints):

@@ -626,8 +626,9 @@ class DetectOptions(_message.Message):
 
     @_builtins.property
     def viewpoint(self) -> _containers.RepeatedCompositeFieldContainer[Global___Vector]:
-        """Camera position, metres; normals are oriented towards it. If there are several, `view_ids`
-        beside the cloud says which one saw each point.
+        """Camera position, metres. If there are several, `view_ids` beside the cloud says which one saw
+        each point. Absent: the origin if the whole cloud lies in front of it, else a place above the
+        cloud from which the least of it is hidden.
         """
 
     @_builtins.property
