@@ -108,8 +108,7 @@ def surrounded(
     """Add the surroundings to the robot's scenes, and remove them afterwards; yields them.
 
     The hand may touch them in `robot.straight`, since the detection has checked it there.
-    InvalidRequest: the start is in collision, the base stands inside an object, or what no camera
-    saw is to be avoided and no camera is known.
+    InvalidRequest: the start is in collision, or the base stands inside an object.
     """
     joints = np.array(asked.joints)
     T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
@@ -216,9 +215,7 @@ def _voxels(
 
 def _hidden(scene: Scene, voxels: Float64, T_base_scene: Float64) -> Float64:
     """Centers (U, 3) of voxels that others hide from every camera, above the support."""
-    if scene.viewpoints is None:
-        fix = "Send the option viewpoint, or depth images with their poses."
-        raise InvalidRequest("options.robot.avoid_unseen", "true, without a camera's position", fix)
+    assert scene.viewpoints is not None
     base = np.linalg.inv(T_base_scene)[:3, 3]
     steps = np.arange(VOXEL_SIZE, 2 * MAX_RANGE, VOXEL_SIZE)[:, None, None]
     hidden = []

@@ -73,3 +73,4 @@ def test_what_no_camera_saw_is_avoided_only_with_a_camera(refused, tmp_path: Pat
     flags = ("--robot", "fr3", "--joints", joints, "--base", base, "--objects", "off")
     said = refused("detect", tmp_path / "cloud.npy", *flags, "--avoid-unseen")
     assert "options.robot.avoid_unseen: got true, without a camera" in said
+    assert "Send the option viewpoint" in said

@@ -11,13 +11,7 @@ from tests.checks import bounded_memory, refusal
 
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.results import SUPPORT
-from edgegrasp_model.scene.cloud import (
-    CloudInput,
-    check_cloud,
-    likely_viewpoint,
-    unit,
-    voxelise,
-)
+from edgegrasp_model.scene.cloud import CloudInput, check_cloud, likely_viewpoint, unit, voxelise
 from edgegrasp_model.scene.scene import build_scene, select_points
 from edgegrasp_model.scene.segment import BACKGROUND, Segmentation
 from edgegrasp_model.scene.support import ViewedPoints, find_support, heights_over

@@ -281,7 +281,6 @@ REFUSED = [  # what changes, and what is said: a field, of its value, of the fix
     ({"joints": [3, 0, 0, -2, 0, 2, 0]}, "robot.joints.0", "", "fr3_joint1"),
     ({"joints": START_IN_THE_TABLE}, "robot.joints", " and the support touch", ""),
     ({"joints": START_IN_ITSELF}, "robot.joints", "touch", ""),
-    ({"avoid_unseen": True}, "robot.avoid_unseen", "", "viewpoint"),
     ({"boxes": ((0.08, 0.0, 0.1),)}, "robot.T_base_cloud", "object", ""),
     ({"options": {"collision": "ignore"}}, "collision.mode", "", ""),
     ({"options": {"gripper": "barrett"}}, "gripper", "", ""),
