@@ -412,9 +412,8 @@ class ModelCatalogue:
         rng = np.random.default_rng(0)
         box = rng.uniform(-1.0, 1.0, (2000, 3)) * (0.02, 0.03, 0.04)
         table = rng.uniform(-1.0, 1.0, (4000, 3)) * (0.3, 0.3, 0.001) - (0.0, 0.0, 0.04)
-        options = DetectOptions(
-            viewpoint=(0.0, 0.0, 0.5), num_approach_points=4, num_candidates=100
-        )
+        # Without a viewpoint, so that the search for one is compiled too.
+        options = DetectOptions(num_approach_points=4, num_candidates=100)
         for detector in self._detectors.values():
             check_reference_logits(detector.network, detector.metadata)
         cloud = np.concatenate([box, table])

@@ -205,53 +205,63 @@ def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64:
     seen = frame.points(near)
     middle = np.median(seen, axis=0)
 
-    def cost(eye: Float64) -> float:
-        distance = float(np.linalg.norm(eye - middle))
-        z = (middle - eye) / distance
-        x = unit(np.cross(z, (0.0, 0.0, 1.0) if abs(z[2]) < 0.99 else (1.0, 0.0, 0.0)))
-        axes = np.stack([x, np.cross(z, x), z])
-        unusual = (np.arccos(-z[2]) - 0.5) ** 2 + np.log(distance / USUAL_DISTANCE) ** 2
-        return float(_hidden_share(seen, eye, axes, 0.011 / distance) + 0.012 * unusual)
+    def best(eyes: Float64) -> Float64:
+        distance = np.linalg.norm(middle - eyes, axis=1)
+        ahead = (middle - eyes) / distance[:, None]
+        across = unit(np.cross(ahead, (0.0, 1e-3, 1.0)))  # not zero where `ahead` is vertical
+        turn = np.stack([across, np.cross(ahead, across), ahead], axis=1)
+        hidden = _hidden_share(seen, eyes, turn, distance)
+        unusual = (np.arccos(-ahead[:, 2]) - 0.5) ** 2 + np.log(distance / USUAL_DISTANCE) ** 2
+        return np.asarray(eyes[np.argmin(hidden + 0.012 * unusual)])
 
     # Places spread evenly over half of a sphere, then around the best one.
     z, turn = 1.0 - (np.arange(60) + 0.5) / 60, np.pi * (3.0 - np.sqrt(5.0)) * np.arange(60)
     level = np.sqrt(1.0 - z * z)
     ways = np.stack([level * np.cos(turn), level * np.sin(turn), z], axis=1)
-    eye, step = min(middle + USUAL_DISTANCE * ways, key=cost), 0.2
+    eye, step = best(middle + USUAL_DISTANCE * ways), 0.2
+    around = np.indices((3, 3, 3)).reshape(3, -1).T - 1.0
     while step > 0.01:
-        eye = min(eye + step * (np.indices((3, 3, 3)).reshape(3, -1).T - 1), key=cost)
-        step *= 0.7
+        eye, step = best(eye + step * around), 0.7 * step
     return frame.points_in_cloud(eye).astype(np.float64)
 
 
 @compiled("contract")
-def _hidden_share(points: Float64, eye: Float64, axes: Float64, cell: float) -> float:
-    """Share of points (N, 3) that lie behind others, as seen from a place (3,).
+def _hidden_share(points: Float64, eyes: Float64, turn: Float64, distance: Float64) -> Float64:
+    """Share (K,) of points (N, 3) that lie behind others as seen from each of the eyes (K, 3).
 
-    By cells of a tangent in an image with `axes` (3, 3), rows right, down and forward. Points 15 mm
-    behind others are seen, those 45 mm behind them are hidden, and those between count in part.
+    Each looks along z of its camera's frame, (K, 3, 3), with cells of 11 mm at a `distance` (K,).
+    Points 15 mm behind others are seen, those 45 mm behind are hidden, others count in part.
     """
-    nearest, half = np.full((144, 144), np.inf), 72
-    cells, away = np.full((len(points), 2), -1), np.empty(len(points))
-    hidden = 0.0
-    for n in range(len(points)):
-        a, b, c = points[n, 0] - eye[0], points[n, 1] - eye[1], points[n, 2] - eye[2]
-        x = axes[0, 0] * a + axes[0, 1] * b + axes[0, 2] * c
-        y = axes[1, 0] * a + axes[1, 1] * b + axes[1, 2] * c
-        z = axes[2, 0] * a + axes[2, 1] * b + axes[2, 2] * c
-        if z < 0.05:  # behind the camera
-            hidden += 1.0
-            continue
-        i, j = np.floor(x / z / cell) + half, np.floor(y / z / cell) + half
-        if 0 <= i < len(nearest) and 0 <= j < len(nearest):
-            cells[n, 0], cells[n, 1] = int(i), int(j)
-            away[n] = np.sqrt(a * a + b * b + c * c)
-            nearest[cells[n, 0], cells[n, 1]] = min(nearest[cells[n, 0], cells[n, 1]], away[n])
-    for n in range(len(points)):
-        if cells[n, 0] >= 0:
-            behind = (away[n] - nearest[cells[n, 0], cells[n, 1]] - 0.015) / 0.03
-            hidden += min(max(behind, 0.0), 1.0)
-    return hidden / len(points)
+    share, half = np.zeros(len(eyes)), 72
+    cell, away = np.empty((len(points), 2), np.int64), np.empty(len(points))
+    for k in range(len(eyes)):
+        nearest, cells = np.full((2 * half, 2 * half), np.inf), distance[k] / 0.011
+        for n in range(len(points)):
+            x, y, z = place_in_view(points[n], eyes[k], turn[k])
+            cell[n, 0], cell[n, 1], away[n] = -1, -1, np.sqrt(x * x + y * y + z * z)
+            if z < 0.05:  # behind the camera
+                share[k] += 1.0
+                continue
+            i, j = np.floor(x / z * cells) + half, np.floor(y / z * cells) + half
+            if 0 <= i < 2 * half and 0 <= j < 2 * half:
+                cell[n, 0], cell[n, 1] = int(i), int(j)
+                nearest[int(i), int(j)] = min(nearest[int(i), int(j)], away[n])
+        for n in range(len(points)):
+            if cell[n, 0] >= 0:
+                behind = (away[n] - nearest[cell[n, 0], cell[n, 1]] - 0.015) / 0.03
+                share[k] += min(max(behind, 0.0), 1.0)
+    return share / len(points)
+
+
+@compiled("contract")
+def place_in_view(point: Floats, viewpoint: Float64, turn: Float64) -> tuple[float, float, float]:
+    """A point (3,) in the camera's frame."""
+    a, b, c = point[0] - viewpoint[0], point[1] - viewpoint[1], point[2] - viewpoint[2]
+    return (
+        turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c,
+        turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c,
+        turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c,
+    )
 
 
 def usual_up(forward: Float64) -> Float64:

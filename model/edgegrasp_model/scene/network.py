@@ -21,6 +21,7 @@ from edgegrasp_model.scene.cloud import (
     LARGE_IMAGE,
     MAX_VIEW_TANGENT,
     OUTLIER_PERCENT,
+    place_in_view,
     subsample,
     unit,
     usual_up,
@@ -229,7 +230,7 @@ def _render(
     pixel = np.full(len(points), -1, dtype=np.int32)
     depth, off = np.empty((2, len(points)), dtype=np.float32)
     for n in range(len(points)):
-        x, y, z = _in_view(points[n], viewpoint, turn)
+        x, y, z = place_in_view(points[n], viewpoint, turn)
         if z < NEAREST_DEPTH:
             continue
         u = (x / z - corner[0]) / pixel_size
@@ -244,19 +245,8 @@ def _render(
         p = pixel[n]
         if p >= 0 and depth[n] < nearest[p] + SURFACE_DEPTH and off[n] < best[p]:
             best[p] = off[n]
-            pixels[p, 0], pixels[p, 1], pixels[p, 2] = _in_view(points[n], viewpoint, turn)
+            pixels[p, 0], pixels[p, 1], pixels[p, 2] = place_in_view(points[n], viewpoint, turn)
     return pixels.reshape(height, width, 3)
-
-
-@compiled("contract")
-def _in_view(point: Float32, viewpoint: Float64, turn: Float64) -> tuple[float, float, float]:
-    """A point (3,) in the camera's frame."""
-    a, b, c = point[0] - viewpoint[0], point[1] - viewpoint[1], point[2] - viewpoint[2]
-    return (
-        turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c,
-        turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c,
-        turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c,
-    )
 
 
 @compiled("contract")
