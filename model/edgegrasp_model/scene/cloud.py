@@ -191,11 +191,12 @@ def seen_from_origin(points: Float32, up: ArrayLike | None) -> bool:
     return bool(upward <= 0.5 * np.linalg.norm(middle))
 
 
-def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64:
+def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64 | None:
     """The place (3,) above points (N, 3) from which the least is hidden: where their camera was.
 
     Of places from which nothing is hidden, the one that is nearest to USUAL_DISTANCE and to 30
-    degrees off `up` (3,). It turns and moves with the cloud.
+    degrees off `up` (3,). It turns and moves with the cloud. None: several cameras saw the points,
+    as 2 % are hidden from everywhere.
     """
     some = subsample(points, 20_000)
     apart = np.linalg.norm(some - np.median(some, axis=0), axis=1)
@@ -205,24 +206,25 @@ def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64:
     seen = frame.points(near)
     middle = np.median(seen, axis=0)
 
-    def best(eyes: Float64) -> Float64:
+    def best(eyes: Float64) -> tuple[Float64, float]:
         distance = np.linalg.norm(middle - eyes, axis=1)
         ahead = (middle - eyes) / distance[:, None]
         across = unit(np.cross(ahead, (0.0, 1e-3, 1.0)))  # not zero where `ahead` is vertical
         turn = np.stack([across, np.cross(ahead, across), ahead], axis=1)
         hidden = _hidden_share(seen, eyes, turn, distance)
         unusual = (np.arccos(-ahead[:, 2]) - 0.5) ** 2 + np.log(distance / USUAL_DISTANCE) ** 2
-        return np.asarray(eyes[np.argmin(hidden + 0.012 * unusual)])
+        row = np.argmin(hidden + 0.012 * unusual)
+        return eyes[row], hidden[row]
 
     # Places spread evenly over half of a sphere, then around the best one.
     z, turn = 1.0 - (np.arange(60) + 0.5) / 60, np.pi * (3.0 - np.sqrt(5.0)) * np.arange(60)
     level = np.sqrt(1.0 - z * z)
     ways = np.stack([level * np.cos(turn), level * np.sin(turn), z], axis=1)
-    eye, step = best(middle + USUAL_DISTANCE * ways), 0.2
+    (eye, hidden), step = best(middle + USUAL_DISTANCE * ways), 0.2
     around = np.indices((3, 3, 3)).reshape(3, -1).T - 1.0
     while step > 0.01:
-        eye, step = best(eye + step * around), 0.7 * step
-    return frame.points_in_cloud(eye).astype(np.float64)
+        (eye, hidden), step = best(eye + step * around), 0.7 * step
+    return None if hidden > 0.02 else frame.points_in_cloud(eye).astype(np.float64)
 
 
 @compiled("contract")

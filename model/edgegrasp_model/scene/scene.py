@@ -32,6 +32,7 @@ from edgegrasp_model.results import OBSTACLE, SUPPORT, UNLABELLED
 from edgegrasp_model.scene.cloud import (
     HAND_REACH,
     UP,
+    USUAL_DISTANCE,
     CanonicalFrame,
     CheckedCloud,
     Cloud,
@@ -162,7 +163,9 @@ def select_points(
             cut_off = math.isnan(support.growth)
             number, certain = objects_above(found, above, plan, height, margin, cut_off)
             confidence = dict(enumerate(certain.tolist()))
-        elif (found.number >= 0).any() or np.median(seen.distance()) < NEAREST_DEPTH:
+        elif options.viewpoint is not None and (
+            (found.number >= 0).any() or np.median(seen.distance()) < NEAREST_DEPTH
+        ):
             number, confidence = found.number, dict(enumerate(found.confidence.tolist()))
     if not given:
         number = without_long(number, sent.points, options.max_object_size)
@@ -175,7 +178,7 @@ def select_points(
         number = chosen_objects(number, sent, options, warnings)
     kept = near_objects_along(plan, number)
     near, number = sent.take(kept), number[kept]
-    up = _up(options, seen, support, found)
+    up = _up(options, seen, support, None if options.viewpoint is None else found)
     return SelectedPoints(near, number, support, up, viewpoints, labels, confidence, corrected)
 
 
@@ -241,7 +244,7 @@ def build_scene(
         object_of_point=number,
         support=None if support is None else _plane_under_hands(support.plane, frame, spare),
         at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, sent.points),
-        viewpoints=eyes.astype(np.float32),
+        viewpoints=None if options.viewpoint is None else eyes.astype(np.float32),
         confidence=selected.confidence,
         P_image_cloud=projection,
         obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
@@ -310,8 +313,10 @@ def near_workspace_side(
 
 def assumed_viewpoint(
     points: Float32, options: DetectOptions, warnings: list[str]
-) -> tuple[float, float, float]:
+) -> tuple[float, float, float] | None:
     """Where the camera is assumed to be that saw points (N, 3), if a request does not say it.
+
+    None: several cameras saw them.
 
     InvalidRequest: the place is needed to the millimetre.
     """
@@ -329,7 +334,14 @@ def assumed_viewpoint(
         raise InvalidRequest("options.robot.avoid_unseen", "true, without a camera's position", fix)
     inside = inside_workspace(points, options.workspace, HAND_REACH)
     up = UP if options.known_up is None else options.known_up
-    x, y, z = likely_viewpoint(points[inside] if inside.any() else points, up).tolist()
+    eye = likely_viewpoint(points[inside] if inside.any() else points, up)
+    if eye is None:
+        warnings.append(
+            "viewpoint is not given, and several cameras saw the cloud, as a part of it is hidden "
+            "from everywhere: send their positions, and view_ids."
+        )
+        return None
+    x, y, z = eye.tolist()
     warnings.append(
         f"viewpoint is not given: the camera is assumed at ({x:.2f}, {y:.2f}, {z:.2f}), from where "
         "the least of the cloud is hidden; send its position."
@@ -338,7 +350,10 @@ def assumed_viewpoint(
 
 
 def camera_positions(sent: CheckedCloud, options: DetectOptions) -> Float64:
-    """The camera positions (W, 3) of the request."""
+    """The camera positions (W, 3) of the request, or a place above the cloud."""
+    if options.viewpoint is None:
+        up = np.array([0.0, 0.0, 1.0]) if options.known_up is None else options.known_up
+        return (np.median(sent.points, axis=0) + USUAL_DISTANCE * up)[None]
     viewpoints = np.asarray(options.viewpoint, dtype=np.float64).reshape(-1, 3)
     if len(viewpoints) == 1:
         return viewpoints
