@@ -200,8 +200,8 @@ def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64 | None:
     """
     some = subsample(points, 20_000)
     apart = np.linalg.norm(some - np.median(some, axis=0), axis=1)
-    some = some[np.linalg.norm(some - some[apart.argmin()], axis=1) < USUAL_DISTANCE]
-    near = subsample(some)
+    beside = np.linalg.norm(some - some[apart.argmin()], axis=1)
+    near = subsample(some[beside < USUAL_DISTANCE])
     frame = CanonicalFrame.of_scene(near, up, None)
     seen = frame.points(near)
     middle = np.median(seen, axis=0)
@@ -212,7 +212,8 @@ def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64 | None:
         across = unit(np.cross(ahead, (0.0, 1e-3, 1.0)))  # not zero where `ahead` is vertical
         turn = np.stack([across, np.cross(ahead, across), ahead], axis=1)
         hidden = _hidden_share(seen, eyes, turn, distance)
-        unusual = (np.arccos(-ahead[:, 2]) - 0.5) ** 2 + np.log(distance / USUAL_DISTANCE) ** 2
+        tilt = np.arccos(np.clip(-ahead[:, 2], -1.0, 1.0))
+        unusual = (tilt - 0.5) ** 2 + np.log(distance / USUAL_DISTANCE) ** 2
         row = np.argmin(hidden + 0.012 * unusual)
         return eyes[row], hidden[row]
 
