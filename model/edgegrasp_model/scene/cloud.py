@@ -196,7 +196,7 @@ def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64 | None:
 
     Of places from which nothing is hidden, the one that is nearest to USUAL_DISTANCE and to 30
     degrees off `up` (3,). It turns and moves with the cloud. None: several cameras saw the points,
-    as 2 % are hidden from everywhere.
+    as some are hidden from everywhere.
     """
     some = subsample(points, 20_000)
     apart = np.linalg.norm(some - np.median(some, axis=0), axis=1)
@@ -206,34 +206,40 @@ def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64 | None:
     seen = frame.points(near)
     middle = np.median(seen, axis=0)
 
-    def best(eyes: Float64) -> tuple[Float64, float]:
-        distance = np.linalg.norm(middle - eyes, axis=1)
-        ahead = (middle - eyes) / distance[:, None]
+    def hidden(eyes: Float64, edge: int) -> Float64:
+        ahead = unit(middle - eyes)
         across = unit(np.cross(ahead, (0.0, 1e-3, 1.0)))  # not zero where `ahead` is vertical
         turn = np.stack([across, np.cross(ahead, across), ahead], axis=1)
-        hidden = _hidden_share(seen, eyes, turn, distance)
-        tilt = np.arccos(np.clip(-ahead[:, 2], -1.0, 1.0))
+        return _hidden_share(seen, eyes, turn, np.linalg.norm(middle - eyes, axis=1), edge)
+
+    def best(eyes: Float64) -> Float64:
+        distance = np.linalg.norm(eyes - middle, axis=1)
+        tilt = np.arccos(np.clip((eyes - middle)[:, 2] / distance, -1.0, 1.0))
         unusual = (tilt - 0.5) ** 2 + np.log(distance / USUAL_DISTANCE) ** 2
-        row = np.argmin(hidden + 0.012 * unusual)
-        return eyes[row], hidden[row]
+        return np.asarray(eyes[np.argmin(hidden(eyes, 0) + 0.012 * unusual)])
 
     # Places spread evenly over half of a sphere, then around the best one.
     z, turn = 1.0 - (np.arange(60) + 0.5) / 60, np.pi * (3.0 - np.sqrt(5.0)) * np.arange(60)
     level = np.sqrt(1.0 - z * z)
     ways = np.stack([level * np.cos(turn), level * np.sin(turn), z], axis=1)
-    (eye, hidden), step = best(middle + USUAL_DISTANCE * ways), 0.2
+    eye, step = best(middle + USUAL_DISTANCE * ways), 0.2
     around = np.indices((3, 3, 3)).reshape(3, -1).T - 1.0
     while step > 0.01:
-        (eye, hidden), step = best(eye + step * around), 0.7 * step
-    return None if hidden > 0.02 else frame.points_in_cloud(eye).astype(np.float64)
+        eye, step = best(eye + step * around), 0.7 * step
+    # Beside edges, sparse and noisy points show through.
+    several = hidden(eye[None], 1)[0] > 0.003
+    return None if several else frame.points_in_cloud(eye).astype(np.float64)
 
 
 @compiled("contract")
-def _hidden_share(points: Float64, eyes: Float64, turn: Float64, distance: Float64) -> Float64:
+def _hidden_share(
+    points: Float64, eyes: Float64, turn: Float64, distance: Float64, edge: int
+) -> Float64:
     """Share (K,) of points (N, 3) that lie behind others as seen from each of the eyes (K, 3).
 
     Each looks along z of its camera's frame, (K, 3, 3), with cells of 11 mm at a `distance` (K,).
-    Points 15 mm behind others are seen, those 45 mm behind are hidden, others count in part.
+    Points 15 mm behind others are seen, those 45 mm behind are hidden, others count in part; the
+    others must be in all cells that are not empty, up to `edge` beside the point's.
     """
     share, half = np.zeros(len(eyes)), 72
     cell, away = np.empty((len(points), 2), np.int64), np.empty(len(points))
@@ -246,13 +252,16 @@ def _hidden_share(points: Float64, eyes: Float64, turn: Float64, distance: Float
                 share[k] += 1.0
                 continue
             i, j = np.floor(x / z * cells) + half, np.floor(y / z * cells) + half
-            if 0 <= i < 2 * half and 0 <= j < 2 * half:
+            if edge <= i < 2 * half - edge and edge <= j < 2 * half - edge:
                 cell[n, 0], cell[n, 1] = int(i), int(j)
                 nearest[int(i), int(j)] = min(nearest[int(i), int(j)], away[n])
         for n in range(len(points)):
-            if cell[n, 0] >= 0:
-                behind = (away[n] - nearest[cell[n, 0], cell[n, 1]] - 0.015) / 0.03
-                share[k] += min(max(behind, 0.0), 1.0)
+            i, j, first = cell[n, 0], cell[n, 1], 0.0
+            if i >= 0:
+                for a in range(i - edge, i + edge + 1):
+                    for b in range(j - edge, j + edge + 1):
+                        first = max(first, nearest[a, b]) if nearest[a, b] < np.inf else first
+                share[k] += min(max((away[n] - first - 0.015) / 0.03, 0.0), 1.0)
     return share / len(points)
 
 
