@@ -25,11 +25,15 @@ from edgegrasp_model.options import parse_options
 from edgegrasp_model.results import SUPPORT, UNLABELLED
 from edgegrasp_sim.report import image, page, table
 
-Rows = list[tuple[str, ...]]
 # Options that are set by the scene or by this command.
 DECIDED = ("viewpoint", "debug", "robot", "previous")
 SHARES = ("on_object", "from_below", "through_points")  # counts, which are shares of the best
+PIXELS = ("pixel_precision", "pixel_recall")
 OVERLAPS = ("overlap_precision", "overlap_recall", "overlap_f")
+HEADS = (  # of the two tables; P, R and F in per cent
+    ("scene", "best", "on an object %", "from below %", "through points %", "objects held", "ms"),
+    ("scene", "object pixels P/R", "overlap P/R/F", "objects found", "called", "plane"),
+)
 ON_SUPPORT, BACKGROUND, NO_READING = (92, 112, 140), (48, 48, 52), (0, 0, 0)  # colours
 
 
@@ -96,15 +100,17 @@ def _write(
     scenes = {name: asdict(figures) for name, figures in done.items()}
     results = {"model": model, "options": dict(options), "all": total, "scenes": scenes}
     (output / "results.json").write_text(json.dumps(results, indent=1) + "\n")
-    tables = [_grasp_table(done, total), _segmentation_table(done, total)]
+    rows = [_rows(name, summary([one]), _plane_text(one)) for name, one in done.items()]
+    rows.append(_rows("all", total, f"{total['planes_right']} of {total['planes']} right"))
+    tables = list(zip(HEADS, *rows, strict=True))
     names = [name + part for name in done for part in ("", "-labels")]
     pictures = (image("png", (output / f"{name}.png").read_bytes(), name) for name in names)
     title = f"{model} in {len(done)} scenes of real cameras"
     (output / "index.html").write_text(page(title, [*map(table, tables), *pictures]))
-    for head, *rows in tables:
+    for head, *cells in tables:
         columns = (Column(name, no_wrap=name in ("scene", "plane")) for name in head)
         shown = Table(*columns, box=None)
-        for row in rows:
+        for row in cells:
             shown.add_row(*row)
         Console(markup=False, emoji=False).print(shown)
     print(f"report: {output / 'index.html'}")
@@ -131,7 +137,7 @@ def summary(done: Sequence[SceneFigures]) -> dict[str, Any]:
         **{name: share(name) for name in SHARES},
         "objects": sum(figures.objects for figures in apart),
         "objects_with_grasp": sum(figures.objects_with_grasp for figures in apart),
-        **{name: mean(name, done) for name in ("pixel_precision", "pixel_recall")},
+        **{name: mean(name, done) for name in PIXELS},
         **{name: mean(name, apart) for name in OVERLAPS},
         "instances": sum(figures.segmentation.labelled for figures in apart),
         "instances_called": sum(figures.segmentation.called for figures in apart),
@@ -145,36 +151,17 @@ def summary(done: Sequence[SceneFigures]) -> dict[str, Any]:
 # The tables
 
 
-def _grasp_table(done: Mapping[str, SceneFigures], total: Mapping[str, Any]) -> Rows:
-    """Table of the best grasps."""
-    head = ("scene", "best", "on an object", "from below", "through points", "objects held", "ms")
-    rows: Rows = [head]
-    for name, one in done.items():
-        counts = (str(getattr(one, count)) for count in ("best", *SHARES))
-        held = f"{one.objects_with_grasp} of {one.objects}" if one.plane_labelled else "-"
-        rows.append((name, *counts, held, f"{one.milliseconds:.0f}"))
-    of_best = (f"{_shares(total[name])} %" for name in SHARES)
-    held = f"{total['objects_with_grasp']} of {total['objects']}"
-    return [*rows, ("all", str(total["best"]), *of_best, held, f"{total['milliseconds']:.0f}")]
-
-
-def _segmentation_table(done: Mapping[str, SceneFigures], total: Mapping[str, Any]) -> Rows:
-    """Table of segmentation and plane."""
-    head = ("scene", "object pixels P/R", "overlap P/R/F", "objects found", "called", "plane")
-    rows: Rows = [head]
-    for name, one in done.items():
-        seen = one.segmentation
-        pixels = _shares(seen.pixel_precision, seen.pixel_recall)
-        overlap = _shares(*(getattr(seen, share) for share in OVERLAPS))
-        found, called = f"{seen.found} of {seen.labelled}", str(seen.called)
-        known = (overlap, found, called) if one.plane_labelled else ("-", "-", "-")
-        rows.append((name, pixels, *known, "refused" if one.refused else _plane_text(one)))
-    pixels = _shares(total["pixel_precision"], total["pixel_recall"])
-    overlap = _shares(*(total[name] for name in OVERLAPS))
-    found = f"{total['instances_found']} of {total['instances']}"
-    planes = f"{total['planes_right']} of {total['planes']} right"
-    rows.append(("all", pixels, overlap, found, str(total["instances_called"]), planes))
-    return rows
+def _rows(name: str, of: Mapping[str, Any], plane: str) -> tuple[tuple[str, ...], ...]:
+    """A row of each table, from the figures over one scene or all."""
+    held = f"{of['objects_with_grasp']} of {of['objects']}" if of["objects"] else "-"
+    found = f"{of['instances_found']} of {of['instances']}" if of["instances"] else "-"
+    called = str(of["instances_called"]) if of["instances"] else "-"
+    pixels, overlap = (_shares(*(of[share] for share in shares)) for shares in (PIXELS, OVERLAPS))
+    best = (_shares(of[share]) for share in SHARES)
+    return (
+        (name, str(of["best"]), *best, held, f"{of['milliseconds']:.0f}"),
+        (name, pixels, overlap, found, called, plane),
+    )
 
 
 def _shares(*shares: float | None) -> str:
@@ -184,6 +171,8 @@ def _shares(*shares: float | None) -> str:
 
 def _plane_text(figures: SceneFigures) -> str:
     plane = figures.plane
+    if figures.refused:
+        return "refused"
     if not figures.plane_labelled:
         return "-"
     if plane is None:
