@@ -3,16 +3,15 @@
 A mesh is scaled to the hand, decomposed into convex parts and cached on disk.
 """
 
-import contextlib
 import hashlib
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Never
 from xml.etree import ElementTree
 
@@ -309,13 +308,10 @@ def _kept_in(name: str, write: Callable[[Path], None]) -> Path:
     if folder.is_dir():
         return folder
     folder.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder.parent))
-    try:
-        write(unfinished)
-        with contextlib.suppress(OSError):  # another process was faster, with the same result
+    with TemporaryDirectory(prefix=".unfinished-", dir=folder.parent) as scratch:
+        write(unfinished := Path(scratch, name))
+        with suppress(OSError):  # another process was faster, with the same result
             unfinished.rename(folder)
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
     return folder
 
 
