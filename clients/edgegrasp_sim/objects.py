@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_sim.engine import OBJECT_FRICTION, OBJECT_MASS
+from edgegrasp_sim.engine import OBJECT_MASS
 from edgegrasp_sim.engine.urdf import convex_hull
 
 MESH_SUFFIXES = (".obj", ".stl")
@@ -198,12 +198,11 @@ def prepare_mesh(mesh: Path) -> Path:
         )
         parts = [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in solids]
         solid: Any = trimesh.util.concatenate(parts)
-        solid.density = OBJECT_MASS / solid.volume
         visible, hulls = ([(m.vertices, m.faces) for m in meshes] for meshes in ([surface], parts))
-        write_parts("object", visible, hulls, solid.center_mass, solid.moment_inertia, folder)
+        write_parts("object", visible, hulls, solid.center_mass, folder)
 
     # Everything that decides how it is prepared.
-    sizes = SHORTEST_SIDE, LONGEST_SIDE, CONCAVITY, OBJECT_MASS, OBJECT_FRICTION
+    sizes = SHORTEST_SIDE, LONGEST_SIDE, CONCAVITY
     recipe = LAYOUT, sizes, SEARCH, version("coacd"), mesh.suffix.lower()
     digest = hashlib.sha256(repr(recipe).encode() + mesh.read_bytes()).hexdigest()
     return _kept_in(digest, write) / "object.urdf"
@@ -219,9 +218,7 @@ def write_object(name: str, surface: str, folder: Path) -> Path:
     """Write an object, `surface` in OBJ and metres; the engine takes its convex hull."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.obj").write_text(surface)
-    mass = f'<mass value="{OBJECT_MASS}"/>'
-    inertia = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
-    return _write_urdf(folder, name, (mass, inertia), (name, name))
+    return _write_urdf(folder, name, name, name)
 
 
 def write_parts(
@@ -229,23 +226,15 @@ def write_parts(
     visible: Iterable[Mesh],  # meshes that a camera sees, metres
     parts: Iterable[Mesh],  # convex meshes; the engine takes the hull of each
     centre: NDArray[np.float64],  # (3,) its centre of mass, metres
-    inertia: NDArray[np.float64],  # (3, 3) about it, kg m²
     folder: Path,  # gets the meshes and `<name>.urdf`; created if missing
 ) -> Path:
     """Write an object of convex parts, so that hollow ones stay hollow; returns its URDF file."""
     folder.mkdir(parents=True, exist_ok=True)
-    meshes = {f"{name}_visual": visible, f"{name}_collision": parts}
-    for mesh, surfaces in meshes.items():
+    names = f"{name}_visual", f"{name}_collision"
+    for mesh, surfaces in zip(names, (visible, parts), strict=True):
         (folder / f"{mesh}.obj").write_text(as_obj(surfaces, named=True))
     xyz = " ".join(f"{value:.7f}" for value in centre)
-    rows, columns = np.triu_indices(3)
-    moments = " ".join(
-        f'i{"xyz"[row]}{"xyz"[column]}="{inertia[row, column]:.9f}"'
-        for row, column in zip(rows, columns, strict=True)
-    )
-    inertial = f'<origin xyz="{xyz}"/>', f'<mass value="{OBJECT_MASS}"/>', f"<inertia {moments}/>"
-    contact = f'    <contact><lateral_friction value="{OBJECT_FRICTION}"/></contact>\n'
-    return _write_urdf(folder, name, inertial, meshes, contact)
+    return _write_urdf(folder, name, *names, f'<origin xyz="{xyz}"/>')
 
 
 def as_obj(
@@ -330,17 +319,15 @@ def _read(mesh: Path) -> Any:
     return surface
 
 
-def _write_urdf(
-    folder: Path, name: str, inertial: Iterable[str], meshes: Iterable[str], contact: str = ""
-) -> Path:
-    """The URDF file of an object: elements of its inertial, its visual and its collision mesh."""
-    elements, (visual, collision) = "\n      ".join(inertial), meshes
+def _write_urdf(folder: Path, name: str, visual: str, collision: str, origin: str = "") -> Path:
+    """The URDF file of an object, with the names of its meshes; engines set mass and inertia."""
     urdf = folder / f"{name}.urdf"
     urdf.write_text(f"""<?xml version="1.0"?>
 <robot name="{name}">
   <link name="base_link">
-{contact}    <inertial>
-      {elements}
+    <inertial>
+      <mass value="{OBJECT_MASS}"/>
+      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>{origin}
     </inertial>
     <visual><geometry><mesh filename="{visual}.obj"/></geometry></visual>
     <collision><geometry><mesh filename="{collision}.obj"/></geometry></collision>

@@ -11,7 +11,6 @@ from xml.etree import ElementTree
 import numpy as np
 
 from edgegrasp_camera.arrays import Float64, Int64
-from edgegrasp_sim.engine import OBJECT_MASS
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, as_obj, blob, write_object, write_parts
 from edgegrasp_training.household import household_mesh, lofted, oval, strips, swept
 
@@ -63,9 +62,7 @@ def household_objects(folder: Path, count: int, rng: np.random.Generator) -> Obj
         corners = [vertices[faces].transpose(1, 0, 2) for vertices, faces in parts]
         volume = [float((np.cross(a, b) * c).sum() / 6) for a, b, c in corners]
         centre = np.average([v.mean(0) for v, _ in parts], axis=0, weights=volume)
-        size = np.square(np.ptp(np.concatenate([v for v, _ in parts]), axis=0))
-        inertia = np.diag(size.sum() - size) * OBJECT_MASS / 12  # of the box around it
-        path = write_parts(name, parts, parts, centre, inertia, folder)
+        path = write_parts(name, parts, parts, centre, folder)
         models.append(ObjectModel(name, path))
     return ObjectSet("household", tuple(models))
 
