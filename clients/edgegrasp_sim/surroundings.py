@@ -15,9 +15,9 @@ TABLE_HEIGHT = 0.05  # metres
 OPEN_EXTENT = 1.2  # metres along both sides of an open table
 OPEN_THICKNESS = 0.2  # metres; objects sink into a thin table, as into the reference's of 12 mm
 TABLE_FRICTION = 0.5  # and of walls
-SUPPORT_CLEARANCE = 0.005  # metres over the table at which the workspace begins
+BOTTOM = TABLE_HEIGHT + 0.005  # metres, z at which the workspace begins
 # Lowest and highest corner of where grasps are looked for on an open table.
-WORKSPACE = ((0.02, 0.02, TABLE_HEIGHT + SUPPORT_CLEARANCE), (SIZE - 0.02, SIZE - 0.02, SIZE))
+WORKSPACE = ((0.02, 0.02, BOTTOM), (SIZE - 0.02, SIZE - 0.02, SIZE))
 MIDDLE = SIZE / 2  # metres, x and y of the middle of every scene
 
 Span = tuple[float, float]  # least and greatest, metres
@@ -120,33 +120,23 @@ def random_bin(
         x, y = MIDDLE + side * (half + wall / 2)
         boxes.append(Box((wall, 2 * float(outer[1]), height), (float(x), MIDDLE, z)))
         boxes.append(Box((length, wall, height), (MIDDLE, float(y), z)))
-    low, high = MIDDLE - half, MIDDLE + half
     top = TABLE_HEIGHT + height + HEAP
-    return Surroundings(
-        tuple(boxes),
-        _corners(low, high, TABLE_HEIGHT + SUPPORT_CLEARANCE, top),
-        _corners(low, high, 0.0, top),
-    )
+    return Surroundings(tuple(boxes), _corners(half, BOTTOM, top), _corners(half, 0.0, top))
 
 
 def random_table(rng: np.random.Generator) -> Surroundings:
     """A table with an edge near the objects, a floor below, and one to three large objects."""
-    reach = np.full(2, REACH)
-    low, high = MIDDLE - reach, MIDDLE + reach
     over = float(rng.uniform(*TABLE_OVER_FLOOR))
     size = rng.uniform(*TABLE_LENGTH, size=2)
     # All the objects' places are on it; an edge may be close to them.
-    aside = rng.uniform(-1.0, 1.0, size=2) * (size / 2 - reach - 0.02)
+    aside = rng.uniform(-1.0, 1.0, size=2) * (size / 2 - REACH - 0.02)
     table = _slab((*size, over), TABLE_HEIGHT, *(MIDDLE + aside))
     boxes = [_slab(FLOOR, TABLE_HEIGHT - over), table]
     large = int(rng.integers(*LARGE_OBJECTS, endpoint=True))
     boxes += [_large_object(rng) for _ in range(large)]
-    bottom = TABLE_HEIGHT + SUPPORT_CLEARANCE
-    return Surroundings(
-        tuple(boxes),
-        _corners(low - 0.05, high + 0.05, bottom, TABLE_HEIGHT + 0.30),
-        _corners(low - 0.05, high + 0.05, 0.0, np.inf),
-    )
+    half = np.full(2, REACH + 0.05)
+    workspace = _corners(half, BOTTOM, TABLE_HEIGHT + 0.30)
+    return Surroundings(tuple(boxes), workspace, _corners(half, 0.0, np.inf))
 
 
 def random_shelf(rng: np.random.Generator) -> Surroundings:
@@ -161,12 +151,11 @@ def random_shelf(rng: np.random.Generator) -> Surroundings:
         boxes.append(Box((board, depth, tall), (x, MIDDLE, middle)))
     back = Box((width + 2 * board, board, tall), (MIDDLE, MIDDLE + (depth + board) / 2, middle))
     ceiling = Box((width, depth, board), (MIDDLE, MIDDLE, TABLE_HEIGHT + height + board / 2))
-    half = np.array([width, depth]) / 2
-    low, high, top = MIDDLE - half, MIDDLE + half, TABLE_HEIGHT + height
+    half, top = np.array([width, depth]) / 2, TABLE_HEIGHT + height
     return Surroundings(
         (*boxes, back, ceiling),
-        _corners(low, high, TABLE_HEIGHT + SUPPORT_CLEARANCE, top),
-        _corners(low, high, TABLE_HEIGHT, top),
+        _corners(half, BOTTOM, top),
+        _corners(half, TABLE_HEIGHT, top),
         (width / 2 - SHELF_MARGIN, depth / 2 - SHELF_MARGIN),
     )
 
@@ -185,5 +174,7 @@ def _large_object(rng: np.random.Generator) -> Box:
     return Box((length, width, height), centre, yaw=float(yaw))
 
 
-def _corners(low: Matrix, high: Matrix, bottom: float, top: float) -> Corners:
-    return (float(low[0]), float(low[1]), bottom), (float(high[0]), float(high[1]), top)
+def _corners(half: Matrix, bottom: float, top: float) -> Corners:
+    """Of what extends `half` (2,) from the middle, along x and y."""
+    (left, front), (right, back) = (MIDDLE - half).tolist(), (MIDDLE + half).tolist()
+    return (left, front, bottom), (right, back, top)
