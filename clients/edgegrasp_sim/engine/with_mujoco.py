@@ -1,5 +1,6 @@
 """MuJoCo: wheels for every current Python, and an image in milliseconds."""
 
+import itertools
 import os
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -100,7 +101,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         self._model: Any = spec.compile()
         self._data: Any = mujoco.MjData(self._model)
         self.changed = False
-        self._bodies = 0
+        self._names = map(str, itertools.count())  # of bodies
         self._hand: MujocoHand | None = None
         self.substeps = SUBSTEPS
         self.uid_of_geom: list[int] = []
@@ -224,16 +225,9 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         self.spec.worldbody.add_body(name="-1 target", mocap=True).add_site(name="target")
         body.add_site(name="hand")
         damping = 2.0 * (ARM_STIFFNESS * (ARM_INERTIA + body.mass)) ** 0.5
-        for axis in range(6):
-            spring = self.spec.add_actuator(
-                name=f"arm {axis}",
-                trntype=mujoco.mjtTrn.mjTRN_SITE,
-                target="hand",
-                refsite="target",
-                gear=np.eye(6)[axis],
-                forcelimited=True,
-                forcerange=(-model.tool_force, model.tool_force),
-            )
+        to_target = {"trntype": mujoco.mjtTrn.mjTRN_SITE, "target": "hand", "refsite": "target"}
+        for axis, gear in enumerate(np.eye(6)):
+            spring = self._drive(f"arm {axis}", model.tool_force, gear=gear, **to_target)
             spring.set_to_position(ARM_STIFFNESS, damping)
         self._hand = MujocoHand(self, body, palm, model)
         self._hand.set_pose(position, (0.0, 0.0, 0.0, 1.0))
@@ -249,15 +243,14 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
             for geom in body.geoms:
                 geom.contype, geom.group = _HAND, _SOLID
                 geom.solref, geom.solimp = (CONTACT_SECONDS, 1.0), IMPEDANCE
-        name = str(self._bodies)
-        self._bodies += 1
-        x, y, z, w = quaternion_xyzw(arm.T_world_root)
-        place = self.spec.worldbody.add_frame(pos=arm.T_world_root[:3, 3], quat=(w, x, y, z))
+        name = next(self._names)
+        turn = np.roll(quaternion_xyzw(arm.T_world_root), 1)  # MuJoCo's w comes first
+        place = self.spec.worldbody.add_frame(pos=arm.T_world_root[:3, 3], quat=turn)
         self.spec.attach(added, prefix=f"{name} ", frame=place)
-        T_flange_body = arm.T_flange_hand @ translation(*model.centre)
-        x, y, z, w = quaternion_xyzw(T_flange_body)
         flange = self.spec.body(f"{name} {arm.flange}")
-        body = flange.add_body(name=name, pos=T_flange_body[:3, 3], quat=(w, x, y, z))
+        T_flange_body = arm.T_flange_hand @ translation(*model.centre)
+        turn = np.roll(quaternion_xyzw(T_flange_body), 1)
+        body = flange.add_body(name=name, pos=T_flange_body[:3, 3], quat=turn)
         palm = self._build_hand(body, model)
         for joint in arm.joint_names:
             self.spec.joint(f"{name} {joint}").armature = JOINT_INERTIA
@@ -348,20 +341,19 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         return near * far / (near + (far - near) * image[::-1].astype(np.float64))
 
     def _add(self, position: Matrix, quaternion_xyzw: Vector) -> Any:
-        x, y, z, w = quaternion_xyzw
-        name = str(self._bodies)
-        self._bodies += 1
         self.changed = True
-        return self.spec.worldbody.add_body(name=name, pos=position, quat=(w, x, y, z))
+        turn = np.roll(quaternion_xyzw, 1)
+        return self.spec.worldbody.add_body(name=next(self._names), pos=position, quat=turn)
 
     def _add_hull(self, body: Any, name: str, points: Matrix, **contact: Any) -> None:
         """Add the convex hull of points (P, 3) for contacts."""
         self.spec.add_mesh(name=name, uservert=points.ravel())
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, group=_SOLID, **contact)
 
-    def _drive(self, joint: str, force: float | None = None) -> Any:
-        """Add a drive of a joint; it exerts at most a force."""
-        drive = self.spec.add_actuator(name=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint)
+    def _drive(self, name: str, force: float | None = None, **moved: Any) -> Any:
+        """Add a drive that exerts at most a force, by default of the joint with its name."""
+        joint = {"trntype": mujoco.mjtTrn.mjTRN_JOINT, "target": name}
+        drive = self.spec.add_actuator(name=name, **moved or joint)
         if force is not None:
             drive.forcelimited, drive.forcerange = True, (-force, force)
         return drive
