@@ -219,7 +219,7 @@ def compare(first: ResultFolder, second: ResultFolder) -> dict[str, Any]:
         figures[name] = {
             "first": _share(successes[0], trials[0]),
             "second": _share(successes[1], trials[1]),
-            **paired_difference(successes, trials, np.random.default_rng(0)),
+            **paired_difference(successes, trials),
         }
     return figures
 
@@ -253,9 +253,7 @@ def wilson(successes: int, trials: int) -> tuple[float, float] | None:
     return float(low), float(high)
 
 
-def paired_difference(
-    above: NDArray[np.int64], below: NDArray[np.int64], rng: np.random.Generator
-) -> dict[str, Any]:
+def paired_difference(above: NDArray[np.int64], below: NDArray[np.int64]) -> dict[str, Any]:
     """Second ratio of sums minus the first, and its 95 % interval; None if a run has no counts.
 
     Scenes are resampled, so that differences between them cancel out. Counts (2, S): of run and
@@ -263,7 +261,7 @@ def paired_difference(
     """
     if (below.sum(axis=1) == 0).any():
         return {"difference": None, "difference_95": None}
-    picks = rng.integers(above.shape[1], size=(RESAMPLES, above.shape[1]))
+    picks = np.random.default_rng(0).integers(above.shape[1], size=(RESAMPLES, above.shape[1]))
     with np.errstate(invalid="ignore"):
         ratios = above[:, picks].sum(axis=-1) / below[:, picks].sum(axis=-1)  # (2, resamples)
     low, high = np.nanpercentile(ratios[1] - ratios[0], [2.5, 97.5]).tolist()
