@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, PositiveFloat
 
+from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_sim.engine import Intrinsics
-from edgegrasp_sim.poses import Matrix
 
 CAMERA = Intrinsics()
 FARTHEST = 0.999  # of the camera's range, from which there is nothing
@@ -20,16 +20,16 @@ Float = TypeVar("Float", bound=np.floating)
 class Observation:
     """The point cloud of one or several depth images, and other input of a planner."""
 
-    cloud: NDArray[np.float32]  # (N, 3) world frame, metres; in the order of the pixels
-    workspace: NDArray[np.float32]  # (2, 3) corners of where grasps are looked for, unless `auto`
+    cloud: Float32  # (N, 3) world frame, metres; in the order of the pixels
+    workspace: Float32  # (2, 3) corners of where grasps are looked for, unless `auto`
     table_height: float  # metres; not to be used where `table` is `auto`
-    camera_positions: NDArray[np.float32]  # (V, 3) float32, every camera, world frame, metres
+    camera_positions: Float32  # (V, 3) float32, every camera, world frame, metres
     view_ids: NDArray[np.int32]  # (N,) int32, which camera saw each point
     table: TableView = "known"  # what the cloud contains, see `PlanningRules`
-    pixels: NDArray[np.int64] | None = None  # (N,) row-major; None: several images, or cut off
+    pixels: Int64 | None = None  # (N,) row-major; None: several images, or cut off
 
     @property
-    def image(self) -> NDArray[np.float32]:
+    def image(self) -> Float32:
         """The cloud as an image (H, W, 3) with NaN holes, or as points (N, 3)."""
         if self.pixels is None:
             return self.cloud
@@ -38,7 +38,7 @@ class Observation:
         return image.reshape(CAMERA.height, CAMERA.width, 3)
 
     @property
-    def camera_position(self) -> NDArray[np.float32]:
+    def camera_position(self) -> Float32:
         """The first camera, world frame, metres: (3,)."""
         return np.asarray(self.camera_positions[0])
 
@@ -63,7 +63,7 @@ class ViewRange:
     azimuth_degrees: Range  # from world x
     target: tuple[float, float, float]  # the point looked at, world frame, metres
 
-    def sample(self, rng: np.random.Generator, views: int = 1) -> list[Matrix]:
+    def sample(self, rng: np.random.Generator, views: int = 1) -> list[Float64]:
         """Draw a pose `T_world_camera` (4, 4), and others evenly spread over a full turn."""
         radius = rng.uniform(*self.radius)
         polar = rng.uniform(*np.deg2rad(self.polar_degrees))
@@ -80,7 +80,7 @@ class ViewRange:
 EVALUATION_VIEWS = ViewRange((0.6, 0.75), (45.0, 60.0), (0.0, 180.0), (0.15, 0.15, 0.25))
 
 
-def look_at(eye: Matrix, target: Matrix) -> Matrix:
+def look_at(eye: Float64, target: Float64) -> Float64:
     """Pose T_world_camera (4, 4) at `eye` that looks at `target` with world z up in the image.
 
     Camera axes: x right, y down, z along the line of sight; where that is vertical, x is world x.
@@ -96,9 +96,7 @@ def look_at(eye: Matrix, target: Matrix) -> Matrix:
     return T
 
 
-def points_of(
-    depth: NDArray[np.float64], T_world_camera: Matrix, camera: Intrinsics
-) -> NDArray[np.float64]:
+def points_of(depth: Float64, T_world_camera: Float64, camera: Intrinsics) -> Float64:
     """The points of a depth image (height, width) nearer than `far`: (N, 3) metres, world frame."""
     seen = depth < FARTHEST * camera.far
     # The renderer samples a pixel at its lower left corner.

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from edgegrasp_camera.arrays import Float64
 from edgegrasp_results import ArmTrajectory
 from edgegrasp_sim.engine import TIME_STEP, ArmModel, Hand, HandModel, Parts, World
 from edgegrasp_sim.engine.urdf import read_obj
-from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
+from edgegrasp_sim.poses import quaternion_xyzw, translation
 from edgegrasp_sim.scene import SceneObject
 
 SHAPES = Path(__file__).parent / "panda_hand.obj"
@@ -72,7 +73,7 @@ class GraspResult:
 
 def run_grasp(
     gripper: "Gripper",  # the hand to use
-    T_world_hand: Matrix,  # pose of the `panda_hand` link at the grasp, (4, 4)
+    T_world_hand: Float64,  # pose of the `panda_hand` link at the grasp, (4, 4)
     objects: Mapping[int, SceneObject],  # what may be held, by the id of its body
     obstacles: Set[int] = frozenset(),  # cutting into these bodies fails the grasp
     *,
@@ -124,7 +125,7 @@ def run_grasp(
     return result(FailureCause.WRONG_OBJECT if wrong else FailureCause.SLIPPED)
 
 
-def retreat_pose(T_world_hand: Matrix) -> Matrix:
+def retreat_pose(T_world_hand: Float64) -> Float64:
     """Where the hand goes after closing: back along the approach, or up after a side grasp."""
     if -T_world_hand[2, 2] < np.cos(SIDE_GRASP_ANGLE):
         return translation(0.0, 0.0, RETREAT_DISTANCE) @ T_world_hand
@@ -153,24 +154,24 @@ class Gripper:
         """Put the open hand where it touches nothing and no camera sees it."""
         self.place(_PARKED)
 
-    def start(self, T_world_hand: Matrix) -> None:
+    def start(self, T_world_hand: Float64) -> None:
         """Place the open hand a little behind the grasp."""
         self.place(T_world_hand @ translation(0.0, 0.0, -PREGRASP_DISTANCE))
 
-    def approach(self, T_world_hand: Matrix) -> Iterator[None]:
+    def approach(self, T_world_hand: Float64) -> Iterator[None]:
         """Move straight to the grasp."""
         return self.steps_to(T_world_hand, step_length=STEP_LENGTH)
 
-    def retreat(self, T_world_hand: Matrix) -> Iterator[None]:
+    def retreat(self, T_world_hand: Float64) -> Iterator[None]:
         """Go to `retreat_pose`."""
         return self.steps_to(retreat_pose(T_world_hand), step_length=STEP_LENGTH)
 
-    def place(self, T_world_hand: Matrix) -> None:
+    def place(self, T_world_hand: Float64) -> None:
         """Place the open hand there at once, at rest."""
         T_world_com = T_world_hand @ self._T_hand_com
         self.body.set_pose(T_world_com[:3, 3], quaternion_xyzw(T_world_com))
 
-    def steps_to(self, T_world_hand: Matrix, *, step_length: float) -> Iterator[None]:
+    def steps_to(self, T_world_hand: Float64, *, step_length: float) -> Iterator[None]:
         """Drag the hand straight there, `step_length` metres a time step; yields after each."""
         T_world_com = T_world_hand @ self._T_hand_com
         quaternion = quaternion_xyzw(T_world_com)
@@ -198,15 +199,15 @@ class ArmGripper(Gripper):
         """Put the arm to its home, the hand open."""
         self._arm.rest()
 
-    def start(self, T_world_hand: Matrix) -> None:
+    def start(self, T_world_hand: Float64) -> None:
         """Start at home, wherever the grasp is."""
         self.park()
 
-    def approach(self, T_world_hand: Matrix) -> Iterator[None]:
+    def approach(self, T_world_hand: Float64) -> Iterator[None]:
         """Follow the motion to the grasp."""
         return self._follow(0, self._planned.grasp_row)
 
-    def retreat(self, T_world_hand: Matrix) -> Iterator[None]:
+    def retreat(self, T_world_hand: Float64) -> Iterator[None]:
         """Follow the motion away from the grasp."""
         return self._follow(self._planned.grasp_row, len(self._planned.times) - 1)
 
@@ -283,7 +284,7 @@ def hand_of(gripper: Mapping[str, Any]) -> HandModel:
     )
 
 
-def _corners(boxes: Matrix) -> Parts:
+def _corners(boxes: Float64) -> Parts:
     """The eight corners (8, 3) of each of some boxes (B, 2, 3)."""
     pick = np.indices((2, 2, 2)).reshape(3, 8).T  # lower or upper, of x, y and z
     return tuple(box[pick, np.arange(3)] for box in boxes)
@@ -310,7 +311,7 @@ def _is_clear(
     The fingers are empty then, or hold one object that rests on nothing else.
     """
     hand, empty_steps, held_steps = gripper.body, 0, 0
-    offset: Matrix | None = None
+    offset: Float64 | None = None
     while True:
         touched = _touched(gripper, objects)
         before, opening = opening, hand.opening
@@ -327,7 +328,7 @@ def _is_clear(
 
 
 def _holds_when_shaken(
-    gripper: Gripper, T_world_hand: Matrix, held: SceneObject, objects: Mapping[int, SceneObject]
+    gripper: Gripper, T_world_hand: Float64, held: SceneObject, objects: Mapping[int, SceneObject]
 ) -> bool:
     """Shake the lifted hand; returns whether it still holds the object."""
     world = gripper.world
@@ -354,7 +355,7 @@ def _touched(gripper: Gripper, objects: Mapping[int, SceneObject]) -> list[Scene
 
 
 def _object_between_fingers(
-    gripper: Gripper, T_world_hand: Matrix, objects: Mapping[int, SceneObject]
+    gripper: Gripper, T_world_hand: Float64, objects: Mapping[int, SceneObject]
 ) -> SceneObject | None:
     """The object between the fingers of a hand at the grasp: the first that rays across hit."""
     half, depths = 0.5 * gripper.model.max_opening, [gripper.model.tip - d for d in _TARGET_DEPTHS]

@@ -16,8 +16,8 @@ from typing import Any, Never
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Float64, Int64
 from edgegrasp_sim.engine import OBJECT_MASS
 from edgegrasp_sim.engine.urdf import convex_hull
 
@@ -30,7 +30,7 @@ CONCAVITY = 0.05
 # A short search for cuts: a second or two for a closed mesh, a minute for a torn one.
 SEARCH = {"mcts_iterations": 20, "mcts_nodes": 8, "mcts_max_depth": 2, "resolution": 1000}
 Size = tuple[float, float, float]
-Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]  # points (P, 3), triangles (F, 3)
+Mesh = tuple[Float64, Int64]  # points (P, 3), triangles (F, 3)
 
 
 class SceneKind(StrEnum):
@@ -225,7 +225,7 @@ def write_parts(
     name: str,  # of the object
     visible: Iterable[Mesh],  # meshes that a camera sees, metres
     parts: Iterable[Mesh],  # convex meshes; the engine takes the hull of each
-    centre: NDArray[np.float64],  # (3,) its centre of mass, metres
+    centre: Float64,  # (3,) its centre of mass, metres
     folder: Path,  # gets the meshes and `<name>.urdf`; created if missing
 ) -> Path:
     """Write an object of convex parts, so that hollow ones stay hollow; returns its URDF file."""

@@ -1,14 +1,12 @@
 """Rigid transforms as 4 x 4 matrices; a name `T_a_b` maps coordinates of frame b to frame a."""
 
-from typing import TypeAlias
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Matrix: TypeAlias = NDArray[np.float64]
+from edgegrasp_camera.arrays import Float64
 
 
-def quaternion_xyzw(T: Matrix) -> list[float]:
+def quaternion_xyzw(T: Float64) -> list[float]:
     """The rotation part of a 4 x 4 rigid transform as a unit quaternion `xyzw`."""
     (a, b, c), (d, e, f), (g, h, i) = T[:3, :3].tolist()
     # Four times the products of the quaternion with itself; its largest column is the sharpest.
@@ -28,14 +26,14 @@ def about_z(angle: float) -> tuple[float, float, float, float]:
     return 0.0, 0.0, float(np.sin(angle / 2)), float(np.cos(angle / 2))
 
 
-def translation(x: float, y: float, z: float) -> Matrix:
+def translation(x: float, y: float, z: float) -> Float64:
     """A 4 x 4 transform that moves by (x, y, z) metres and does not turn."""
     T = np.eye(4)
     T[:3, 3] = (x, y, z)
     return T
 
 
-def require_pose(T_world_hand: ArrayLike) -> Matrix:
+def require_pose(T_world_hand: ArrayLike) -> Float64:
     """Check that the pose of a hand is a finite rigid transform (4, 4); raises ValueError."""
     T = np.asarray(T_world_hand, dtype=np.float64)
     R = T[:3, :3] if T.shape == (4, 4) and np.isfinite(T).all() else np.zeros((3, 3))

@@ -12,10 +12,10 @@ from statistics import fmean, median, stdev
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import TypeAdapter
 from scipy.stats import binomtest
 
+from edgegrasp_camera.arrays import Int64
 from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.trial import Attempt, Round
 
@@ -151,7 +151,7 @@ def _arm_figures(rounds: Sequence[Round]) -> dict[str, Any] | None:
     }
 
 
-def count(rounds: Iterable[Round]) -> NDArray[np.int64]:
+def count(rounds: Iterable[Round]) -> Int64:
     """Successes, attempts and objects of each round, as `COUNTS`: (3, R)."""
     rows = [(item.successes, len(item.attempts), len(item.objects)) for item in rounds]
     return np.array(rows, np.int64).reshape(-1, len(COUNTS)).T
@@ -253,7 +253,7 @@ def wilson(successes: int, trials: int) -> tuple[float, float] | None:
     return float(low), float(high)
 
 
-def paired_difference(above: NDArray[np.int64], below: NDArray[np.int64]) -> dict[str, Any]:
+def paired_difference(above: Int64, below: Int64) -> dict[str, Any]:
     """Second ratio of sums minus the first, and its 95 % interval; None if a run has no counts.
 
     Scenes are resampled, so that differences between them cancel out. Counts (2, S): of run and
@@ -283,9 +283,7 @@ def over_seeds(rate: dict[str, Any]) -> str:
     return " ± ".join(f"{100 * number:.1f}" for number in numbers if number is not None) or "none"
 
 
-def _rate(
-    successes: NDArray[np.int64], trials: NDArray[np.int64], seeds: NDArray[np.int64]
-) -> dict[str, Any]:
+def _rate(successes: Int64, trials: Int64, seeds: Int64) -> dict[str, Any]:
     by_seed = {
         str(seed): _share(successes[seeds == seed], trials[seeds == seed])["value"]
         for seed in np.unique(seeds)

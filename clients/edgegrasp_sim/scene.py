@@ -9,9 +9,10 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from edgegrasp_camera.arrays import Float64
 from edgegrasp_sim.engine import TIME_STEP, Body, World
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
-from edgegrasp_sim.poses import Matrix, about_z
+from edgegrasp_sim.poses import about_z
 from edgegrasp_sim.surroundings import (
     DEEP_BIN_INSIDE,
     MIDDLE,
@@ -182,7 +183,7 @@ def _covered(layout: Layout, placed: Sequence[SceneObject]) -> float:
 
 
 def _drop(
-    layout: Layout, number: int, where: tuple[Matrix, Matrix], height: float, seconds: float
+    layout: Layout, number: int, where: tuple[Float64, Float64], height: float, seconds: float
 ) -> list[SceneObject]:
     """Drop objects one by one, turned any way, between the corners `where`, (2,) each, metres."""
     rng = layout.rng
@@ -200,7 +201,7 @@ def _drop(
 def _put_down(
     layout: Layout,
     attempts: int,  # objects drawn at most
-    draw_place: Callable[[], Matrix],  # gives x and y, metres
+    draw_place: Callable[[], Float64],  # gives x and y, metres
     lying_share: float = 0.0,  # of the objects, which are turned any way
 ) -> list[SceneObject]:
     """Put objects down one by one, each where it touches nothing."""

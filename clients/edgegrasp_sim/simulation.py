@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from edgegrasp_camera.arrays import Float64
 from edgegrasp_camera.picture import shaded
 from edgegrasp_results import ArmTrajectory
 from edgegrasp_sim import hand
@@ -17,7 +18,7 @@ from edgegrasp_sim.engine import ArmModel, make_world
 from edgegrasp_sim.engine.urdf import least_width
 from edgegrasp_sim.hand import MIN_OPENING, ArmGripper, GraspResult, Gripper, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
-from edgegrasp_sim.poses import Matrix, require_pose
+from edgegrasp_sim.poses import require_pose
 from edgegrasp_sim.scene import STANDING_IN, Layout, SceneObject, load_object, settle
 from edgegrasp_sim.sensor import DepthNoise, DepthSensor
 from edgegrasp_sim.surroundings import OPEN_TABLE, TABLE_HEIGHT, Surroundings
@@ -94,7 +95,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         ]
 
     @property
-    def object_bounds(self) -> Matrix:
+    def object_bounds(self) -> Float64:
         """The box around each object that is left: (K, 2, 3) metres, world frame."""
         return np.array([item.body.bounds for item in self._objects]).reshape(-1, 2, 3)
 
@@ -150,7 +151,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
 
     def observe_from(
         self,
-        T_world_cameras: Sequence[Matrix],  # one for each image
+        T_world_cameras: Sequence[Float64],  # one for each image
         rng_noise: np.random.Generator,  # stream of the noise
         *,
         noise_std: float = NOISE_STD,  # of each coordinate of each point, metres
@@ -181,7 +182,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
             pixels=np.flatnonzero(depth < FARTHEST * CAMERA.far) if whole else None,
         )
 
-    def color_image(self, T_world_camera: Matrix) -> NDArray[np.uint8]:
+    def color_image(self, T_world_camera: Float64) -> NDArray[np.uint8]:
         """The scene in colour from a pose (4, 4): (H, W, 3), each object in a different colour."""
         depth = self.world.render_depth(T_world_camera, CAMERA)
         seen = depth < FARTHEST * CAMERA.far

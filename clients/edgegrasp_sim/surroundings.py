@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgegrasp_camera.arrays import Float64
 from edgegrasp_sim.engine import Body, Vector, World
-from edgegrasp_sim.poses import Matrix
 
 SIZE = 0.30  # metres, edge of the workspace cube
 TABLE_HEIGHT = 0.05  # metres
@@ -174,7 +174,7 @@ def _large_object(rng: np.random.Generator) -> Box:
     return Box((length, width, height), centre, yaw=float(yaw))
 
 
-def _corners(half: Matrix, bottom: float, top: float) -> Corners:
+def _corners(half: Float64, bottom: float, top: float) -> Corners:
     """Of what extends `half` (2,) from the middle, along x and y."""
     (left, front), (right, back) = (MIDDLE - half).tolist(), (MIDDLE + half).tolist()
     return (left, front, bottom), (right, back, top)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from edgegrasp_camera.arrays import Float32, Int64
+from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import Sample, Sampler
 from edgegrasp_model.detector import GraspDetector, Prepared
@@ -23,7 +23,7 @@ from edgegrasp_sim.camera import Observation, TableView, ViewRange
 from edgegrasp_sim.engine import choose_engine
 from edgegrasp_sim.hand import FINGERTIP
 from edgegrasp_sim.objects import CLUTTER, ObjectSet, SceneKind
-from edgegrasp_sim.poses import Matrix, about_z
+from edgegrasp_sim.poses import about_z
 from edgegrasp_sim.scene import STANDING_IN
 from edgegrasp_sim.sensor import random_sensor
 from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
@@ -222,7 +222,7 @@ def _views(
 def ask(
     simulation: ClutterSimulation,
     kind: SceneKind,
-    cameras: Sequence[Matrix],  # (4, 4) T_world_camera of each
+    cameras: Sequence[Float64],  # (4, 4) T_world_camera of each
     noise: np.random.Generator,  # of the observation and what it is said to show
     choice: np.random.Generator,  # of the rest of the request
     *,

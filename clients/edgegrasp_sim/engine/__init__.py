@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
-from edgegrasp_sim.poses import Matrix
+from edgegrasp_camera.arrays import Float64
 
 if TYPE_CHECKING:
     from edgegrasp_sim.engine.with_mujoco import MujocoBody, MujocoHand, MujocoWorld
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 World: TypeAlias = "MujocoWorld | PybulletWorld"
 Body: TypeAlias = "MujocoBody | PybulletBody"
 Hand: TypeAlias = "MujocoHand | PybulletHand"
-Vector: TypeAlias = Sequence[float] | Matrix
+Vector: TypeAlias = Sequence[float] | Float64
 
 TIME_STEP = 1.0 / 80.0  # seconds
 GRAVITY = 9.81  # m/s²
@@ -84,7 +84,7 @@ class Contact(NamedTuple):
     distance: float  # metres; negative where the two overlap
 
 
-Parts: TypeAlias = tuple[Matrix, ...]  # convex ones, each by its points, (P, 3) metres
+Parts: TypeAlias = tuple[Float64, ...]  # convex ones, each by its points, (P, 3) metres
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,8 +115,8 @@ class ArmModel:
     """An arm that carries a hand; J joints."""
 
     urdf: str  # XML with absolute paths of meshes, without what is beyond the flange
-    T_world_root: Matrix  # where its first link stands, (4, 4)
+    T_world_root: Float64  # where its first link stands, (4, 4)
     flange: str  # link that the hand is on
-    T_flange_hand: Matrix  # where the hand's frame is in the flange's, (4, 4)
+    T_flange_hand: Float64  # where the hand's frame is in the flange's, (4, 4)
     joint_names: Sequence[str]  # of the moving joints, J
-    home: Matrix  # where they rest, (J,) radians or metres
+    home: Float64  # where they rest, (J,) radians or metres

@@ -8,11 +8,10 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_sim.poses import Matrix
+from edgegrasp_camera.arrays import Float64, Int64
 
 SIDES = 32  # of the prism that stands for a cylinder
 BALL = 300  # points of the hull that stands for a sphere
@@ -21,14 +20,14 @@ BALL = 300  # points of the hull that stands for a sphere
 class Surface(NamedTuple):
     """Triangles: points (P, 3), metres, and rows of them, (F, 3)."""
 
-    points: Matrix
-    faces: NDArray[np.int64]
+    points: Float64
+    faces: Int64
 
 
 class Shape(NamedTuple):
     """An object, in the frame of its centre of mass, with the axes of its link."""
 
-    centre: Matrix  # the centre of mass in the link's frame, (3,) metres
+    centre: Float64  # the centre of mass in the link's frame, (3,) metres
     visible: list[Surface]  # what a camera sees
     hulls: list[Surface]  # the convex parts that contacts use
 
@@ -99,7 +98,7 @@ def least_width(path: Path) -> float:
     return float(np.ptp(heights, axis=0).min())
 
 
-def convex_hull(points: Matrix) -> Surface | None:
+def convex_hull(points: Float64) -> Surface | None:
     """The convex hull of points (P, 3), faces outwards; None if it has no volume."""
     try:
         hull = ConvexHull(points)
@@ -143,7 +142,7 @@ def _parts(element: ElementTree.Element, urdf: Path) -> list[Surface]:
     return [Surface(turn.apply(size * p) + move, faces) for p, faces in parts]
 
 
-def _origin(element: ElementTree.Element) -> tuple[Matrix, Rotation]:
+def _origin(element: ElementTree.Element) -> tuple[Float64, Rotation]:
     origin = element.find("origin")
     if origin is None:
         return np.zeros(3), Rotation.identity()
@@ -151,7 +150,7 @@ def _origin(element: ElementTree.Element) -> tuple[Matrix, Rotation]:
     return _numbers(origin, "xyz", 3, "0 0 0"), turn
 
 
-def _numbers(element: ElementTree.Element, name: str, count: int, default: str = "") -> Matrix:
+def _numbers(element: ElementTree.Element, name: str, count: int, default: str = "") -> Float64:
     text = element.get(name, default)
     if len(words := text.split()) != count:
         raise ValueError(f"{name} of its {element.tag} is {text!r}; write {count} numbers")

@@ -13,12 +13,12 @@ os.environ.setdefault("MUJOCO_GL", "egl")  # read on import; images need no disp
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Float64
 from edgegrasp_sim import engine
 from edgegrasp_sim.engine import Contact, HandModel, Intrinsics, Vector
 from edgegrasp_sim.engine.urdf import read_urdf
-from edgegrasp_sim.poses import Matrix, about_z, quaternion_xyzw, translation
+from edgegrasp_sim.poses import about_z, quaternion_xyzw, translation
 
 SUBSTEPS = 4  # of 3.125 ms in each time step
 ARM_SUBSTEPS = 13  # with an arm, for joints that hardly give: more than 1 kHz
@@ -105,7 +105,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         self._hand: MujocoHand | None = None
         self.substeps = SUBSTEPS
         self.uid_of_geom: list[int] = []
-        self._places: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+        self._places: dict[int, tuple[Float64, Float64]] = {}
 
     @property
     def data(self) -> Any:
@@ -123,7 +123,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         """The model, with all bodies."""
         return self.data.model
 
-    def places(self, uid: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def places(self, uid: int) -> tuple[Float64, Float64]:
         """Positions and velocities of a body's joints and its links': views of the state."""
         data = self.data
         if uid not in self._places:
@@ -150,7 +150,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
                 hand.watch()
             hand.way = None
 
-    def first_hits(self, starts: Matrix, ends: Matrix) -> list[int]:
+    def first_hits(self, starts: Float64, ends: Float64) -> list[int]:
         """The body that each ray meets first, -1 for none; (R, 3) metres each, world frame."""
         model, data = self.model, self.data
         solid = np.arange(6) == _SOLID
@@ -216,7 +216,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
         return MujocoBody(self, body, signs * half)
 
-    def add_hand(self, model: HandModel, position: Matrix) -> "MujocoHand":
+    def add_hand(self, model: HandModel, position: Float64) -> "MujocoHand":
         """Add an open hand with its centre of mass there; a world may have one."""
         body = self._add(np.asarray(position), (0.0, 0.0, 0.0, 1.0))
         body.add_freejoint().armature = ARM_INERTIA
@@ -261,7 +261,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         added_arm.rest()
         return added_arm
 
-    def _build_hand(self, body: Any, model: HandModel) -> Matrix:
+    def _build_hand(self, body: Any, model: HandModel) -> Float64:
         """Give a body palm and fingers; returns the palm's corners (P, 3)."""
         body.gravcomp = 1.0
         palm = [part - model.centre for part in model.palm]
@@ -303,7 +303,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
             self._couple(slide[0], one, model.advance)
         return np.concatenate(palm)
 
-    def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
+    def render_depth(self, T_world_camera: Float64, camera: Intrinsics) -> Float64:
         """Depth (height, width) at the pixels' lower left corners, metres; `far` if empty."""
         _gl_context(camera.width, camera.height)
         model, data = self.model, self.data
@@ -340,12 +340,12 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         # Rows go up; depths from 1, near, to 0, far or nothing.
         return near * far / (near + (far - near) * image[::-1].astype(np.float64))
 
-    def _add(self, position: Matrix, quaternion_xyzw: Vector) -> Any:
+    def _add(self, position: Float64, quaternion_xyzw: Vector) -> Any:
         self.changed = True
         turn = np.roll(quaternion_xyzw, 1)
         return self.spec.worldbody.add_body(name=next(self._names), pos=position, quat=turn)
 
-    def _add_hull(self, body: Any, name: str, points: Matrix, **contact: Any) -> None:
+    def _add_hull(self, body: Any, name: str, points: Float64, **contact: Any) -> None:
         """Add the convex hull of points (P, 3) for contacts."""
         self.spec.add_mesh(name=name, uservert=points.ravel())
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, group=_SOLID, **contact)
@@ -373,7 +373,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
 class MujocoBody:
     """A body of a model. Its pose is that of its centre of mass."""
 
-    def __init__(self, world: MujocoWorld, body: Any, points: Matrix) -> None:
+    def __init__(self, world: MujocoWorld, body: Any, points: Float64) -> None:
         self.world, self.points, self._body = world, points, body
         self.uid = int(body.name)
 
@@ -387,7 +387,7 @@ class MujocoBody:
         self.world.changed = True
 
     @property
-    def position(self) -> Matrix:
+    def position(self) -> Float64:
         """Centre of mass, world frame, metres: (3,)."""
         return self.world.places(self.uid)[0][:3].copy()
 
@@ -398,7 +398,7 @@ class MujocoBody:
         return x, y, z, w
 
     @property
-    def rotation(self) -> Matrix:
+    def rotation(self) -> Float64:
         """Its axes in the world, (3, 3)."""
         matrix = np.empty(9)
         mujoco.mju_quat2Mat(matrix, self.world.places(self.uid)[0][3:7])
@@ -417,7 +417,7 @@ class MujocoBody:
         return float(np.linalg.norm(self.world.places(self.uid)[1]))
 
     @property
-    def bounds(self) -> Matrix:
+    def bounds(self) -> Float64:
         """Lowest and highest corner of the axis-aligned box around it: (2, 3) metres."""
         corners = self.points @ self.rotation.T + self.position
         return np.stack((corners.min(axis=0), corners.max(axis=0)))
@@ -436,11 +436,11 @@ class MujocoBody:
 class MujocoHand(MujocoBody):
     """A body, the palm, that springs of limited force pull to a target; motors at two fingers."""
 
-    def __init__(self, world: MujocoWorld, body: Any, points: Matrix, model: HandModel) -> None:
+    def __init__(self, world: MujocoWorld, body: Any, points: Float64, model: HandModel) -> None:
         super().__init__(world, body, points)
         self.hand = model
-        self.way: Matrix | None = None  # (substeps, D) in the next time step, of
-        self.goal: Matrix = np.empty(0)  # (D,) part of the state: its target's place
+        self.way: Float64 | None = None  # (substeps, D) in the next time step, of
+        self.goal: Float64 = np.empty(0)  # (D,) part of the state: its target's place
 
     @property
     def opening(self) -> float:
@@ -482,11 +482,11 @@ class MujocoArm(MujocoHand):
     """
 
     substeps = ARM_SUBSTEPS  # of a time step
-    home: Matrix  # (J,)
+    home: Float64  # (J,)
     _found: tuple[Contact, ...] = ()
 
     @property
-    def position(self) -> Matrix:
+    def position(self) -> Float64:
         """As of other bodies; an arm's joints come first in its places."""
         return np.array(self.world.data.body(str(self.uid)).xpos)
 
@@ -499,7 +499,7 @@ class MujocoArm(MujocoHand):
         data.ctrl[:2], data.ctrl[2 : 2 + count] = FINGER_SPEED, self.home
         self.way, self._found = None, ()
 
-    def drive(self, positions: Matrix, velocities: Matrix) -> None:
+    def drive(self, positions: Float64, velocities: Float64) -> None:
         """Have the joints' controllers follow (substeps, J) in the next time step."""
         self.goal = self.world.data.ctrl[2 : 2 + len(self.home)]
         self.way = positions + JOINT_DAMPING / JOINT_STIFFNESS * velocities
@@ -535,7 +535,7 @@ def _gl_context(width: int, height: int) -> Any:
     return context
 
 
-def _weigh(body: Any, mass: float, corners: Matrix) -> None:
+def _weigh(body: Any, mass: float, corners: Float64) -> None:
     """Give a body the inertia of the box around its points (P, 3), as PyBullet does."""
     x, y, z = np.square(np.ptp(corners, axis=0))
     body.explicitinertial = True

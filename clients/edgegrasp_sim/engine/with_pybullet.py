@@ -8,11 +8,11 @@ from typing import Any, ClassVar, NoReturn
 import numpy as np
 import pybullet
 import pybullet_data
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Float64, Int64
 from edgegrasp_sim import engine
 from edgegrasp_sim.engine import ArmModel, Contact, HandModel, Intrinsics, Parts, Vector
-from edgegrasp_sim.poses import Matrix, about_z
+from edgegrasp_sim.poses import about_z
 
 SOLVER_ITERATIONS = 100
 COLLISION_DEPTH = 0.001  # metres
@@ -69,7 +69,7 @@ class PybulletWorld(AbstractContextManager["PybulletWorld"]):
                 self._hand.swing()
             self.client.stepSimulation()
 
-    def first_hits(self, starts: Matrix, ends: Matrix) -> list[int]:
+    def first_hits(self, starts: Float64, ends: Float64) -> list[int]:
         return [hit[0] for hit in self.client.rayTestBatch(starts.tolist(), ends.tolist())]
 
     def detect_collisions(self) -> None:
@@ -104,19 +104,19 @@ class PybulletWorld(AbstractContextManager["PybulletWorld"]):
         self.client.changeDynamics(uid, -1, lateralFriction=friction)
         return PybulletBody(self.client, uid)
 
-    def add_hand(self, model: HandModel, position: Matrix) -> "PybulletHand":
+    def add_hand(self, model: HandModel, position: Float64) -> "PybulletHand":
         self._hand = PybulletHand(self.client, model, position)
         return self._hand
 
     def add_arm(self, arm: ArmModel, model: HandModel) -> NoReturn:
         raise ValueError(f"engine is {self.name}; an arm takes mujoco")
 
-    def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
+    def render_depth(self, T_world_camera: Float64, camera: Intrinsics) -> Float64:
         return self.render(T_world_camera, camera, pybullet.ER_NO_SEGMENTATION_MASK)[0]
 
     def render(
-        self, T_world_camera: Matrix, camera: Intrinsics, flags: int = 0
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        self, T_world_camera: Float64, camera: Intrinsics, flags: int = 0
+    ) -> tuple[Float64, Int64]:
         """Depth, and the body at each pixel, -1 for none, unless the flags leave it out."""
         view = np.linalg.inv(T_world_camera)
         view[1:3] *= -1.0  # OpenGL's camera looks along -z with y up
@@ -163,7 +163,7 @@ class PybulletBody:
         self.client.removeBody(self.uid)
 
     @property
-    def position(self) -> Matrix:
+    def position(self) -> Float64:
         return np.asarray(self.client.getBasePositionAndOrientation(self.uid)[0], dtype=np.float64)
 
     @property
@@ -180,7 +180,7 @@ class PybulletBody:
         return float(np.linalg.norm((linear, angular)))
 
     @property
-    def bounds(self) -> Matrix:
+    def bounds(self) -> Float64:
         lower, upper = self.client.getAABB(self.uid)
         return np.asarray((lower, upper), dtype=np.float64)
 
@@ -192,7 +192,7 @@ class PybulletBody:
 class PybulletHand(PybulletBody):
     """A hand that a fixed constraint drags; the last two links are its fingers."""
 
-    def __init__(self, client: _Client, model: HandModel, position: Matrix) -> None:
+    def __init__(self, client: _Client, model: HandModel, position: Float64) -> None:
         self.client, self.model = client, model
         if model.meshes is None:
             palm, *fingers = (_boxes(client, each) for each in (model.palm, *model.fingers))
