@@ -26,8 +26,8 @@ from edgegrasp_sim.surroundings import (
     random_table,
 )
 
-PACKED_SCALE = (0.7, 0.8)
-PILE_SCALE = (0.8, 1.0)
+# The usual range of the factor on the objects' sizes, by the kind whose objects they are.
+SCALES = {SceneKind.PACKED: (0.7, 0.8), SceneKind.PILE: (0.8, 1.0)}
 
 PACKED_ATTEMPTS = 12  # objects drawn to be stood upright on a table
 PACKED_RANGE = (0.08, 0.22)  # metres, of x and y
@@ -63,7 +63,7 @@ class SceneObject:
     """An object that stands in a scene."""
 
     model: ObjectModel
-    scale: float
+    scale: float  # factor on the size in the model's file
     body: Body
 
 
@@ -77,8 +77,8 @@ def load_object(
     """Load an object with its link frame there; `scale` comes on top of the model's own."""
     if not model.urdf.is_file():
         raise FileNotFoundError(f"no object file at {model.urdf}; check the object folder")
-    body = world.load_urdf(model.urdf, position, quaternion_xyzw, scale * model.scale)
-    return SceneObject(model, scale, body)
+    whole = scale * model.scale
+    return SceneObject(model, whole, world.load_urdf(model.urdf, position, quaternion_xyzw, whole))
 
 
 class Layout(NamedTuple):
@@ -229,13 +229,13 @@ def _put_down(
     return placed
 
 
-# What objects stand in (None: an open table), the usual range of their scales, how they are placed.
-STANDING_IN: dict[SceneKind, tuple[MakeSurroundings | None, tuple[float, float], MakeObjects]] = {
-    SceneKind.PACKED: (None, PACKED_SCALE, make_packed),
-    SceneKind.PILE: (None, PILE_SCALE, make_pile),
-    SceneKind.BIN: (random_bin, PILE_SCALE, make_bin),
-    SceneKind.FULL_BIN: (partial(random_bin, extents=SMALL_BIN_INSIDE), PILE_SCALE, make_full_bin),
-    SceneKind.DEEP_BIN: (partial(random_bin, extents=DEEP_BIN_INSIDE), PILE_SCALE, make_bin),
-    SceneKind.TABLE: (random_table, PACKED_SCALE, make_table),
-    SceneKind.SHELF: (random_shelf, PACKED_SCALE, make_table),
+# What objects stand in (None: an open table), and how they are placed.
+STANDING_IN: dict[SceneKind, tuple[MakeSurroundings | None, MakeObjects]] = {
+    SceneKind.PACKED: (None, make_packed),
+    SceneKind.PILE: (None, make_pile),
+    SceneKind.BIN: (random_bin, make_bin),
+    SceneKind.FULL_BIN: (partial(random_bin, extents=SMALL_BIN_INSIDE), make_full_bin),
+    SceneKind.DEEP_BIN: (partial(random_bin, extents=DEEP_BIN_INSIDE), make_bin),
+    SceneKind.TABLE: (random_table, make_table),
+    SceneKind.SHELF: (random_shelf, make_table),
 }

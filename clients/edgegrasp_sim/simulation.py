@@ -19,7 +19,7 @@ from edgegrasp_sim.engine.urdf import least_width
 from edgegrasp_sim.hand import MIN_OPENING, ArmGripper, GraspResult, Gripper, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import require_pose
-from edgegrasp_sim.scene import STANDING_IN, Layout, SceneObject, load_object, settle
+from edgegrasp_sim.scene import SCALES, STANDING_IN, Layout, SceneObject, load_object, settle
 from edgegrasp_sim.sensor import DepthNoise, DepthSensor
 from edgegrasp_sim.surroundings import OPEN_TABLE, TABLE_HEIGHT, Surroundings
 
@@ -87,12 +87,8 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
     @property
     def too_wide(self) -> list[ObjectModel]:
         """Models of the objects that are wider at their narrowest than the hand opens."""
-        widest = self._hand.model.max_opening
-        return [
-            item.model
-            for item in self._objects
-            if least_width(item.model.urdf) * item.scale * item.model.scale > widest
-        ]
+        opening, there = self._hand.model.max_opening, self._objects
+        return [one.model for one in there if least_width(one.model.urdf) * one.scale > opening]
 
     @property
     def object_bounds(self) -> Float64:
@@ -103,7 +99,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
     def placements(self) -> list[ObjectPlacement]:
         """Where the objects are; `reset_from_poses` takes them back."""
         return [
-            ObjectPlacement(item.model.urdf, item.scale * item.model.scale, (x, y, z), turn)
+            ObjectPlacement(item.model.urdf, item.scale, (x, y, z), turn)
             for item in self._objects
             for (x, y, z), turn in [(item.body.position.tolist(), item.body.quaternion_xyzw)]
         ]
@@ -121,9 +117,10 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         objects = self.object_sets.get(kind)
         if objects is None:
             raise ValueError(f"no object set for scene {kind.value!r}; pass one in `objects`")
-        surround, usual, make = STANDING_IN[kind]
+        surround, make = STANDING_IN[kind]
         around = self._clear(table if surround is None else surround(rng))
-        layout = Layout(self.world, around, objects, rng, num_objects, scales or usual)
+        scales = scales or SCALES[kind.objects]
+        layout = Layout(self.world, around, objects, rng, num_objects, scales)
         self._objects = make(layout)
         self._gripper = self._add_gripper()
         return self.num_objects

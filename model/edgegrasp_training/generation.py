@@ -24,7 +24,7 @@ from edgegrasp_sim.engine import choose_engine
 from edgegrasp_sim.hand import FINGERTIP
 from edgegrasp_sim.objects import CLUTTER, ObjectSet, SceneKind
 from edgegrasp_sim.poses import about_z
-from edgegrasp_sim.scene import STANDING_IN
+from edgegrasp_sim.scene import SCALES
 from edgegrasp_sim.sensor import random_sensor
 from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
@@ -169,7 +169,7 @@ def generate_scene(
         gripper = random_gripper(hand)
     elif options.gripper != "panda":
         gripper = gripper_fields(options.gripper)
-    _, (low, high), _ = STANDING_IN[kind]
+    low, high = SCALES[kind.objects]
     sizes, seen_from = (low * WIDER_SCALES[0], high * WIDER_SCALES[1]), VIEWS[kind]
     drawn = sets.get(source)
     with TemporaryDirectory() as folder:
