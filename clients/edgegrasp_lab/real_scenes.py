@@ -238,9 +238,7 @@ def _meet_points(scene: RealScene, grasps: Sequence[Any], gripper: Gripper) -> B
 
     seen = scene.points[np.isfinite(scene.points).all(axis=1)]
     hands = np.reshape([grasp.T_cloud_hand for grasp in grasps], (-1, 4, 4)).astype(np.float32)
-    boxes = gripper.boxes(gripper.max_opening)
-    boxes[:, 0] += NOISE
-    boxes[:, 1] -= NOISE
+    boxes = np.add(gripper.boxes(gripper.max_opening), [[NOISE], [-NOISE]])
     return any_point_in_boxes(in_hands(seen, hands), boxes)
 
 
