@@ -19,7 +19,6 @@ from edgegrasp_camera.arrays import Int64
 from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.trial import Attempt, Round
 
-CSV_COLUMNS = ("seed", "round", "attempt", *Attempt.__dataclass_fields__)
 PAIRED = ("scene", "engine", "protocol", "objects", "constants")  # equal in paired runs
 COUNTS = ("successes", "attempts", "objects")
 RATE_LABELS = {"grasp_success_rate": "GSR", "declutter_rate": "DR"}
@@ -82,13 +81,13 @@ class ResultFolder:
         summary = summary_of(self.manifest()["run"], rounds)
         _write(self.path / "summary.json", json.dumps(summary, indent=1) + "\n")
         with (self.path / "attempts.csv").open("w", newline="") as file:
-            table = csv.DictWriter(file, CSV_COLUMNS)
+            columns = ("seed", "round", "attempt", *Attempt.__dataclass_fields__)
+            table = csv.DictWriter(file, columns)
             table.writeheader()
             for item in rounds:
                 for number, attempt in enumerate(item.attempts):
                     where = {"seed": item.seed, "round": item.index, "attempt": number}
-                    pose = {"T_world_hand": json.dumps(attempt.T_world_hand)}
-                    table.writerow(where | asdict(attempt) | pose)
+                    table.writerow(where | asdict(attempt))
         return summary
 
 
