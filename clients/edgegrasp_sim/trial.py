@@ -124,7 +124,6 @@ class RoundDriver:
             open_table(rules.table_thickness),
         )
         self.view, self._points = -1, 0
-        self._failures = 0
         names = tuple(model.name for model in simulation.object_models)
         wide = tuple(model.name for model in simulation.too_wide)
         self._round = Round(seed, index, names, (), 0, RoundEnd.CLEARED, too_wide=wide)
@@ -135,7 +134,8 @@ class RoundDriver:
         rules = self.protocol.round
         if self.simulation.num_objects == 0:
             return RoundEnd.CLEARED
-        if self._failures >= rules.max_consecutive_failures:
+        last = self._round.attempts[-rules.max_consecutive_failures :]
+        if len(last) == rules.max_consecutive_failures and not any(one.success for one in last):
             return RoundEnd.FAILURES
         return RoundEnd.NO_GRASP if self._round.no_grasp >= rules.max_no_grasp else None
 
@@ -192,6 +192,5 @@ class RoundDriver:
             motion_seconds=0.0 if grasp.motion is None else seconds_of(grasp.motion),
             touched_on_the_way=result.touched_on_the_way,
         )
-        self._failures = 0 if attempt.success else self._failures + 1
         self._round.attempts += (attempt,)
         return attempt
