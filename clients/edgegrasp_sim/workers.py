@@ -40,6 +40,8 @@ def run_tasks(
     """Run independent tasks, again if a worker dies; yields each task with its result."""
     if workers is not None and workers < 1:
         raise ValueError(f"workers is {workers}; use at least 1")
+    if not tasks:
+        return iter(())
     if ray is not None:
         return _on_ray(ray, make_runner, tasks, workers)
     processes = min(workers or len(os.sched_getaffinity(0)), len(tasks))
@@ -51,8 +53,6 @@ def run_tasks(
 def _here(
     make_runner: MakeRunner[Task, Result], tasks: Sequence[Task]
 ) -> Iterator[tuple[Task, Result]]:
-    if not tasks:
-        return
     run: Any = make_runner()
     with closing(run) if hasattr(run, "close") else nullcontext():
         for task in tasks:
@@ -119,8 +119,6 @@ def _on_ray(
     except ModuleNotFoundError:
         message = "ray is not installed: pip install 'edgegrasp[ray]'"
         raise ModuleNotFoundError(message) from None
-    if not tasks:
-        return
     own: dict[str, Any] = {}
     if address == LOCAL_RAY:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # only read from there
