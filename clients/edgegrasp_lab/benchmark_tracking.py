@@ -30,8 +30,6 @@ OBJECTS = 3  # in a simulated scene
 REPEATED = 8  # images of a still scene in which the first grasp is looked for anew
 ALIKE = 0.02, 10.0  # metres and degrees within which it is the same one
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # a hand of two equal fingers is the same after it
-# Which grasps are executed: the first at the start; the first, and the last one, in the end.
-SUCCESSES = ("still", "open_loop", "followed")
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,7 @@ class RecordedScene:
         return np.eye(4)
 
     def execute(self, done: Followed) -> dict[str, bool]:
-        """Which of the grasps of SUCCESSES hold an object; none is tried here."""
+        """Whether the grasps hold an object; none is tried here."""
         return {}
 
 
@@ -133,13 +131,14 @@ class SimulatedScene:
         return T
 
     def execute(self, done: Followed) -> dict[str, bool]:
-        """Try all three in simulation."""
-        grasps = dict(zip(SUCCESSES, (done.first, done.first, done.last), strict=True))
-        success = dict.fromkeys(grasps, False)
-        for name, grasp in grasps.items():
-            self._place(0.0 if name == "still" else self.motion.seconds)
-            if grasp is not None:
-                success[name] = self.simulation.try_grasp(grasp.T_cloud_hand).success
+        """Try the first grasp at the start; the first, and the last one, in the end."""
+        first, last, end = done.first, done.last, self.motion.seconds
+        tries = {"still": (first, 0.0), "open_loop": (first, end), "followed": (last, end)}
+        success: dict[str, bool] = {}
+        for name, (grasp, seconds) in tries.items():
+            self._place(seconds)
+            tried = None if grasp is None else self.simulation.try_grasp(grasp.T_cloud_hand)
+            success[name] = tried is not None and tried.success
         return success
 
     def _place(self, seconds: float) -> None:
@@ -280,7 +279,7 @@ def summary(done: list[Followed]) -> dict[str, Any]:
 def simulated(objects: Path | None, motion: Motion, rounds: int) -> Iterator[SimulatedScene]:
     """Simulated scenes; each is valid until the next one."""
     kind = SceneKind.PACKED
-    sets = None if objects is None else {kind: ObjectSet.from_folder(objects, kind, "test")}
+    sets = {kind: ObjectSet.from_folder(objects, kind)}
     with ClutterSimulation(sets, engine="mujoco") as simulation:
         for number in range(rounds):
             rng = np.random.default_rng(number)
