@@ -42,11 +42,9 @@ def repeat(
     run, known = facts["run"], facts["objects_folder"]
     if "arm" in run:
         raise ValueError(f"{folder.path} holds attempts of an arm, whose motions are not kept")
-    rounds = {(done.seed, done.index): done for done in folder.rounds()}
-    done = rounds.get((seed, index))
+    done = next((one for one in folder.rounds() if (one.seed, one.index) == (seed, index)), None)
     if done is None:
-        kept = ", ".join(f"{s}/{i}" for s, i in list(rounds)[:10])
-        raise ValueError(f"round is {index} of seed {seed}; the folder has {kept}, …")
+        raise ValueError(f"round is {index} of seed {seed}; choose one of {folder.path / 'rounds'}")
     if not 0 <= number < len(done.attempts):
         raise ValueError(f"attempt is {number}; the round has {len(done.attempts)}, from 0 on")
     config = BenchmarkConfig(
@@ -73,9 +71,7 @@ def repeat(
 def write_report(folder: ResultFolder, summary: dict[str, Any]) -> Path:
     """Write `report.html` into a finished result folder."""
     rounds, facts = folder.rounds(), folder.manifest()
-    pictures: list[str] = []
-    if "arm" not in facts["run"]:
-        pictures = list(_failure_pictures(folder, rounds))
+    pictures = () if "arm" in facts["run"] else _failure_pictures(folder, rounds)
     protocol = f"protocol {summary['protocol']}, version {summary['protocol_version']}"
     title = f"{planner_title(facts['run']['planner'])} on {summary['scene']} scenes, {protocol}"
     parts = [
