@@ -246,10 +246,7 @@ def below_gate(summary: dict[str, Any], gate: Path) -> list[str]:
 
 def wilson(successes: int, trials: int) -> tuple[float, float] | None:
     """Wilson's 95 % interval of a share; None without trials."""
-    if trials == 0:
-        return None
-    low, high = binomtest(successes, trials).proportion_ci(method="wilson")
-    return float(low), float(high)
+    return binomtest(successes, trials).proportion_ci(method="wilson") if trials else None
 
 
 def paired_difference(above: Int64, below: Int64) -> dict[str, Any]:
