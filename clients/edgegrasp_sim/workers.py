@@ -117,8 +117,7 @@ def _on_ray(
     try:
         ray: Any = importlib.import_module("ray")
     except ModuleNotFoundError:
-        message = "ray is not installed: pip install 'edgegrasp[ray]'"
-        raise ModuleNotFoundError(message) from None
+        raise ModuleNotFoundError("ray is not installed: pip install 'edgegrasp[ray]'") from None
     own: dict[str, Any] = {}
     if address == LOCAL_RAY:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # only read from there
