@@ -42,10 +42,8 @@ class BenchmarkConfig:
     def __post_init__(self) -> None:
         if self.rounds < 1:
             raise ValueError(f"rounds is {self.rounds}; run at least 1")
-        if not self.seeds or min(self.seeds) < 0:
-            raise ValueError(f"seeds is {self.seeds}; pass numbers of 0 or more")
-        if len(set(self.seeds)) < len(self.seeds):
-            raise ValueError(f"seeds is {self.seeds}; pass each seed once")
+        if not self.seeds or min(self.seeds) < 0 or len({*self.seeds}) < len(self.seeds):
+            raise ValueError(f"seeds is {self.seeds}; pass numbers of 0 or more, each seed once")
         chosen = engines.choose_engine(self.engine, self.protocol.engine)
         object.__setattr__(self, "engine", chosen)
 
