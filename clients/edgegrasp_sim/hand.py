@@ -205,22 +205,19 @@ class ArmGripper(Gripper):
 
     def approach(self, T_world_hand: Float64) -> Iterator[None]:
         """Follow the motion to the grasp."""
-        return self._follow(0, self._planned.grasp_row)
+        return self._follow(away=False)
 
     def retreat(self, T_world_hand: Float64) -> Iterator[None]:
         """Follow the motion away from the grasp."""
-        return self._follow(self._planned.grasp_row, len(self._planned.times) - 1)
+        return self._follow(away=True)
 
-    @property
-    def _planned(self) -> ArmTrajectory:
-        if self.motion is None:
+    def _follow(self, *, away: bool) -> Iterator[None]:
+        """Follow the motion to the grasp, or away from it; yields after each time step."""
+        motion, substeps = self.motion, self._arm.substeps
+        if motion is None:
             raise ValueError("the grasp has no motion of the arm; plan it with a robot")
-        return self.motion
-
-    def _follow(self, first: int, last: int) -> Iterator[None]:
-        """Follow some rows of the motion; yields after each time step."""
-        motion, substeps = self._planned, self._arm.substeps
-        begin, end = motion.times[first], motion.times[last]
+        start, grasp, end = motion.times[[0, motion.grasp_row, -1]]
+        begin, end = (grasp, end) if away else (start, grasp)
         steps = int(np.ceil((end - begin + SETTLE_SECONDS) / TIME_STEP))
         for step in range(steps):
             times = begin + (step + np.arange(1, substeps + 1) / substeps) * TIME_STEP
