@@ -59,9 +59,8 @@ def judged(file: Path, grasps: list[Grasp], plane: Any = None) -> SceneFigures:
 def test_grasps_are_judged_by_the_labels(scene: Path) -> None:
     top = TABLE + 2 * HALF[2] * NORMAL
     floor = TABLE + 0.2 * ALONG
-    good = grasp(-NORMAL, top - 0.02 * NORMAL, end=top)
     grasps = [
-        good,
+        grasp(-NORMAL, top - 0.02 * NORMAL, end=top),  # good
         grasp(NORMAL, top, end=top, score=0.4),  # from below, through the table
         grasp(-NORMAL, floor + 0.02 * NORMAL, end=floor),  # beside the box
         grasp(-NORMAL, top - 0.08 * NORMAL, end=top),  # the palm is in the box

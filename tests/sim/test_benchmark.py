@@ -73,8 +73,7 @@ def run_in(path: Path, config: BenchmarkConfig, planner=make_planner, **limits) 
     """The rounds of a benchmark that runs, or goes on, in a folder."""
     folder = ResultFolder(path)
     folder.open(manifest(config, {"name": "top-down"}))
-    for _ in run_benchmark(config, planner, folder, **limits):
-        pass
+    list(run_benchmark(config, planner, folder, **limits))
     return folder.rounds()
 
 
