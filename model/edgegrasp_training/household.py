@@ -7,11 +7,14 @@ that a bowl or a ring is as hollow for a finger as it is for a camera.
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
-from edgegrasp_camera.arrays import Float64, Int64
+from edgegrasp_camera.arrays import Float64
+from edgegrasp_sim.engine.urdf import Surface, convex_hull
 
 Numbers = Float64 | list[float]
-Mesh = tuple[Float64, Int64]  # vertices (V, 3) metres, triangles (F, 3) facing outwards
+Part = Float64  # (..., 3) metres: points whose convex hull it is
 Random = np.random.Generator
 
 FINE, COARSE = 28, 16  # corners of a circle: of a solid part, and of a wall of as many parts
@@ -19,26 +22,27 @@ LIE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # turns z t
 RAISE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # turns y to z
 
 
-def household_mesh(rng: Random) -> tuple[str, list[Mesh]]:
+def household_mesh(rng: Random) -> tuple[str, list[Surface]]:
     """Draw an object of any family: its name, and closed convex parts that may overlap.
 
     They stand on z = 0 about the z axis.
     """
     family, make = list(FAMILIES.items())[int(rng.integers(len(FAMILIES)))]
-    parts = make(rng)
-    points = np.concatenate([vertices for vertices, _ in parts])
+    parts = [part.reshape(-1, 3) for part in make(rng)]
+    points = np.concatenate(parts)
     low, high = points.min(axis=0), points.max(axis=0)
     origin = np.array([*(low + high)[:2] / 2, low[2]])
-    return family, [(vertices - origin, faces) for vertices, faces in parts]
+    hulls = [convex_hull(part - origin) for part in parts]
+    return family, [hull for hull in hulls if hull is not None]
 
 
-def _can(rng: Random) -> list[Mesh]:
+def _can(rng: Random) -> list[Part]:
     radius, height = rng.uniform(0.025, 0.05), rng.uniform(0.03, 0.18)
     rim = rng.uniform(0.001, 0.006)
     return [_solid([radius - rim, radius, radius, radius - rim], [0, rim, height - rim, height])]
 
 
-def _bottle(rng: Random) -> list[Mesh]:
+def _bottle(rng: Random) -> list[Part]:
     radius, height = rng.uniform(0.02, 0.05), rng.uniform(0.12, 0.32)
     neck, shoulder = radius * rng.uniform(0.25, 0.6), height * rng.uniform(0.45, 0.8)
     cap, top = neck * rng.uniform(1.0, 1.3), height * rng.uniform(0.85, 0.93)
@@ -49,18 +53,18 @@ def _bottle(rng: Random) -> list[Mesh]:
     foot = min(0.004, radius / 5)
     body = [radius - foot, radius, radius, neck + 0.3 * (radius - neck), neck]
     heights = [0.0, foot, shoulder, shoulder + 0.75 * slope, shoulder + slope]
-    parts = [_loft(outline, body, heights), _solid([neck, neck], [shoulder, top])]
+    parts = [lofted(outline, body, heights), _solid([neck, neck], [shoulder, top])]
     return [*parts, _solid([cap, cap], [top - 0.01, height])]
 
 
-def _jar(rng: Random) -> list[Mesh]:
+def _jar(rng: Random) -> list[Part]:
     radius, height = rng.uniform(0.025, 0.055), rng.uniform(0.05, 0.16)
     lid, top = radius * rng.uniform(0.75, 1.05), height - rng.uniform(0.01, 0.02)
     body = _solid([0.93 * radius, radius, radius, lid * 0.95], [0.0, 0.004, 0.85 * top, top])
     return [body, _solid([lid, lid], [top, height])]
 
 
-def _bowl(rng: Random) -> list[Mesh]:
+def _bowl(rng: Random) -> list[Part]:
     """Round or oval; a third has the straight handle of a pan."""
     radius, depth, wall = rng.uniform(0.04, 0.11), rng.uniform(0.025, 0.09), rng.uniform(2e-3, 5e-3)
     flat = rng.uniform(0.35, 0.7)
@@ -75,7 +79,7 @@ def _bowl(rng: Random) -> list[Mesh]:
     return _placed(parts, np.diag([1.0, rng.uniform(0.7, 1.0), 1.0]))
 
 
-def _cup(rng: Random) -> list[Mesh]:
+def _cup(rng: Random) -> list[Part]:
     radius, height, wall = rng.uniform(0.03, 0.05), rng.uniform(0.05, 0.12), rng.uniform(3e-3, 5e-3)
     bottom = radius * rng.uniform(0.65, 1.0)
     parts = _shell([bottom, radius], [0.0, height], wall, rng.uniform(0.004, 0.008))
@@ -89,7 +93,7 @@ def _cup(rng: Random) -> list[Mesh]:
     return [*parts, *handle, *both]
 
 
-def _plate(rng: Random) -> list[Mesh]:
+def _plate(rng: Random) -> list[Part]:
     radius, height, wall = rng.uniform(0.06, 0.15), rng.uniform(0.01, 0.03), rng.uniform(3e-3, 6e-3)
     well = radius * rng.uniform(0.5, 0.75)
     step = radius * rng.uniform(0.04, 0.15)
@@ -97,7 +101,7 @@ def _plate(rng: Random) -> list[Mesh]:
     return _shell([well, well + step, radius], [0.0, rise, height], wall, wall)
 
 
-def _glass(rng: Random) -> list[Mesh]:
+def _glass(rng: Random) -> list[Part]:
     radius, height = rng.uniform(0.025, 0.045), rng.uniform(0.07, 0.17)
     wall = rng.uniform(0.002, 0.004)
     if rng.random() < 0.65:
@@ -105,24 +109,25 @@ def _glass(rng: Random) -> list[Mesh]:
     stem, thick = height * rng.uniform(0.3, 0.55), rng.uniform(0.003, 0.006)
     radii, heights = radius * np.array([0.35, 0.95, 1.1, 0.9]), np.array([0.0, 0.35, 0.6, 1.0])
     bowl = _shell(radii, heights * (height - stem), wall, 2 * wall)
+    bowl = _placed(bowl, np.eye(3), (0.0, 0.0, stem))
     foot = _solid([0.9 * radius, 0.9 * radius, 2 * thick], [0.0, 0.003, 0.008])
-    return [foot, _solid([thick, thick], [0.0, stem + wall]), *_placed(bowl, (0.0, 0.0, stem))]
+    return [foot, _solid([thick, thick], [0.0, stem + wall]), *bowl]
 
 
-def _carton(rng: Random) -> list[Mesh]:
+def _carton(rng: Random) -> list[Part]:
     """A closed box; half of them fit the hand on no side."""
     least = 0.085 if rng.random() < 0.5 else 0.02
     size = np.exp(rng.uniform(np.log(least), np.log(0.28), size=3))
     return [_box(size, (0.0, 0.0, 0.0), rng.uniform(0.0, 0.03))]
 
 
-def _tray(rng: Random) -> list[Mesh]:
+def _tray(rng: Random) -> list[Part]:
     x, y = rng.uniform(0.06, 0.28, size=2)
     z, wall = rng.uniform(0.025, 0.12), rng.uniform(0.002, 0.006)
     return [_box((x, y, wall), (0.0, 0.0, wall / 2)), *_walls(x, y, z, wall)]
 
 
-def _book(rng: Random) -> list[Mesh]:
+def _book(rng: Random) -> list[Part]:
     """Covers are a little larger than the pages; a quarter of the books stand."""
     x, y, z = rng.uniform(0.1, 0.28), rng.uniform(0.08, 0.21), rng.uniform(0.008, 0.06)
     cover, inset = rng.uniform(0.001, 0.003), rng.uniform(0.0, 0.005)
@@ -131,7 +136,7 @@ def _book(rng: Random) -> list[Mesh]:
     return _placed(parts, RAISE) if rng.random() < 0.25 else parts
 
 
-def _torch(rng: Random) -> list[Mesh]:
+def _torch(rng: Random) -> list[Part]:
     """Lying, or standing on its head."""
     grip, length = rng.uniform(0.009, 0.018), rng.uniform(0.08, 0.22)
     head, neck = grip * rng.uniform(1.1, 2.0), length * rng.uniform(0.15, 0.35)
@@ -140,9 +145,9 @@ def _torch(rng: Random) -> list[Mesh]:
     return parts if rng.random() < 0.25 else _placed(parts, LIE)
 
 
-def _hammer(rng: Random) -> list[Mesh]:
+def _hammer(rng: Random) -> list[Part]:
     length, grip = rng.uniform(0.18, 0.33), rng.uniform(0.010, 0.017)
-    handle = _placed([_loft(oval() * (0.75, 1.0), [grip, grip, 0.7 * grip], [0, 0.4, 1])], LIE)
+    handle = _placed([lofted(oval() * (0.75, 1.0), [grip, grip, 0.7 * grip], [0, 0.4, 1])], LIE)
     thick, span = rng.uniform(0.018, 0.036), rng.uniform(0.07, 0.13)
     poll, claw = np.array([length, span / 2, 0.0]), np.array([length, -span / 2, 0.0])
     middle = (poll + claw) / 2
@@ -150,16 +155,16 @@ def _hammer(rng: Random) -> list[Mesh]:
     return [*_placed(handle, np.diag([length, 1.0, 1.0])), *head]
 
 
-def _screwdriver(rng: Random) -> list[Mesh]:
+def _screwdriver(rng: Random) -> list[Part]:
     grip, handle = rng.uniform(0.009, 0.018), rng.uniform(0.06, 0.12)
     shaft, length = rng.uniform(0.002, 0.005), rng.uniform(0.05, 0.17)
     outline = oval(1.0, int(rng.choice([6, 8, FINE])))
-    body = _loft(outline, [0.7 * grip, grip, grip, 0.6 * grip], [0, 0.15, 0.7, 1])
+    body = lofted(outline, [0.7 * grip, grip, grip, 0.6 * grip], [0, 0.15, 0.7, 1])
     parts = _placed([body], np.diag([1.0, 1.0, handle]))
     return _placed([*parts, _solid([shaft, shaft], [handle - 0.01, handle + length])], LIE)
 
 
-def _spanner(rng: Random) -> list[Mesh]:
+def _spanner(rng: Random) -> list[Part]:
     """A flat bar, with an open jaw at one end and a ring or a jaw at the other."""
     length, thick = rng.uniform(0.1, 0.26), rng.uniform(0.004, 0.01)
     parts = [_box((length, rng.uniform(0.008, 0.018), thick), (0.0, 0.0, 0.0))]
@@ -174,24 +179,23 @@ def _spanner(rng: Random) -> list[Mesh]:
     return parts
 
 
-def _scissors(rng: Random) -> list[Mesh]:
+def _scissors(rng: Random) -> list[Part]:
     blade, thick = rng.uniform(0.05, 0.12), rng.uniform(0.002, 0.004)
     spread, shank = rng.uniform(0.08, 0.35), rng.uniform(0.03, 0.06)
     loop, rod = rng.uniform(0.013, 0.022), rng.uniform(0.003, 0.005)
-    parts: list[Mesh] = []
+    parts: list[Part] = []
     for side in (-1.0, 1.0):
         outline = np.array([[-shank, -0.006], [blade, -0.001], [blade, 0.001], [-shank, 0.006]])
-        flat = _loft(outline, [1.0, 1.0], [0.0, thick])
+        flat = lofted(outline, [1.0, 1.0], [0.0, thick])
         eye = _wedges(oval(1.0, 8) * rod + (loop, 0.0), np.linspace(0, 2 * np.pi, COARSE + 1))
         long = np.diag([rng.uniform(1.0, 1.5), 1.0, 1.0])
         eye = _placed(eye, long, (-shank - loop, side * 0.3 * loop, thick / 2))
-        c, s = np.cos(side * spread / 2), np.sin(side * spread / 2)
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        turn = Rotation.from_euler("z", side * spread / 2).as_matrix()
         parts += _placed([flat, *eye], turn, (0.0, 0.0, side * thick / 2))
     return [*parts, _solid([0.005, 0.005], [-thick, 2 * thick])]
 
 
-def _clamp(rng: Random) -> list[Mesh]:
+def _clamp(rng: Random) -> list[Part]:
     reach, opening = rng.uniform(0.03, 0.08), rng.uniform(0.03, 0.11)
     bar, thick = rng.uniform(0.010, 0.018), rng.uniform(0.008, 0.015)
     side = opening / 2 + bar / 2
@@ -204,15 +208,15 @@ def _clamp(rng: Random) -> list[Mesh]:
     return [*parts, _rod(tip, tip - (0.0, 0.006, 0.0), 0.6 * thick)]
 
 
-def _pen(rng: Random) -> list[Mesh]:
+def _pen(rng: Random) -> list[Part]:
     radius, length = rng.uniform(0.0035, 0.01), rng.uniform(0.11, 0.18)
     cap = radius * rng.uniform(1.0, 1.2)
     outline = oval(1.0, int(rng.choice([6, FINE])))
-    body = _loft(outline, [0.3 * radius, radius, radius], [0, 0.02, length])
+    body = lofted(outline, [0.3 * radius, radius, radius], [0, 0.02, length])
     return _placed([body, _solid([cap, cap], [length * rng.uniform(0.6, 0.9), length])], LIE)
 
 
-def _fruit(rng: Random) -> list[Mesh]:
+def _fruit(rng: Random) -> list[Part]:
     """A sphere to a spindle, a third of them a pear or a banana."""
     kind = rng.random()
     if kind < 0.15:
@@ -238,13 +242,13 @@ def _fruit(rng: Random) -> list[Mesh]:
     return _placed(parts, LIE) if kind > 0.7 else parts
 
 
-def _bag(rng: Random) -> list[Mesh]:
+def _bag(rng: Random) -> list[Part]:
     """A bulged box, some with the flat seam of a packet at both ends."""
     x, y, z = rng.uniform((0.06, 0.04, 0.02), (0.26, 0.18, 0.12))
     sharp = rng.uniform(0.3, 0.8)
     turn = np.linspace(-0.48, 0.48, 12) * np.pi
     heights = np.sign(turn) * np.abs(np.sin(turn)) ** sharp
-    body = _loft(oval(rng.uniform(0.3, 0.7)), np.cos(turn) ** sharp, heights)
+    body = lofted(oval(rng.uniform(0.3, 0.7)), np.cos(turn) ** sharp, heights)
     lean = np.array([[x / 2, 0.0, 0.0], [0.0, y / 2, 0.0], [0.0, 0.0, z / 2]])
     lean[:2, 2] = rng.uniform(-0.1, 0.1, size=2) * z
     parts = _placed([body], lean)
@@ -253,7 +257,7 @@ def _bag(rng: Random) -> list[Mesh]:
     return _placed(parts, LIE.T) if rng.random() < 0.3 else parts
 
 
-def _ring(rng: Random) -> list[Mesh]:
+def _ring(rng: Random) -> list[Part]:
     """A roll of tape, a pipe, a bracelet; some stand on their edge."""
     outer, height = rng.uniform(0.025, 0.07), rng.uniform(0.008, 0.07)
     inner = outer * rng.uniform(0.45, 0.93)
@@ -263,13 +267,13 @@ def _ring(rng: Random) -> list[Mesh]:
     return _placed(parts, RAISE) if rng.random() < 0.15 else parts
 
 
-def _frame(rng: Random) -> list[Mesh]:
+def _frame(rng: Random) -> list[Part]:
     x, y = rng.uniform(0.06, 0.28, size=2)
     bar, thick = min(rng.uniform(0.006, 0.03), 0.2 * min(x, y)), rng.uniform(0.006, 0.03)
     return _walls(x, y, thick, bar)
 
 
-FAMILIES: dict[str, Callable[[Random], list[Mesh]]] = {
+FAMILIES: dict[str, Callable[[Random], list[Part]]] = {
     make.__name__[1:]: make
     for make in (
         *(_can, _bottle, _jar, _bowl, _cup, _plate, _glass, _carton, _tray, _book, _torch),
@@ -306,47 +310,27 @@ def swept(section: Float64, angles: Float64) -> Float64:
     return rings
 
 
-def strips(rings: int, corners: int, *, closed: bool = True) -> tuple[Int64, Int64]:
-    """Triangles that join neighbouring rings, or open rows, of corners: two to each side."""
-    number = np.arange(rings * corners).reshape(rings, corners)
-    if closed:
-        number = np.hstack([number, number[:, :1]])
-    low, high = number[:-1], number[1:]
-    sides = low[:, :-1], low[:, 1:], high[:, 1:], high[:, :-1]
-    a, b, c, d = (each.ravel() for each in sides)
-    return np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)
-
-
-def _loft(outline: Float64, widths: Numbers, heights: Numbers) -> Mesh:
-    """A solid with a convex outline (S, 2), counter-clockwise; heights ascend."""
-    rings = lofted(outline, widths, heights)
-    return rings.reshape(-1, 3), _faces(*rings.shape[:2])
-
-
-def _solid(radii: Numbers, heights: Numbers) -> Mesh:
+def _solid(radii: Numbers, heights: Numbers) -> Part:
     """A solid of revolution about z; its profile is convex."""
-    return _loft(oval(), radii, heights)
+    return lofted(oval(), radii, heights)
 
 
-def _box(size: Float64 | tuple[float, ...], centre: tuple[float, ...], cut: float = 0.0) -> Mesh:
+def _box(size: ArrayLike, centre: ArrayLike, cut: float = 0.0) -> Part:
     """A box; `cut` of its size is taken off its upright edges."""
     x, y, z = np.asarray(size) / 2
-    outline = _rectangle(2 * x, 2 * y)
-    if cut:
-        outline = np.repeat(outline, 2, axis=0)
-        inward = np.array([[0, 1], [1, 0], [-1, 0], [0, 1], [0, -1], [-1, 0], [1, 0], [0, -1]])
-        outline = outline + inward * cut * 2 * np.minimum(x, y)
-    return _placed([_loft(outline, [1.0, 1.0], [-z, z])], centre)[0]
+    cut = cut * 2 * min(x, y)
+    outline = np.concatenate([_rectangle(2 * (x - cut), 2 * y), _rectangle(2 * x, 2 * (y - cut))])
+    return _placed([lofted(outline, [1.0, 1.0], [-z, z])], np.eye(3), centre)[0]
 
 
-def _walls(x: float, y: float, z: float, thick: float) -> list[Mesh]:
+def _walls(x: float, y: float, z: float, thick: float) -> list[Part]:
     """Four bars around an opening, x by y outside and z high."""
     sides = -1.0, 1.0
     parts = [_box((x, thick, z), (0.0, side * (y - thick) / 2, z / 2)) for side in sides]
     return parts + [_box((thick, y, z), (side * (x - thick) / 2, 0.0, z / 2)) for side in sides]
 
 
-def _rod(start: Float64, end: Float64, first: float, last: float = 0.0) -> Mesh:
+def _rod(start: Float64, end: Float64, first: float, last: float = 0.0) -> Part:
     """A round rod from one point to another, with the radius at each; without a last the same."""
     along = end - start
     length = float(np.linalg.norm(along))
@@ -354,18 +338,17 @@ def _rod(start: Float64, end: Float64, first: float, last: float = 0.0) -> Mesh:
     x = np.cross(z, (0.0, 0.0, 1.0) if abs(z[2]) < 0.9 else (1.0, 0.0, 0.0))
     x /= np.linalg.norm(x)
     frame = np.stack([x, np.cross(z, x), z], axis=1)
-    vertices, faces = _loft(oval(1.0, COARSE), [first, last or first], [0.0, length])
-    return vertices @ frame.T + start, faces
+    rod = lofted(oval(1.0, COARSE), [first, last or first], [0.0, length])
+    return _placed([rod], frame, start)[0]
 
 
-def _wedges(section: Float64, angles: Float64) -> list[Mesh]:
+def _wedges(section: Float64, angles: Float64) -> list[Part]:
     """A convex section (P, 2) of radius and height, swept about z: a part between two angles."""
     rings = swept(section, angles)
-    faces = _faces(2, len(section))[:, ::-1]
-    return [(rings[k : k + 2].reshape(-1, 3), faces) for k in range(len(angles) - 1)]
+    return [rings[k : k + 2] for k in range(len(angles) - 1)]
 
 
-def _shell(radii: Numbers, heights: Numbers, wall: float, floor: float) -> list[Mesh]:
+def _shell(radii: Numbers, heights: Numbers, wall: float, floor: float) -> list[Part]:
     """A vessel: its outer profile from the foot up, the thickness of its wall and its floor."""
     outside = np.stack([radii, heights], axis=1)
     way = np.diff(outside, axis=0)
@@ -374,25 +357,12 @@ def _shell(radii: Numbers, heights: Numbers, wall: float, floor: float) -> list[
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     inside = outside + wall * np.stack([-way[:, 1], way[:, 0]], axis=1)
     angles = 2 * np.pi * (np.arange(COARSE + 1) + 0.5) / COARSE
-    parts = [_loft(oval(1.0, COARSE), [outside[0, 0]] * 2, [0.0, floor])]
+    parts = [lofted(oval(1.0, COARSE), [outside[0, 0]] * 2, [0.0, floor])]
     for k in range(len(way) - 1):
         section = np.array([outside[k], outside[k + 1], inside[k + 1], inside[k]])
         parts += _wedges(section, angles)
     return parts
 
 
-def _placed(parts: list[Mesh], *moves: Float64 | tuple[float, ...]) -> list[Mesh]:
-    for move in map(np.asarray, moves):
-        if move.ndim == 2:
-            parts = [(vertices @ move.T, faces) for vertices, faces in parts]
-        else:
-            parts = [(vertices + move, faces) for vertices, faces in parts]
-    return parts
-
-
-def _faces(rings: int, corners: int) -> Int64:
-    """Triangles that join neighbouring rings of corners and close both ends."""
-    first, second = strips(rings, corners)
-    start, end = np.arange(1, corners - 1), np.arange(2, corners)
-    fan = np.stack([np.zeros_like(start), start, end], axis=1)
-    return np.concatenate([first, fan[:, ::-1], second, fan + (rings - 1) * corners])
+def _placed(parts: list[Part], turn: Float64, place: ArrayLike = 0.0) -> list[Part]:
+    return [part @ turn.T + np.asarray(place) for part in parts]

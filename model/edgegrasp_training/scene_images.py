@@ -22,8 +22,9 @@ from edgegrasp_camera.arrays import Bools, Float32, Float64
 from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.engine import Intrinsics
 from edgegrasp_sim.engine.urdf import parse_obj
+from edgegrasp_sim.objects import Mesh
 from edgegrasp_sim.sensor import DepthSensor, random_sensor
-from edgegrasp_training.household import Mesh, household_mesh
+from edgegrasp_training.household import household_mesh
 from edgegrasp_training.scene_layouts import (
     MAX_OBJECTS,
     OBJECT,

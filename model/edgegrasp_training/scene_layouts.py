@@ -16,7 +16,9 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float64, Int64
-from edgegrasp_training.household import Mesh, lofted, strips
+from edgegrasp_sim.objects import Mesh
+from edgegrasp_training.household import lofted
+from edgegrasp_training.shapes import joined
 
 OTHER, SUPPORT, OBJECT = 0, 1, 2  # labels; objects are numbered from OBJECT
 MAX_OBJECTS = 96
@@ -144,7 +146,10 @@ def _bin(scene: SceneMeshes) -> None:
     flush = rng.random() < 0.2
     round_bin = not flush and rng.random() < 0.12
     scene.elevation = (0.45 if depth < 0.1 else 0.75, 1.57)
-    scene.add(_disc(half) if round_bin else _surface(rng, half, 0.004), SUPPORT)
+    if round_bin:  # an ellipse around the rectangle
+        scene.add(joined(lofted(_ROUND, np.outer((0.0, 1.0), half), [0.0, 0.0])), SUPPORT)
+    else:
+        scene.add(_surface(rng, half, 0.004), SUPPORT)
     _open_box(scene, half, depth, flush, round_bin)
     if not round_bin:
         scene.add_box((2 * half[0] + 0.004, 2 * half[1] + 0.004, 0.01), (0, 0, -0.012))
@@ -366,15 +371,7 @@ def _cable(rng: np.random.Generator, place: ArrayLike) -> Mesh:
     side = np.stack([-np.sin(heading), np.cos(heading)], 1)
     level = way[:, None] + radius * np.cos(angle)[None, :, None] * side[:, None]
     height = rise[:, None, None] + radius + radius * np.sin(angle)[None, :, None]
-    points = np.concatenate([level, height], axis=2)
-    return points.reshape(-1, 3), np.concatenate(strips(50, 6))
-
-
-def _disc(half: tuple[float, float]) -> Mesh:
-    """The level ellipse through the corners of a rectangle."""
-    points = np.concatenate([np.zeros((1, 3)), np.pad(_ROUND * half, ((0, 0), (0, 1)))])
-    around = np.arange(len(_ROUND))
-    return points, np.stack([0 * around, around + 1, (around + 1) % len(_ROUND) + 1], axis=1)
+    return joined(np.concatenate([level, height], axis=2))
 
 
 def _open_box(
@@ -392,8 +389,7 @@ def _open_box(
     inner, top = np.array(half), np.array(half) + slope
     corners = _ROUND if is_round else np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     sizes = np.array([inner, top, top + rim, top + wall, inner + wall])
-    rings = lofted(corners, sizes, [low, depth, depth, behind, low])
-    scene.add((rings.reshape(-1, 3), np.concatenate(strips(*rings.shape[:2]))))
+    scene.add(joined(lofted(corners, sizes, [low, depth, depth, behind, low])))
     if is_round:
         return
     for _ in range(int(rng.integers(1, 7)) if rng.random() < 0.35 else 0):  # handles and bosses
@@ -432,8 +428,7 @@ def _surface(rng: np.random.Generator, half: tuple[float, float], bow: float) ->
         wave = rng.normal(0.0, 4.0, 2)
         z += rng.normal(0.0, 0.5) * np.sin(wave[0] * x + wave[1] * y + rng.uniform(0, 6.3))
     z = bow * z / max(np.abs(z).max(), 1e-9) * (rng.random() if bow else 0.0)
-    points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    return points, np.concatenate(strips(n, n, closed=False))
+    return joined(np.stack([x, y, z], axis=-1), closed=False)
 
 
 def box(size: ArrayLike, centre: ArrayLike, yaw: float = 0.0) -> Mesh:

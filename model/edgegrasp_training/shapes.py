@@ -10,9 +10,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from edgegrasp_camera.arrays import Float64, Int64
+from edgegrasp_camera.arrays import Float64
+from edgegrasp_sim.engine.urdf import Surface
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, as_obj, blob, write_object, write_parts
-from edgegrasp_training.household import household_mesh, lofted, oval, strips, swept
+from edgegrasp_training.household import household_mesh, lofted, oval, swept
 
 STRETCH = 1.35  # greatest factor along an axis; its inverse is the least
 MADE_SHARE = 0.5  # of a scene's objects that are computed
@@ -105,18 +106,27 @@ def free_shape(rng: np.random.Generator, index: int) -> str:
     return as_obj(_surface(part * np.maximum(scale, THINNEST / extents)) for part in parts)
 
 
-def _surface(rings: Rings) -> tuple[Float64, Int64]:
-    """Join neighbouring rings and close the ends by fans: points (P, 3), triangles (F, 3)."""
-    count, corners, _ = rings.shape
-    points = np.concatenate([rings.reshape(-1, 3), rings[[0, -1]].mean(axis=1)])
-    sides = np.stack([each.reshape(-1, corners, 3) for each in strips(count, corners)], axis=1)
+def joined(rings: Rings, *, closed: bool = True) -> Surface:
+    """The surface between neighbouring rings, or open rows, of corners; two triangles a side."""
+    number = np.arange(rings.size // 3).reshape(rings.shape[:2])
+    if closed:
+        number = np.hstack([number, number[:, :1]])
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+    triangles = np.array([[a, b, c], [a, c, d]]).transpose(2, 0, 3, 1)
+    return Surface(rings.reshape(-1, 3), triangles.reshape(-1, 3))
+
+
+def _surface(rings: Rings) -> Surface:
+    """Join neighbouring rings and close the ends by fans."""
+    (points, sides), (count, corners, _) = joined(rings), rings.shape
+    points = np.concatenate([points, rings[[0, -1]].mean(axis=1)])
     ring, last = np.arange(corners), (count - 1) * corners
     bottom = np.stack([np.full(corners, count * corners), np.roll(ring, -1), ring], axis=1)
     top = bottom[:, [0, 2, 1]] + (1, last, last)
-    triangles = np.concatenate([sides.reshape(-1, 3), bottom, top])
+    triangles = np.concatenate([sides, bottom, top])
     a, b, c = points[triangles].transpose(1, 0, 2)
     outwards = (np.cross(a, b) * c).sum() > 0.0
-    return points, triangles if outwards else triangles[:, ::-1]
+    return Surface(points, triangles if outwards else triangles[:, ::-1])
 
 
 def _plain(rng: np.random.Generator) -> Rings:
