@@ -300,7 +300,7 @@ def _frame(rng: np.random.Generator, start: ArrayLike) -> Mesh:
             sections=int(rng.choice([4, 8])),
             segment=np.stack([first, first + way]),
         )
-        bars.append((np.asarray(bar.vertices), np.asarray(bar.faces)))
+        bars.append((bar.vertices, bar.faces))
         ends += [first + way, first + way * rng.random()]
     points, triangles = merged(bars)
     return (points - origin) @ _turn(rng.uniform(0, 2 * np.pi)).T + origin, triangles
@@ -433,14 +433,10 @@ def _surface(rng: np.random.Generator, half: tuple[float, float], bow: float) ->
 
 def box(size: ArrayLike, centre: ArrayLike, yaw: float = 0.0) -> Mesh:
     """A box; size and centre (3,) metres."""
-    corners = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    return (corners * np.asarray(size)) @ _turn(yaw).T + np.asarray(centre), _BOX_FACES
+    import trimesh
 
-
-_BOX_FACES = np.array(
-    [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
-     (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
-)  # fmt: skip
+    made = trimesh.creation.box(size)
+    return made.vertices @ _turn(yaw).T + np.asarray(centre), made.faces
 
 
 def pool_mesh(rng: np.random.Generator, mesh: Mesh) -> PoolMesh:
