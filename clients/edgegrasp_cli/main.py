@@ -30,7 +30,7 @@ COMMANDS = {
     "replay": ("lab.replay", "service,sim", "Repeat a recorded attempt or request."),
     "generate-data": ("lab.train", "train", "Make labelled edge grasps in simulation."),
     "train": ("lab.train", "train", "Train weights on generated data."),
-    "generate-scenes": ("lab.train", "open3d,robot,train", "Make images for train-scene."),
+    "generate-scenes": ("lab.train", "meshes,open3d,robot,train", "Make images for train-scene."),
     "train-scene": ("lab.train", "open3d,train", "Train the network that recognises objects."),
     "import-checkpoint": ("lab.train", "model", "Convert the authors' checkpoints to safetensors."),
 }
