@@ -240,10 +240,8 @@ def random_turn(rng: np.random.Generator, *, upright: bool) -> Float32:
 
 def _labels(view: LabelledView) -> Float32:
     """Targets (E,): whether each grasp holds, and a little more where it survives shaking."""
-    held = view.success == 1
-    firm = np.full(len(held), FIRM_SHARE)
-    if view.firm is not None:
-        firm = np.where(view.firm == UNTRIED, FIRM_SHARE, view.firm == 1)
+    held, shaken = view.success == 1, UNTRIED if view.firm is None else view.firm
+    firm = np.where(shaken == UNTRIED, FIRM_SHARE, shaken == 1)
     return np.asarray(held * (1.0 - SHAKEN_SHARE * (1.0 - firm)), np.float32)
 
 
