@@ -220,12 +220,8 @@ def pack_hands(
 def turned(batch: BallBatch, turn: Float32) -> BallBatch:
     """Rotate all balls of a batch by one rotation (3, 3)."""
     transposed = torch.from_numpy(turn.T.copy())
-    return replace(
-        batch,
-        points=batch.points @ transposed,
-        normals=batch.normals @ transposed,
-        approach=batch.approach @ transposed,
-    )
+    vectors = ("points", "normals", "approach")
+    return replace(batch, **{name: getattr(batch, name) @ transposed for name in vectors})
 
 
 def random_turn(rng: np.random.Generator, *, upright: bool) -> Float32:

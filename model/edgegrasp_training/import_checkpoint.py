@@ -84,14 +84,9 @@ def import_checkpoint(directory: Path) -> tuple[nn.Module, CheckpointMetadata]:
             f"directory: got {directory}, which does not fit {config.architecture} ({error}). "
             "Give the authors' layout at the paper's widths."
         ) from error
-    metadata = CheckpointMetadata(
-        name=config.architecture,
-        network=config,
-        voxel_size=VOXEL_SIZE,
-        gripper=GRIPPER,
-        training={"source": "imported from the authors' layout", "checkpoint": number},
-    )
-    return network.eval(), metadata
+    metadata = CheckpointMetadata(config.architecture, config, VOXEL_SIZE, GRIPPER)
+    training = {"source": "imported from the authors' layout", "checkpoint": number}
+    return network.eval(), replace(metadata, training=training)
 
 
 def _load_weights(path: Path) -> dict[str, Tensor]:

@@ -109,14 +109,8 @@ def _example(
         (number[:, :-1] >= 0) & seen[:, 1:], number[:, :-1] == number[:, 1:], -1
     )
     links[1, :-1] = np.where((number[:-1] >= 0) & seen[1:], number[:-1] == number[1:], -1)
-    return (
-        features,
-        classes,
-        votes.astype(np.float32).transpose(2, 0, 1).copy(),
-        weight.astype(np.float32),
-        links.astype(np.float32),
-        true_up.astype(np.float32),
-    )
+    numbers = votes.transpose(2, 0, 1), weight, links, true_up
+    return features, classes, *(each.astype(np.float32) for each in numbers)
 
 
 _MIRROR, _HALF_TURN = np.array([[-1, 1, 1], [-1, -1, 1]], dtype=np.float32)
