@@ -6,7 +6,7 @@ cameras.
 One command makes the whole data set again: `edgegrasp generate-scenes FOLDER --objects OBJECTS`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -60,6 +60,10 @@ LEVEL = 0.85  # least z of a support's normal: its edges are labelled other
 WRONG = 0.02, 0.01  # metres, and share of the depth, by which a reading shows nothing real
 UNSEEN_WALLS = 0.25  # of the images, in which steep background has no readings, or few
 
+# From a camera and its pose T_world_camera: depth (H, W) in metres, `far` where nothing is hit,
+# labels (H, W), and where it is steep.
+Render = Callable[[Intrinsics, Float64], tuple[Float64, NDArray[np.uint8], Bools]]
+
 
 class SceneImage(NamedTuple):
     """A depth image with labels; camera frame: x right, y down, z forward; metres."""
@@ -97,16 +101,16 @@ def generate(
 
 def make_images(scene: SceneMeshes) -> list[SceneImage]:
     """VIEWS_PER_SCENE images of a scene, without those that are too near or empty."""
-    casting = _casting(scene.parts)
-    drawn = [_make_image(scene, casting) for _ in range(VIEWS_PER_SCENE)]
+    render = _renderer(scene.parts)
+    drawn = [_make_image(scene, render) for _ in range(VIEWS_PER_SCENE)]
     return [image for image in drawn if image is not None]
 
 
-def _make_image(scene: SceneMeshes, casting: o3d.t.geometry.RaycastingScene) -> SceneImage | None:
+def _make_image(scene: SceneMeshes, render: Render) -> SceneImage | None:
     rng, pose = scene.rng, _draw_pose(scene)
     focal = WIDTH / 2 / np.tan(np.radians(rng.uniform(35, 80)) / 2)
     camera = Intrinsics(WIDTH, HEIGHT, focal, WIDTH / 2, HEIGHT / 2, 0.1, 13.0)
-    depth, label, steep = _cast(casting, scene.parts, camera, pose)
+    depth, label, steep = render(camera, pose)
     close = (depth < 0.22).mean()
     seen = np.bincount(label.ravel(), minlength=OBJECT + MAX_OBJECTS)[OBJECT:]
     if close > 0.15 or (scene.centres and not (seen > 25).any()):
@@ -142,34 +146,27 @@ def _draw_pose(scene: SceneMeshes) -> Float64:
     return pose
 
 
-def _casting(parts: Sequence[tuple[Mesh, int]]) -> o3d.t.geometry.RaycastingScene:
+def _renderer(parts: Sequence[tuple[Mesh, int]]) -> Render:
     casting = o3d.t.geometry.RaycastingScene(nthreads=1)
     for (points, faces), _ in parts:
         arrays = points.astype(np.float32), faces.astype(np.uint32)
         casting.add_triangles(*map(o3d.core.Tensor.from_numpy, arrays))
-    return casting
-
-
-def _cast(
-    casting: o3d.t.geometry.RaycastingScene,
-    parts: Sequence[tuple[Mesh, int]],
-    camera: Intrinsics,
-    pose: Float64,
-) -> tuple[Float64, NDArray[np.uint8], Bools]:
-    """Depth (H, W) in metres, `far` where nothing is hit, labels (H, W), and where it is steep."""
-    y, x = np.indices((camera.height, camera.width)) + 0.5
-    ahead = np.full(x.shape, camera.focal_length)
-    rays = np.stack([x - camera.centre_x, y - camera.centre_y, ahead], axis=-1)
-    direction = rays / camera.focal_length @ pose[:3, :3].T
-    both = np.concatenate([np.broadcast_to(pose[:3, 3], direction.shape), direction], axis=-1)
-    hit = casting.cast_rays(o3d.core.Tensor.from_numpy(both.astype(np.float32)), nthreads=1)
-    depth = np.minimum(hit["t_hit"].numpy().astype(np.float64), camera.far)
     labels = np.array([label for _, label in parts] + [OTHER])
-    which = np.minimum(hit["geometry_ids"].numpy().astype(np.int64), len(parts))
-    label = labels[which]
-    steep = np.abs(hit["primitive_normals"].numpy()[..., 2]) < LEVEL
-    label[(label == SUPPORT) & steep] = OTHER
-    return depth, label.astype(np.uint8), steep
+
+    def render(camera: Intrinsics, pose: Float64) -> tuple[Float64, NDArray[np.uint8], Bools]:
+        y, x = np.indices((camera.height, camera.width)) + 0.5
+        ahead = np.full(x.shape, camera.focal_length)
+        rays = np.stack([x - camera.centre_x, y - camera.centre_y, ahead], axis=-1)
+        direction = rays / camera.focal_length @ pose[:3, :3].T
+        both = np.concatenate([np.broadcast_to(pose[:3, 3], direction.shape), direction], axis=-1)
+        hit = casting.cast_rays(o3d.core.Tensor.from_numpy(both.astype(np.float32)), nthreads=1)
+        depth = np.minimum(hit["t_hit"].numpy().astype(np.float64), camera.far)
+        label = labels[np.minimum(hit["geometry_ids"].numpy().astype(np.int64), len(parts))]
+        steep = np.abs(hit["primitive_normals"].numpy()[..., 2]) < LEVEL
+        label[(label == SUPPORT) & steep] = OTHER
+        return depth, label.astype(np.uint8), steep
+
+    return render
 
 
 def _faults(
@@ -181,7 +178,7 @@ def _faults(
     glass = numbers[rng.random(len(numbers)) < 0.03]
     if len(glass):
         rest = [part for part in scene.parts if part[1] not in glass]
-        behind, behind_label, _ = _cast(_casting(rest), rest, camera, pose)
+        behind, behind_label, _ = _renderer(rest)(camera, pose)
         through = np.isin(label, glass) & (_blobs(rng, depth.shape) < rng.uniform(0.2, 1.0))
         depth, label = np.where(through, behind, depth), np.where(through, behind_label, label)
     if rng.random() < 0.12:
