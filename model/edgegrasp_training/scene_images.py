@@ -34,7 +34,6 @@ from edgegrasp_training.scene_layouts import (
     SceneMeshes,
     draw_scene,
     merged,
-    open3d_mesh,
     pool_mesh,
     simplified,
 )
@@ -233,18 +232,19 @@ def make_pool(rng: np.random.Generator, objects: Sequence[Path]) -> list[PoolMes
 
 def _softened(rng: np.random.Generator, mesh: Mesh) -> Mesh:
     """A mesh bent by waves in random directions, most of them longer than half of the object."""
-    surface = open3d_mesh(mesh)
-    while len(surface.triangles) < 1000:
-        surface = surface.subdivide_midpoint()
-    points = np.asarray(surface.vertices).copy()
+    import trimesh
+
+    points, triangles = mesh
+    while len(triangles) < 1000:
+        points, triangles = trimesh.remesh.subdivide(points, triangles)  # type: ignore[no-untyped-call]
     longest = np.ptp(points, axis=0).max()
     for _ in range(8):
         length = longest * np.exp(rng.uniform(-1.8, 0.4))
         direction, shift = rng.normal(size=(2, 3))
         direction *= 2 * np.pi / length / np.linalg.norm(direction)
         shift *= rng.uniform(0.0, 0.06) * length
-        points += shift * np.sin(points @ direction + rng.uniform(0, 2 * np.pi))[:, None]
-    return points, np.asarray(surface.triangles).astype(np.int64)
+        points = points + shift * np.sin(points @ direction + rng.uniform(0, 2 * np.pi))[:, None]
+    return points, triangles
 
 
 def make_arms(rng: np.random.Generator) -> list[Mesh]:

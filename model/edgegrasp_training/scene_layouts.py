@@ -464,15 +464,10 @@ def simplified(mesh: Mesh, triangles: int) -> Mesh:
     """A mesh of at most so many triangles: many times faster to cast rays at."""
     if len(mesh[1]) <= triangles:
         return mesh
-    surface = open3d_mesh(mesh).simplify_quadric_decimation(triangles)
+    rows = o3d.utility.Vector3iVector(mesh[1].astype(np.int32))
+    surface = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(mesh[0]), rows)
+    surface = surface.simplify_quadric_decimation(triangles)
     return np.asarray(surface.vertices).copy(), np.asarray(surface.triangles).astype(np.int64)
-
-
-def open3d_mesh(mesh: Mesh) -> o3d.geometry.TriangleMesh:
-    """A mesh as Open3D's."""
-    return o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(mesh[0]), o3d.utility.Vector3iVector(mesh[1].astype(np.int32))
-    )
 
 
 class HeightMap:
