@@ -412,6 +412,8 @@ def random_gripper(rng: np.random.Generator) -> dict[str, Any]:
     if rng.random() < 0.4:  # fingers swing on links, here their length and outward part
         radius = rng.uniform(0.05, 0.11)
         swing = {"radius": radius, "reach": min(rng.uniform(0.3, 0.5) * opening, 0.75 * radius)}
+    pad_box = [[-half_width, 0.0, pad], [half_width, thick, tip]]
+    root_box = [[-half_width, 0.002, palm - 0.005], [half_width, thick + root, pad]]
     return {
         "name": "random",
         "max_opening": opening,
@@ -419,11 +421,6 @@ def random_gripper(rng: np.random.Generator) -> dict[str, Any]:
         "contact_z": contact,
         "tcp_z": contact,
         "hand": {"boxes": [[[-body, -side, 0.0], [body, side, palm]]]},
-        "finger": {
-            "boxes": [
-                [[-half_width, 0.0, pad], [half_width, thick, tip]],
-                [[-half_width, 0.002, palm - 0.005], [half_width, thick + root, pad]],
-            ]
-        },
+        "finger": {"boxes": [pad_box, root_box]},
         "swing": swing,
     }
