@@ -108,11 +108,8 @@ def train(
     print(f"{len(views)} training and {len(validation)} validation views")
     with Progress() as progress:
         task = progress.add_task("steps", total=asked.steps, completed=trainer.step)
-
-        def on_step(step: int, loss: float) -> None:
+        for step, loss in trainer.run(asked.until):
             progress.update(task, completed=step, description=f"loss {loss:.3f}")
-
-        trainer.run(on_step, asked.until)
     if trainer.finished:
         provenance = {"data": [folder.name for folder in data], "date": time.strftime("%Y-%m-%d")}
         evaluation = trainer.finish(provenance, shlex.join(["edgegrasp", *sys.argv[1:]]))

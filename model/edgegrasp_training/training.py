@@ -3,7 +3,7 @@
 import csv
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import replace
 from functools import lru_cache
@@ -95,14 +95,14 @@ class Trainer:
         """Whether all steps are done."""
         return self.step >= self.options.steps
 
-    def run(self, progress: Callable[[int, float], None], until: int | None = None) -> None:
-        """Train until finished, or up to a step; `progress` gets each step's number and loss."""
+    def run(self, until: int | None = None) -> Iterator[tuple[int, float]]:
+        """Train until finished, or up to a step; yields each step's number and loss."""
         while not self.finished and (until is None or self.step < until):
             start = time.perf_counter()
             loss = self._train_step()
             self.seconds += time.perf_counter() - start
             self.step += 1
-            progress(self.step, loss)
+            yield self.step, loss
             if self.step % self.options.evaluate_every == 0 or self.step == self.options.steps:
                 evaluation = self.evaluate(balls_per_view=8)
                 if evaluation.loss < self.best_loss:

@@ -47,10 +47,6 @@ def make_trainer(views: list[Path]) -> Callable[..., Trainer]:
     return make
 
 
-def ignore(step: int, loss: float) -> None:
-    """Where progress is not looked at."""
-
-
 def same_weights(one: Trainer, other: Trainer) -> bool:
     state = other.network.state_dict()
     return all(torch.equal(value, state[name]) for name, value in one.network.state_dict().items())
@@ -59,7 +55,7 @@ def same_weights(one: Trainer, other: Trainer) -> bool:
 def test_loss_falls_and_the_best_network_is_kept_with_a_card(make_trainer, tmp_path) -> None:
     run = make_trainer(tmp_path)
     before = run.evaluate()
-    run.run(ignore)
+    list(run.run())
     assert run.finished
     after = run.finish({"data": ["made up"]}, "edgegrasp train data")
     assert after.loss < 0.8 * before.loss
@@ -81,7 +77,7 @@ def test_loss_falls_in_a_few_steps_on_the_views_that_come_with_the_project(tmp_p
     options = TrainingOptions(evaluate_every=1000)
     run = Trainer(metadata, train, validation, tmp_path, options)
     before = run.evaluate()
-    run.run(ignore, until=20)
+    list(run.run(until=20))
     after = run.evaluate()
     assert after.loss < 0.9 * before.loss
     assert after.auroc > 0.7
@@ -90,38 +86,38 @@ def test_loss_falls_in_a_few_steps_on_the_views_that_come_with_the_project(tmp_p
 @pytest.mark.parametrize("network", ["balls", "hands"])
 def test_pausing_and_resuming_is_the_same_as_going_through(make_trainer, tmp_path, network) -> None:
     through = make_trainer(tmp_path / "through", network)
-    through.run(ignore, until=14)
-    make_trainer(tmp_path / "paused", network).run(ignore, until=9)
+    list(through.run(until=14))
+    list(make_trainer(tmp_path / "paused", network).run(until=9))
     resumed = make_trainer(tmp_path / "paused", network)
     assert resumed.step == 9
-    resumed.run(ignore, until=14)
+    list(resumed.run(until=14))
     assert resumed.step == through.step == 14
     assert same_weights(through, resumed)
     with pytest.raises(ValueError, match=r"was begun with another seed\."):
         make_trainer(tmp_path / "paused", network, seed=1)
     other = make_trainer(tmp_path / "other", network, seed=1)
-    other.run(ignore, until=3)
+    list(other.run(until=3))
     assert not same_weights(through, other)
 
 
 @pytest.mark.parametrize("network", ["balls", "hands"])
 def test_a_run_may_start_where_another_ended(make_trainer, tmp_path, network) -> None:
     first = make_trainer(tmp_path / "first", network, steps=4)
-    first.run(ignore)
+    list(first.run())
     start = tmp_path / "first" / "tiny.safetensors"
     on = make_trainer(tmp_path / "on", network, start=start, steps=4)
     np.testing.assert_allclose(on.evaluate().logit, first.evaluate().logit, atol=1e-5)
-    on.run(ignore)
+    list(on.run())
     assert not same_weights(first, on)
     on.finish({}, "edgegrasp train data")
     _, metadata = load_checkpoint(tmp_path / "on" / "tiny.safetensors")
     assert metadata.training["started_from"] == "tiny"
     assert metadata.training["started_from_digest"] == load_checkpoint(start)[1].digest
     half = make_trainer(tmp_path / "half", network, start=start, steps=4, keep=0.5)
-    half.run(ignore)
+    list(half.run())
     np.testing.assert_array_equal(*(half.finish({}, "").logit for _ in range(2)))
     kept = make_trainer(tmp_path / "kept", network, start=start, steps=4, keep=1.0)
-    kept.run(ignore)
+    list(kept.run())
     logit = kept.finish({}, "edgegrasp train data").logit  # all of the old weights is kept
     np.testing.assert_allclose(logit, first.evaluate().logit, atol=1e-4)
 
@@ -131,7 +127,7 @@ def teacher(make_trainer, tmp_path_factory: pytest.TempPathFactory) -> Teacher:
     """A hand network that learned which grasps of the made-up views hold."""
     folder = tmp_path_factory.mktemp("guide")
     trainer = make_trainer(folder, name="guide")
-    trainer.run(ignore)
+    list(trainer.run())
     trainer.finish({}, "")
     return Teacher(folder / "guide.safetensors", 0.04)
 
@@ -152,7 +148,7 @@ def test_loss_falls_with_a_teacher_who_is_named_in_card_and_checkpoint(
 ) -> None:
     run = make_trainer(tmp_path, "balls", teacher=teacher)
     before = run.evaluate()
-    run.run(ignore)
+    list(run.run())
     after = run.finish({}, "edgegrasp train data --teacher guide.safetensors")
     assert after.loss < 0.9 * before.loss
     _, metadata = load_checkpoint(tmp_path / "tiny.safetensors")
@@ -172,12 +168,12 @@ def test_a_teacher_alone_labels_views_in_which_no_grasp_was_tried(
         replace(made_up_view(number), **none).save(tmp_path / f"packed_{number}_0.npz")
     run = make_trainer(tmp_path / "run", "balls", teacher=teacher, views=find_views([tmp_path]))
     before = run.evaluate()
-    run.run(ignore)
+    list(run.run())
     assert run.evaluate().loss < 0.95 * before.loss
 
 
 def test_hands_go_on_with_hands_alone_and_teach_balls_alone(make_trainer, teacher, tmp_path):
-    make_trainer(tmp_path / "balls", "balls", steps=1).run(ignore)
+    list(make_trainer(tmp_path / "balls", "balls", steps=1).run())
     balls = tmp_path / "balls" / "tiny.safetensors"
     with pytest.raises(ValueError, match="same model"):
         make_trainer(tmp_path / "on", "hands", start=balls)
