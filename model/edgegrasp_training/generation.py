@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import Sample, Sampler
-from edgegrasp_model.detector import GraspDetector, Prepared
+from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector, Prepared
 from edgegrasp_model.gripper import gripper_fields
 from edgegrasp_model.options import DetectOptions, SupportPlane
 from edgegrasp_model.ranking import average_similar_hands
@@ -30,7 +30,6 @@ from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
 from edgegrasp_sim.workers import run_tasks
 from edgegrasp_training.options import GenerationOptions
-from edgegrasp_training.recipes import build_network, recipe
 from edgegrasp_training.shapes import household_objects, varied_objects
 from edgegrasp_training.views import TABLE as TABLE_PLANE
 from edgegrasp_training.views import LabelledView, load_view
@@ -77,7 +76,8 @@ FREE_SHARE = 0.75  # of the grasps chosen at random, those that are collision-fr
 LIKELY, LIKELY_SHARE = 1 / 3, 0.7  # best part of an object's grasps, most of which are tried there
 
 Query = tuple[Observation, DetectOptions]  # a view of a scene, and a request for grasps in it
-detector = lru_cache(maxsize=1)(GraspDetector.load)  # loads weights once in a process
+detector = lru_cache(maxsize=2)(GraspDetector.load)  # loads weights once in a process
+USUAL = WEIGHTS_FOLDER / "edgegrasp-plus.safetensors"  # prepares views without a guide
 
 
 def generate(
@@ -335,7 +335,7 @@ def choose_grasps(
     observation, request = query
     if len(observation.cloud) < (request.num_approach_points or 1):
         return None
-    prepared = (guide or untrained()).prepare(observation.cloud, request)
+    prepared = (guide or detector(USUAL)).prepare(observation.cloud, request)
     scene = prepared.scene
     if scene is None or not scene.approach_allowed.any():
         return None
@@ -351,13 +351,6 @@ def choose_grasps(
         rows = _likely(number, sample.logits, rating, options.grasps_per_view, rng)
         best = int(np.searchsorted(rows, rating.argmax()))
     return prepared, scene, sample.candidates.take(rows), best
-
-
-@lru_cache(maxsize=1)
-def untrained() -> GraspDetector:
-    """The detector that prepares views without a guide; its network is not asked."""
-    metadata = recipe("edgegrasp-plus")
-    return GraspDetector(build_network(metadata.network), metadata)
 
 
 def _any(sample: Sample, total: int, rng: np.random.Generator) -> Int64:
