@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from edgegrasp_model.errors import InvalidCheckpoint
-from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
+from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.edgegrasp import GRASP_WIDTH
 from edgegrasp_training.recipes import RECIPES, build_network
 
@@ -77,7 +77,12 @@ def import_checkpoint(directory: Path) -> tuple[nn.Module, CheckpointMetadata]:
     }
     network = build_network(config)
     try:
-        ours = _renamed(theirs, _VN_PARTS) if is_vn else _edgegrasp_weights(theirs, config)
+        ours = _renamed(theirs, _VN_PARTS if is_vn else _EDGEGRASP_PARTS)
+        if "join.weight" in ours:
+            # Theirs reads point, normal, f3, ball, depth, approach; ours f3 and ball at the end.
+            sizes = [6, config.conv_widths[-1] + config.global_widths_2[-1], GRASP_WIDTH - 6]
+            first, features, last = torch.split(ours["join.weight"], sizes, dim=1)
+            ours["join.weight"] = torch.cat((first, last, features), dim=1)
         network.load_state_dict(ours)
     except RuntimeError as error:
         raise InvalidCheckpoint(
@@ -109,14 +114,4 @@ def _renamed(theirs: dict[str, Tensor], parts: dict[str, str]) -> dict[str, Tens
         for pattern, replacement in parts.items():
             name = re.sub(rf"^{pattern}(?=\.\w+$)", replacement, name)
         ours[name] = weight
-    return ours
-
-
-def _edgegrasp_weights(theirs: dict[str, Tensor], config: NetworkConfig) -> dict[str, Tensor]:
-    ours = _renamed(theirs, _EDGEGRASP_PARTS)
-    if "join.weight" in ours:
-        # Theirs reads [p, n, f3, ball, depth, approach]; ours [p, n, depth, approach, f3, ball].
-        features = config.conv_widths[-1] + config.global_widths_2[-1]
-        parts = torch.split(ours["join.weight"], [6, features, GRASP_WIDTH - 6], dim=1)
-        ours["join.weight"] = torch.cat((parts[0], parts[2], parts[1]), dim=1)
     return ours
