@@ -1,4 +1,4 @@
-"""Household objects of random shape and size, as convex parts: cans to scissors, numpy alone.
+"""Household objects of random shape and size, as convex parts: cans to scissors.
 
 The union of an object's parts is its visible surface, and each part is its own collision hull, so
 that a bowl or a ring is as hollow for a finger as it is for a camera.
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float64
+from edgegrasp_model.scene.cloud import unit
 from edgegrasp_sim.engine.urdf import Surface, convex_hull
 
 Numbers = Float64 | list[float]
@@ -332,13 +333,11 @@ def _walls(x: float, y: float, z: float, thick: float) -> list[Part]:
 
 def _rod(start: Float64, end: Float64, first: float, last: float = 0.0) -> Part:
     """A round rod from one point to another, with the radius at each; without a last the same."""
-    along = end - start
-    length = float(np.linalg.norm(along))
-    z = along / length
-    x = np.cross(z, (0.0, 0.0, 1.0) if abs(z[2]) < 0.9 else (1.0, 0.0, 0.0))
-    x /= np.linalg.norm(x)
+    z = unit(end - start)
+    x = unit(np.cross(z, (0.0, 0.0, 1.0) if abs(z[2]) < 0.9 else (1.0, 0.0, 0.0)))
     frame = np.stack([x, np.cross(z, x), z], axis=1)
-    rod = lofted(oval(1.0, COARSE), [first, last or first], [0.0, length])
+    ends = [0.0, float(np.linalg.norm(end - start))]
+    rod = lofted(oval(1.0, COARSE), [first, last or first], ends)
     return _placed([rod], frame, start)[0]
 
 
@@ -351,10 +350,8 @@ def _wedges(section: Float64, angles: Float64) -> list[Part]:
 def _shell(radii: Numbers, heights: Numbers, wall: float, floor: float) -> list[Part]:
     """A vessel: its outer profile from the foot up, the thickness of its wall and its floor."""
     outside = np.stack([radii, heights], axis=1)
-    way = np.diff(outside, axis=0)
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
-    way = np.concatenate([way[:1], way[1:] + way[:-1], way[-1:]])
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    way = unit(np.diff(outside, axis=0))
+    way = unit(np.concatenate([way[:1], way[1:] + way[:-1], way[-1:]]))
     inside = outside + wall * np.stack([-way[:, 1], way[:, 0]], axis=1)
     angles = 2 * np.pi * (np.arange(COARSE + 1) + 0.5) / COARSE
     parts = [lofted(oval(1.0, COARSE), [outside[0, 0]] * 2, [0.0, floor])]

@@ -551,9 +551,8 @@ def _turned(rng: np.random.Generator, drawn: PoolMesh, how: str) -> PoolMesh:
     elif how == "lying":
         try:
             hull = ConvexHull(samples * factor)
-            size = 0.5 * np.linalg.norm(
-                np.cross(*np.diff(hull.points[hull.simplices], axis=1).transpose(1, 0, 2)), axis=1
-            )
+            sides = np.diff(hull.points[hull.simplices], axis=1).transpose(1, 0, 2)
+            size = np.linalg.norm(np.cross(*sides), axis=1)
             down = hull.equations[int(rng.choice(len(size), p=size / size.sum())), :3]
             to_down, _ = Rotation.align_vectors([[0, 0, -1]], [down])
             turn = turn @ to_down.as_matrix()
