@@ -4,8 +4,6 @@ The union of an object's parts is its visible surface, and each part is its own 
 that a bowl or a ring is as hollow for a finger as it is for a camera.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
@@ -28,13 +26,13 @@ def household_mesh(rng: Random) -> tuple[str, list[Surface]]:
 
     They stand on z = 0 about the z axis.
     """
-    family, make = list(FAMILIES.items())[int(rng.integers(len(FAMILIES)))]
+    make = FAMILIES[int(rng.integers(len(FAMILIES)))]
     parts = [part.reshape(-1, 3) for part in make(rng)]
     points = np.concatenate(parts)
     low, high = points.min(axis=0), points.max(axis=0)
     origin = np.array([*(low + high)[:2] / 2, low[2]])
     hulls = [convex_hull(part - origin) for part in parts]
-    return family, [hull for hull in hulls if hull is not None]
+    return make.__name__[1:], [hull for hull in hulls if hull is not None]
 
 
 def _can(rng: Random) -> list[Part]:
@@ -274,13 +272,10 @@ def _frame(rng: Random) -> list[Part]:
     return _walls(x, y, thick, bar)
 
 
-FAMILIES: dict[str, Callable[[Random], list[Part]]] = {
-    make.__name__[1:]: make
-    for make in (
-        *(_can, _bottle, _jar, _bowl, _cup, _plate, _glass, _carton, _tray, _book, _torch),
-        *(_hammer, _screwdriver, _spanner, _scissors, _clamp, _pen, _fruit, _bag, _ring, _frame),
-    )
-}
+FAMILIES = (
+    *(_can, _bottle, _jar, _bowl, _cup, _plate, _glass, _carton, _tray, _book, _torch),
+    *(_hammer, _screwdriver, _spanner, _scissors, _clamp, _pen, _fruit, _bag, _ring, _frame),
+)
 
 
 def oval(sharp: float = 1.0, corners: int = FINE) -> Float64:

@@ -9,6 +9,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from edgegrasp_camera.arrays import Float64
 from edgegrasp_sim.engine.urdf import Surface
@@ -60,9 +61,9 @@ def household_objects(folder: Path, count: int, rng: np.random.Generator) -> Obj
     for number in range(count):
         family, parts = household_mesh(rng)
         name = f"{family}-{number:03d}"
-        corners = [vertices[faces].transpose(1, 0, 2) for vertices, faces in parts]
-        volume = [float((np.cross(a, b) * c).sum() / 6) for a, b, c in corners]
-        centre = np.average([v.mean(0) for v, _ in parts], axis=0, weights=volume)
+        points = [part.points for part in parts]
+        volume = [ConvexHull(each).volume for each in points]
+        centre = np.average([each.mean(0) for each in points], axis=0, weights=volume)
         path = write_parts(name, parts, parts, centre, folder)
         models.append(ObjectModel(name, path))
     return ObjectSet("household", tuple(models))
