@@ -173,10 +173,8 @@ def evaluate(network: SceneNet, images: Sequence[SceneImage]) -> dict[str, float
             said, true = output.classes.argmax(1).numpy(), batch.classes.numpy()
             np.add.at(totals, (true[true >= 0], said[true >= 0]), 1)
     both = np.diag(totals)
-    union = totals.sum(0) + totals.sum(1) - both
-    return losses | {
-        f"iou_{name}": both[k] / union[k] for k, name in enumerate(("other", "support", "object"))
-    }
+    shares = both / (totals.sum(0) + totals.sum(1) - both)
+    return losses | dict(zip(("iou_other", "iou_support", "iou_object"), shares, strict=True))
 
 
 def fit_confidence(network: SceneNet, images: Sequence[SceneImage]) -> list[float]:
