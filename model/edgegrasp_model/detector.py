@@ -28,12 +28,11 @@ from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import Collision, DetectOptions
 from edgegrasp_model.results import NoGrasp, Pace
-from edgegrasp_model.scene.cloud import check_cloud
+from edgegrasp_model.scene.cloud import assumed_viewpoint, check_cloud
 from edgegrasp_model.scene.scene import (
     MAX_VOXELS,
     Scene,
     SelectedPoints,
-    assumed_viewpoint,
     build_scene,
     select_points,
 )

@@ -13,7 +13,7 @@ from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Floats, Int6
 from edgegrasp_camera.clouds import CloudInput as CloudInput
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.kernels import compiled
-from edgegrasp_model.options import Workspace
+from edgegrasp_model.options import DetectOptions, SupportPlane, Workspace
 
 MAX_CLOUD_EXTENT = 20.0  # metres; if most of a cloud is wider, it is probably in millimetres
 MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
@@ -178,6 +178,44 @@ def pose_matrix(turn: Floats, place: ArrayLike) -> Float64:
     return T
 
 
+def assumed_viewpoint(
+    points: Float32, options: DetectOptions, warnings: list[str]
+) -> tuple[float, float, float] | None:
+    """Where the camera is assumed to be that saw points (N, 3), if a request does not say it.
+
+    None: several cameras saw them.
+
+    InvalidRequest: the place is needed to the millimetre.
+    """
+    if seen_from_origin(points, options.up):
+        warnings.append(
+            "viewpoint is not given: the camera is assumed at the origin, as the whole cloud "
+            "lies in front of it; if the camera is elsewhere, send its position."
+        )
+        return 0.0, 0.0, 0.0
+    if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
+        fix = "Send the camera's position: depths are corrected along its rays."
+        raise InvalidRequest("options.viewpoint", "nothing", fix)
+    if options.robot is not None and options.robot.avoid_unseen:
+        fix = "Send the option viewpoint, or depth images with their poses."
+        raise InvalidRequest("options.robot.avoid_unseen", "true, without a camera's position", fix)
+    inside = inside_workspace(points, options.workspace, HAND_REACH)
+    up = UP if options.known_up is None else options.known_up
+    eye = likely_viewpoint(points[inside] if inside.any() else points, up)
+    if eye is None:
+        warnings.append(
+            "viewpoint is not given, and several cameras saw the cloud, as a part of it is hidden "
+            "from everywhere: send their positions, and view_ids."
+        )
+        return None
+    x, y, z = eye.tolist()
+    warnings.append(
+        f"viewpoint is not given: the camera is assumed at ({x:.2f}, {y:.2f}, {z:.2f}), from where "
+        "the least of the cloud is hidden; send its position."
+    )
+    return x, y, z
+
+
 def seen_from_origin(points: Float32, up: ArrayLike | None) -> bool:
     """Whether points (N, 3) look as if seen by a camera at the origin along +z.
 
@@ -246,7 +284,10 @@ def _hidden_share(
     for k in range(len(eyes)):
         nearest, cells = np.full((2 * half, 2 * half), np.inf), distance[k] / 0.011
         for n in range(len(points)):
-            x, y, z = place_in_view(points[n], eyes[k], turn[k])
+            a, b, c = points[n] - eyes[k]
+            x = turn[k, 0, 0] * a + turn[k, 0, 1] * b + turn[k, 0, 2] * c
+            y = turn[k, 1, 0] * a + turn[k, 1, 1] * b + turn[k, 1, 2] * c
+            z = turn[k, 2, 0] * a + turn[k, 2, 1] * b + turn[k, 2, 2] * c
             cell[n, 0], cell[n, 1], away[n] = -1, -1, np.sqrt(x * x + y * y + z * z)
             if z < 0.05:  # behind the camera
                 share[k] += 1.0
@@ -263,17 +304,6 @@ def _hidden_share(
                         first = max(first, nearest[a, b]) if nearest[a, b] < np.inf else first
                 share[k] += min(max((away[n] - first - 0.015) / 0.03, 0.0), 1.0)
     return share / len(points)
-
-
-@compiled("contract")
-def place_in_view(point: Floats, viewpoint: Float64, turn: Float64) -> tuple[float, float, float]:
-    """A point (3,) in the camera's frame."""
-    a, b, c = point[0] - viewpoint[0], point[1] - viewpoint[1], point[2] - viewpoint[2]
-    return (
-        turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c,
-        turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c,
-        turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c,
-    )
 
 
 def usual_up(forward: Float64) -> Float64:

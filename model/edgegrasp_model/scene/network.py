@@ -21,7 +21,6 @@ from edgegrasp_model.scene.cloud import (
     LARGE_IMAGE,
     MAX_VIEW_TANGENT,
     OUTLIER_PERCENT,
-    place_in_view,
     subsample,
     unit,
     usual_up,
@@ -230,7 +229,7 @@ def _render(
     pixel = np.full(len(points), -1, dtype=np.int32)
     depth, off = np.empty((2, len(points)), dtype=np.float32)
     for n in range(len(points)):
-        x, y, z = place_in_view(points[n], viewpoint, turn)
+        x, y, z = _in_view(points[n], viewpoint, turn)
         if z < NEAREST_DEPTH:
             continue
         u = (x / z - corner[0]) / pixel_size
@@ -245,7 +244,7 @@ def _render(
         p = pixel[n]
         if p >= 0 and depth[n] < nearest[p] + SURFACE_DEPTH and off[n] < best[p]:
             best[p] = off[n]
-            pixels[p, 0], pixels[p, 1], pixels[p, 2] = place_in_view(points[n], viewpoint, turn)
+            pixels[p, 0], pixels[p, 1], pixels[p, 2] = _in_view(points[n], viewpoint, turn)
     return pixels.reshape(height, width, 3)
 
 
@@ -329,3 +328,14 @@ def _fill_features(points: Float32, up: Float64, known: bool, offset: float, out
                 out[i, j, 5], out[i, j, 6], out[i, j, 7] = nx / length, ny / length, nz / length
                 if known:
                     out[i, j, 9] = (up[0] * nx + up[1] * ny + up[2] * nz) / length
+
+
+@compiled("contract")
+def _in_view(point: Float32, viewpoint: Float64, turn: Float64) -> tuple[float, float, float]:
+    """A point (3,) in the camera's frame."""
+    a, b, c = point[0] - viewpoint[0], point[1] - viewpoint[1], point[2] - viewpoint[2]
+    return (
+        turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c,
+        turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c,
+        turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c,
+    )

@@ -39,8 +39,6 @@ from edgegrasp_model.scene.cloud import (
     Voxels,
     clean_cloud,
     inside_workspace,
-    likely_viewpoint,
-    seen_from_origin,
     unit,
     voxelise,
 )
@@ -311,49 +309,11 @@ def near_workspace_side(
     return np.asarray((at_low | at_high).any(axis=1))
 
 
-def assumed_viewpoint(
-    points: Float32, options: DetectOptions, warnings: list[str]
-) -> tuple[float, float, float] | None:
-    """Where the camera is assumed to be that saw points (N, 3), if a request does not say it.
-
-    None: several cameras saw them.
-
-    InvalidRequest: the place is needed to the millimetre.
-    """
-    if seen_from_origin(points, options.up):
-        warnings.append(
-            "viewpoint is not given: the camera is assumed at the origin, as the whole cloud "
-            "lies in front of it; if the camera is elsewhere, send its position."
-        )
-        return 0.0, 0.0, 0.0
-    if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
-        fix = "Send the camera's position: depths are corrected along its rays."
-        raise InvalidRequest("options.viewpoint", "nothing", fix)
-    if options.robot is not None and options.robot.avoid_unseen:
-        fix = "Send the option viewpoint, or depth images with their poses."
-        raise InvalidRequest("options.robot.avoid_unseen", "true, without a camera's position", fix)
-    inside = inside_workspace(points, options.workspace, HAND_REACH)
-    up = UP if options.known_up is None else options.known_up
-    eye = likely_viewpoint(points[inside] if inside.any() else points, up)
-    if eye is None:
-        warnings.append(
-            "viewpoint is not given, and several cameras saw the cloud, as a part of it is hidden "
-            "from everywhere: send their positions, and view_ids."
-        )
-        return None
-    x, y, z = eye.tolist()
-    warnings.append(
-        f"viewpoint is not given: the camera is assumed at ({x:.2f}, {y:.2f}, {z:.2f}), from where "
-        "the least of the cloud is hidden; send its position."
-    )
-    return x, y, z
-
-
 def camera_positions(sent: CheckedCloud, options: DetectOptions) -> Float64:
     """The camera positions (W, 3) of the request, or a place above the cloud."""
     if options.viewpoint is None:
         up = np.array([0.0, 0.0, 1.0]) if options.known_up is None else options.known_up
-        return (np.median(sent.points, axis=0) + USUAL_DISTANCE * up)[None]
+        return (np.median(sent.points, axis=0) + 2.5 * USUAL_DISTANCE * up)[None]
     viewpoints = np.asarray(options.viewpoint, dtype=np.float64).reshape(-1, 3)
     if len(viewpoints) == 1:
         return viewpoints
