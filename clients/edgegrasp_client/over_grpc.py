@@ -15,7 +15,7 @@ from edgegrasp_camera.arrays import Array
 from edgegrasp_client import errors
 from edgegrasp_client.connection import Tls, token_metadata
 from edgegrasp_client.errors import GraspClientError, error_of_kind, invalid
-from edgegrasp_client.requests import Request, cloud_file, float32_points
+from edgegrasp_client.requests import Request, cloud_file
 from edgegrasp_client.results import Answer, Model, StreamAnswer, field_of, read_as
 from edgegrasp_results import Detection
 
@@ -155,11 +155,8 @@ def message_of(request: Request) -> Any:
     fields: dict[str, Any] = {"options": request.options, "depth_images": request.depth_images}
     for name, array in request.arrays.items():
         fields[name] = array if name in ("edges", "hand_poses") else _packed(array)
-    if (cloud := request.cloud) is not None:
-        if (points := float32_points(cloud)) is not None:
-            fields["points"] = _packed(points)
-        else:
-            fields["encoded"] = dict(zip(("format", "data"), cloud_file(cloud), strict=True))
+    if request.cloud is not None:
+        fields["encoded"] = dict(zip(("format", "data"), cloud_file(request.cloud), strict=True))
     kind = grasp_pb2.ScoreGraspsRequest if request.scores else grasp_pb2.DetectGraspsRequest
     message = kind()
     fill(message, fields)

@@ -191,28 +191,21 @@ def object_in_scene(
 # The forms of the wire
 
 
-def float32_points(cloud: Cloud) -> Float32 | None:
-    """The cloud as (N, 3) float32 if it is an array of N points, else None."""
-    if not isinstance(cloud, np.ndarray) or cloud.shape[1:] != (3,):
-        return None
-    if cloud.dtype not in (np.float32, np.float64):
-        return None
-    with np.errstate(over="ignore"):  # the server refuses infinity
-        return np.ascontiguousarray(cloud, dtype=np.float32)
-
-
 def cloud_file(cloud: Cloud) -> tuple[str, bytes]:
     """The cloud as a file, its format first, which is one of FILE_FORMATS.
 
-    An array of a wrong shape is sent as it is, and the server refuses it.
+    Points (N, 3) become float32. An array of a wrong shape is sent as it is, and the server refuses
+    it.
 
     Raises:
         InvalidRequestError: It is neither an array of numbers nor a readable file of a known
             format.
     """
     if isinstance(cloud, np.ndarray) and not cloud.dtype.hasobject:
-        points = float32_points(cloud)
-        return "npy", npy_bytes(cloud if points is None else points)
+        if cloud.shape[1:] == (3,) and cloud.dtype in (np.float32, np.float64):
+            with np.errstate(over="ignore"):  # the server refuses infinity
+                cloud = np.ascontiguousarray(cloud, dtype=np.float32)
+        return "npy", npy_bytes(cloud)
     if not isinstance(cloud, str | PathLike):
         kind = f"a {type(cloud).__name__}"
         value = f"dtype {cloud.dtype}" if isinstance(cloud, np.ndarray) else kind
