@@ -3,9 +3,8 @@
 import hashlib
 import re
 import ssl
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import grpc
 
@@ -21,13 +20,11 @@ ADMIN_FIX = "Send an admin token; where the server has none, send its process SI
 _TOKEN = re.compile(r"[A-Za-z0-9._~+/-]{16,512}=*")
 
 
-@dataclass(frozen=True)
-class Token:
-    """A token that the server knows."""
+class Token(NamedTuple):
+    """What is known of a token."""
 
     name: str  # for logs: "NAME:" before a token in its file, else where it was read
-    digest: bytes  # SHA-256; the token itself is not kept
-    is_admin: bool = False  # also permits reloading weights
+    is_admin: bool  # whether it also permits reloading weights
 
 
 class Tokens:
@@ -37,10 +34,8 @@ class Tokens:
     """
 
     def __init__(self, settings: Settings) -> None:
-        known = _read_tokens("token_file", settings.token_file)
-        known += _read_tokens("admin_token_file", settings.admin_token_file)
-        # Looked up by digest, so that timing reveals nothing about a token.
-        self.known = {token.digest: token for token in known}
+        self.known = _read_tokens("token_file", settings.token_file)
+        self.known |= _read_tokens("admin_token_file", settings.admin_token_file)
         self.required = settings.token_file is not None  # by requests
 
     def check(self, authorization: str | None) -> Token:
@@ -53,17 +48,17 @@ class Tokens:
         return found
 
 
-def _read_tokens(setting: str, path: Path | None) -> list[Token]:
+def _read_tokens(setting: str, path: Path | None) -> dict[bytes, Token]:
+    """Tokens by their digests: they are not kept, and timing reveals nothing about them."""
     if path is None:
-        return []
+        return {}
     try:
         lines = [line.partition("#")[0].strip() for line in path.read_text().splitlines()]
     except (OSError, UnicodeDecodeError) as error:
         why = f"{setting}: got {str(path)!r}. It cannot be read: {error}."
         raise InvalidSettings(why) from None
-    tokens: list[Token] = []
-    for line in filter(None, lines):
-        number = len(tokens) + 1
+    tokens: dict[bytes, Token] = {}
+    for number, line in enumerate(filter(None, lines), start=1):
         name, _, text = line.rpartition(":")
         if not _TOKEN.fullmatch(text):
             raise InvalidSettings(
@@ -71,7 +66,7 @@ def _read_tokens(setting: str, path: Path | None) -> list[Token]:
                 "A-Z a-z 0-9 - . _ ~ + /, such as `openssl rand -hex 32` prints."
             )
         is_admin = setting.startswith("admin")
-        tokens.append(Token(name or f"{setting} {number}", _digest(text), is_admin))
+        tokens[_digest(text)] = Token(name or f"{setting} {number}", is_admin)
     if not tokens:
         raise InvalidSettings(f"{setting}: got {str(path)!r}. It has no token; write one per line.")
     return tokens
