@@ -99,7 +99,7 @@ class RestTransport:
         try:
             body = response.json()
             if not response.is_success:
-                raise _described(body, response)
+                raise _described(body)
             return read(body)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise _foreign(response) from error
@@ -163,14 +163,11 @@ def _base64(value: object) -> str:
     raise TypeError(f"a {type(value).__name__} is not a JSON value")
 
 
-def _described(problem: Mapping[str, Any], response: httpx.Response) -> GraspClientError:
-    """The exception for an error reported by the server."""
-    kind = str(problem.get("type", ""))
-    if not kind.startswith(KIND_PREFIX):
-        return _foreign(response)
-    said = (str(problem.get(name, "")) for name in ("detail", "field", "value", "fix"))
-    after = problem.get("retry_after")
-    return error_of_kind(kind.removeprefix(KIND_PREFIX), *said, retry_after=after)
+def _described(problem: Mapping[str, Any]) -> GraspClientError:
+    """The exception for a server's problem document; raises KeyError for another one's."""
+    said = (problem[name] for name in ("detail", "field", "value", "fix"))
+    kind = problem["type"].removeprefix(KIND_PREFIX)
+    return error_of_kind(kind, *said, retry_after=problem["retry_after"])
 
 
 def _foreign(response: httpx.Response) -> GraspClientError:
