@@ -9,14 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from edgegrasp_camera.files import sent_cloud
+from edgegrasp_camera.depth import Intrinsics, metres, unproject
+from edgegrasp_camera.files import pixels
 from edgegrasp_model.detector import ModelCatalogue
 from edgegrasp_model.options import DetectOptions
 
 SAMPLE = Path(__file__).with_name("sample") / "depth.png"
-IMAGE = {"depth": SAMPLE, "intrinsics": (540.0, 540.0, 320.0, 239.0)}
+CAMERA = Intrinsics(fx=540.0, fy=540.0, cx=320.0, cy=239.0)  # pixels
 
-points = np.asarray(sent_cloud(None, [IMAGE]).points)  # (480, 640, 3) metres, NaN for holes
+points = unproject(metres(pixels(SAMPLE)), CAMERA)  # (480, 640, 3) metres, NaN for holes
 options = DetectOptions(viewpoint=(0.0, 0.0, 0.0), top_k=5)
 detection = ModelCatalogue.load().get("").detect(points, options)
 for grasp in detection.grasps:

@@ -11,7 +11,7 @@ import struct
 import sys
 import warnings
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -70,18 +70,6 @@ def pixels(file: Path) -> Array:
         raise UnsupportedMediaType(file.name, repr(file.suffix), "Give a .png or .npy file.")
     read = read_png if kind == ".png" else read_npy
     return read(file.read_bytes(), sys.maxsize, file.name)
-
-
-def sent_cloud(file: Path | None, images: Sequence[Any] | None) -> CloudInput:
-    """The cloud of a request: that of a file, or of depth images whose depths are files."""
-    if file is not None:
-        return read_file(file.suffix[1:].lower(), file.read_bytes(), sys.maxsize)
-    depths, views = [], []
-    for image in images or ():
-        camera = {name: value for name, value in image.items() if name != "depth"}
-        depths.append(pixels(Path(str(image["depth"]))))
-        views.append(DepthView(**camera | {"intrinsics": intrinsics_of(image["intrinsics"])}))
-    return fuse_depth_images(depths, views)
 
 
 @contextmanager

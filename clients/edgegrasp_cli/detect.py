@@ -17,10 +17,11 @@ from rich.console import Console
 from rich.table import Column, Table
 from typer import Argument, Option
 
-from edgegrasp_camera.files import pixels, sent_cloud
+from edgegrasp_camera.clouds import CloudInput
+from edgegrasp_camera.files import pixels
 from edgegrasp_camera.picture import draw_detection
 from edgegrasp_cli.flags import Connection, option_flags, parse_option_flags, takes_flags
-from edgegrasp_model.options import parse_options
+from edgegrasp_model.options import DetectOptions, parse_options
 from edgegrasp_model.request_cloud import File, decode_cloud, value_of_text
 from edgegrasp_results import plain
 
@@ -114,7 +115,8 @@ def detect(
     with waiting, open_client(asked) as client:
         detection = client.detect(file, depth_images=images, colors=colors, **fields)
     if asked.picture is not None:
-        draw_detection(asked.picture, detection, sent_cloud(file, images), fields, colors)
+        sent, _ = decoded(file, {"depth_images": images})
+        draw_detection(asked.picture, detection, sent, fields, colors)
     if asked.trajectory is not None:
         _write_trajectory(asked.trajectory, detection)
     if as_document:
@@ -160,15 +162,7 @@ class OwnDetector:
 
     def detect(self, cloud: Any = None, **asked: Any) -> Any:
         """Find grasps in a cloud, as `GraspClient.detect`; raises also as the detector."""
-        from edgegrasp_client.requests import Request, cloud_file
-
-        request = Request(cloud, asked)
-        fields: dict[str, Any] = {name: array.tobytes() for name, array in request.arrays.items()}
-        if request.cloud is None:
-            fields["depth_images"] = request.depth_images
-        else:
-            fields["cloud"] = File(*cloud_file(request.cloud))
-        sent, parsed = decode_cloud(fields, parse_options(request.options), sys.maxsize)
+        sent, parsed = decoded(cloud, asked)
         detector = self._catalogue.get(parsed.model)
         if parsed.robot is None:
             return detector.detect(sent, parsed)
@@ -194,6 +188,19 @@ class OwnDetector:
 
         device = choose_device(self.device)
         return ModelCatalogue.load(self.weights, "", device, self.grippers)
+
+
+def decoded(cloud: Any, asked: Mapping[str, Any]) -> tuple[CloudInput, DetectOptions]:
+    """The cloud and the options of a request, as a server reads them."""
+    from edgegrasp_client.requests import Request, cloud_file
+
+    request = Request(cloud, asked)
+    fields: dict[str, Any] = {name: array.tobytes() for name, array in request.arrays.items()}
+    if request.cloud is None:
+        fields["depth_images"] = request.depth_images
+    else:
+        fields["cloud"] = File(*cloud_file(request.cloud))
+    return decode_cloud(fields, parse_options(request.options), sys.maxsize)
 
 
 def _check_outputs(asked: DetectFlags, fields: Mapping[str, Any]) -> None:

@@ -16,8 +16,9 @@ from pydantic import Field
 from typer import Option
 
 from edgegrasp_camera import EdgeGraspError
-from edgegrasp_camera.files import pixels, sent_cloud
+from edgegrasp_camera.files import pixels
 from edgegrasp_camera.picture import draw_detection
+from edgegrasp_cli.detect import decoded
 from edgegrasp_cli.flags import Server, takes_flags
 from edgegrasp_model.options import DetectOptions
 
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 MAX_GRASPS = 20  # in one answer: some 5,000 characters
 IDENTITY_POSE = [float(row == column) for row in range(4) for column in range(4)]  # T_base_cloud
-PREGRASP_DISTANCE = 0.05  # metres from the pregrasp to the grasp
 INSTRUCTIONS = (
     "Finds 6-DoF grasps of a parallel-jaw gripper in point clouds and depth images. Lengths are "
     "metres, quaternions xyzw; poses are in the frame of the cloud, that of a depth image in its "
@@ -167,9 +167,10 @@ class _Tools:
             raise ValueError("Give point_cloud_file alone, or depth_file and intrinsics.")
         asked = self._request(options, num_grasps, robot, viewpoint, point_cloud_file, image)
         found = self._client.detect(**asked)
-        sent, pictures = sent_cloud(asked.get("cloud"), asked.get("depth_images")), []
+        sent, _ = decoded(asked.get("cloud"), {"depth_images": asked.get("depth_images")})
         best = found.grasps[0].score if found.grasps else 0.0
         text = f"{len(found.grasps)} grasps, the best {best:.2f}. {' '.join(found.warnings)}"
+        pictures = []
         for from_above in (False, True):
             drawn = io.BytesIO()
             draw_detection(drawn, found, sent, asked, from_above=from_above)
@@ -291,7 +292,7 @@ def _short(found: "Detection") -> str:
             "hand_quaternion_xyzw": _digits(quaternion_from_matrix(grasp.T_cloud_hand[:3, :3]), 4),
             "tcp_position": _digits(grasp.T_cloud_tcp[:3, 3], 4),
             "approach_direction": _digits(grasp.approach_direction, 3),
-            "pregrasp_hand_position": _digits(grasp.pregrasp(PREGRASP_DISTANCE)[:3, 3], 4),
+            "pregrasp_hand_position": _digits(grasp.pregrasp()[:3, 3], 4),
             "width": round(grasp.width, 4),
             "object": grasp.object,
             **({} if grasp.arm is None else {"arm": _short_plan(grasp.arm)}),
