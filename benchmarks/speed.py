@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.measuring import RESULTS, RUNS, interleaved, machine, memory, write_results
+from benchmarks.measuring import RESULTS, interleaved, machine, memory, write_results
 from examples.your_planner import plan
 
 from edgegrasp_client import GraspClient
@@ -211,13 +211,9 @@ def table(results: dict[str, Any]) -> str:
     ]
     head = "simulator", "scene", "labels per second and core", "rounds per minute and core"
     text = (
-        f"Processor time on one thread of an {machine['processor']} with "
-        f"{machine['capability']} ({machine['gflops']:.0f} GFLOP/s in float32), wall-clock "
-        f"time on two; medians of {RUNS} interleaved runs, 32 approach points, at most 2,000 "
-        f"candidates, one view. "
-        f"The server is ready after {server['ready_seconds']:.1f} s and takes "
-        f"{server['rest_mb']:.0f} MB at rest, {server['used_mb']:.0f} MB after ten "
-        f"requests. Times of labels and rounds include scenes and images."
+        f"{machine['processor']} with {machine['capability']}, {machine['gflops']:.0f} GFLOP/s in "
+        f"float32; the server is ready after {server['ready_seconds']:.1f} s and takes "
+        f"{server['rest_mb']:.0f} MB at rest, {server['used_mb']:.0f} MB after ten requests."
     )
     return "\n".join([*lines, "", *views.table(head, rows), "", text])
 
