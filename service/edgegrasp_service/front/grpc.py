@@ -140,12 +140,10 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         return self._handler(handler_call_details.method)
 
     def _handler(self, path: str) -> Any:
-        async def handle(messages: Any, context: Any) -> None:
-            await self._handle(path, context)
-
+        handle = partial(self._handle, path)
         return grpc.stream_stream_rpc_method_handler(handle, response_serializer=_serialized)
 
-    async def _handle(self, path: str, context: Any) -> None:
+    async def _handle(self, path: str, messages: Any, context: Any) -> None:
         metadata = context.invocation_metadata() or ()
         headers = {name: value for name, value in metadata if isinstance(value, str)}
         method, behave = self._behaviours.get(path, ("other", _unimplemented))
