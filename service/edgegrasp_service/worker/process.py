@@ -188,7 +188,7 @@ class WorkerPool:
     @property
     def pids(self) -> list[int]:
         """Process ids of the workers."""
-        return [worker.pid for worker in self._workers]
+        return [worker.ready.pid for worker in self._workers]
 
     async def start(self) -> None:
         """Load weights and start workers; workers of an earlier start finish their request and end.
@@ -271,14 +271,14 @@ class WorkerPool:
                 if answer.facts.deaths:
                     worker.kill()  # it ran out of memory: its state cannot be trusted
             self._workers.discard(worker)  # `take` skips it
-            if await worker.nursery.crashed(worker.pid):
+            if await worker.nursery.crashed(worker.ready.pid):
                 deaths = MAX_DEATHS
         finally:
             error = errors.WorkerLost(LOST) if deaths < MAX_DEATHS else errors.HarmfulRequest()
             worker.finish(Answer(b"", Facts(deaths=deaths), errors.report(error)))
             worker.close()
         if worker.nursery is self._nursery:
-            logger.warning("worker %d died and is replaced", worker.pid)
+            logger.warning("worker %d died and is replaced", worker.ready.pid)
             self._replaced()
             await self._until_done(worker.nursery, lambda: self._replace(worker.nursery))
 
@@ -371,7 +371,6 @@ class _Worker:
 
     def __init__(self, nursery: Nursery) -> None:
         self.nursery = nursery
-        self.pid = 0
         self.ready = Ready(0, [])  # the message that it sent when it had loaded
         self.answer: asyncio.Future[Answer] | None = None  # of the job that it works on
         self._writer: asyncio.StreamWriter | None = None
@@ -384,7 +383,6 @@ class _Worker:
             self.reader, self._writer = await asyncio.open_unix_connection(sock=ours)
             self.nursery.fork(theirs)
         self.ready = await _ready(self.reader)
-        self.pid = self.ready.pid
 
     async def run(self, job: Job, deadline: float) -> Answer:
         """Run a job until a deadline of the event loop's clock; if cancelled, soon kill it.
@@ -416,9 +414,9 @@ class _Worker:
     def kill(self) -> None:
         """Kill the worker."""
         self.killed = True
-        if self.pid:
+        if self.ready.pid:
             with contextlib.suppress(ProcessLookupError):
-                os.kill(self.pid, signal.SIGKILL)
+                os.kill(self.ready.pid, signal.SIGKILL)
 
     def close(self) -> None:
         """Close the connection; the process ends when it is idle."""
