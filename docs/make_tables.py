@@ -20,6 +20,7 @@ BOUNDS = (
     ("maximum", "to "),
     ("exclusiveMaximum", "to under "),
 )
+NAMES = {-(2**31): "-2^31", 2**31: "2^31", 2**63: "2^63", math.pi: "π"}  # of numbers
 
 
 def pages() -> dict[Path, str]:
@@ -111,11 +112,7 @@ def _range(schema: Schema) -> str:
 
 
 def _number(bound: float) -> str:
-    if abs(bound) >= 2**31 and math.log2(abs(bound)).is_integer():
-        return f"{'-' if bound < 0 else ''}2^{int(math.log2(abs(bound)))}"
-    if math.isclose(bound, math.pi):
-        return "π"
-    return str(int(bound)) if float(bound).is_integer() else f"{bound:g}"
+    return NAMES.get(bound, str(int(bound)) if float(bound).is_integer() else f"{bound:g}")
 
 
 if __name__ == "__main__":
