@@ -26,7 +26,7 @@ from edgegrasp.oip import open_inference_pb2 as messages
 from edgegrasp_camera.arrays import Array
 from edgegrasp_cli.flags import Server, takes_flags
 from edgegrasp_client import GraspClient, errors
-from edgegrasp_client.errors import invalid
+from edgegrasp_client.connection import invalid
 from edgegrasp_client.requests import option_of_text, plain_options
 
 PLATFORM = "edgegrasp"

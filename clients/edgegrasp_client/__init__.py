@@ -13,18 +13,7 @@ from edgegrasp_camera.depth import Intrinsics as Intrinsics
 from edgegrasp_client.client import AsyncGraspClient as AsyncGraspClient
 from edgegrasp_client.client import GraspClient as GraspClient
 from edgegrasp_client.connection import Tls as Tls
-from edgegrasp_client.errors import AccessDeniedError as AccessDeniedError
-from edgegrasp_client.errors import DeadlineError as DeadlineError
-from edgegrasp_client.errors import GraspClientError as GraspClientError
-from edgegrasp_client.errors import InvalidRequestError as InvalidRequestError
-from edgegrasp_client.errors import OverloadedError as OverloadedError
-from edgegrasp_client.errors import PayloadTooLargeError as PayloadTooLargeError
-from edgegrasp_client.errors import ProtocolError as ProtocolError
-from edgegrasp_client.errors import ServerFailedError as ServerFailedError
-from edgegrasp_client.errors import ServerUnavailableError as ServerUnavailableError
-from edgegrasp_client.errors import StartCollisionError as StartCollisionError
-from edgegrasp_client.errors import UnknownModelError as UnknownModelError
-from edgegrasp_client.errors import WorkerLostError as WorkerLostError
+from edgegrasp_client.errors import *  # noqa: F403
 from edgegrasp_client.options import *  # noqa: F403  # the names of its `__all__`
 from edgegrasp_client.requests import DepthImage as DepthImage
 from edgegrasp_client.requests import RequestFields as RequestFields

@@ -23,8 +23,8 @@ from typing_extensions import Unpack
 
 from edgegrasp_camera.arrays import Array
 from edgegrasp_client import errors
-from edgegrasp_client.connection import RETRIES, Tls, is_rest, retry_delay, seconds_of
-from edgegrasp_client.errors import GraspClientError, invalid
+from edgegrasp_client.connection import RETRIES, Tls, invalid, is_rest, retry_delay, seconds_of
+from edgegrasp_client.errors import GraspClientError
 from edgegrasp_client.over_grpc import GrpcTransport
 from edgegrasp_client.over_rest import RestTransport
 from edgegrasp_client.requests import Cloud, Request, RequestFields, StreamRequest

@@ -1,4 +1,4 @@
-"""Addresses, TLS, tokens and retries of a client; and a local server."""
+"""Addresses, TLS, tokens, retries and refusals of a client; and a local server."""
 
 import math
 import random
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from edgegrasp_client.errors import OverloadedError, ServerUnavailableError, invalid
+from edgegrasp_client.errors import InvalidRequestError, OverloadedError, ServerUnavailableError
 
 HTTP_OVER_UNIX = "http+unix:"
 
@@ -109,3 +109,14 @@ def local_server(*flags: str, program: Sequence[str] = ()) -> Iterator[Addresses
                 server.wait(STOP_SECONDS)
             except subprocess.TimeoutExpired:
                 server.kill()
+
+
+def unreachable(address: str, why: str) -> ServerUnavailableError:
+    """The exception for a call whose connection was not made or broke."""
+    hint = "Check the address, whether it needs TLS, and that `edgegrasp serve` runs there."
+    return ServerUnavailableError(f"No connection to {address} ({why}). {hint}")
+
+
+def invalid(field: str, value: str, fix: str) -> InvalidRequestError:
+    """The exception for a request that the client refuses before sending it."""
+    return InvalidRequestError(f"{field}: got {value}. {fix}", field, value, fix)

@@ -12,11 +12,10 @@ from google.protobuf.message import DecodeError, Message
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_camera.arrays import Array
-from edgegrasp_client import errors
-from edgegrasp_client.connection import Tls, token_metadata
-from edgegrasp_client.errors import GraspClientError, error_of_kind, invalid
+from edgegrasp_client.connection import Tls, invalid, token_metadata, unreachable
+from edgegrasp_client.errors import GraspClientError
 from edgegrasp_client.requests import Request, cloud_file
-from edgegrasp_client.results import Answer, Model, StreamAnswer, field_of, read_as
+from edgegrasp_client.results import Answer, Model, StreamAnswer, error_of_kind, field_of, read_as
 from edgegrasp_results import Detection
 
 CHANNEL_OPTIONS = (
@@ -136,7 +135,7 @@ def _error_of(error: Any, address: str) -> GraspClientError:
         detail = grasp_pb2.ErrorDetail.FromString(metadata[ERROR_METADATA])
     except (DecodeError, KeyError):
         if code == grpc.StatusCode.UNAVAILABLE:
-            return errors.unreachable(address, message)
+            return unreachable(address, message)
         kind = code.name.lower().replace("_", "-")
         return error_of_kind(kind, f"{code.name}: {message}")
     return _described(message, detail)

@@ -12,10 +12,10 @@ import numpy as np
 
 from edgegrasp_camera.depth import ENCODINGS
 from edgegrasp_client import errors
-from edgegrasp_client.connection import HTTP_OVER_UNIX, Tls, token_metadata
-from edgegrasp_client.errors import GraspClientError, error_of_kind, invalid
+from edgegrasp_client.connection import HTTP_OVER_UNIX, Tls, invalid, token_metadata, unreachable
+from edgegrasp_client.errors import GraspClientError
 from edgegrasp_client.requests import Request, cloud_file, npy_bytes
-from edgegrasp_client.results import Answer, StreamAnswer, read_as
+from edgegrasp_client.results import Answer, StreamAnswer, error_of_kind, read_as
 from edgegrasp_results import Detection
 
 MAX_QUERY_LENGTH = 4000  # characters; servers and proxies limit the length of an address
@@ -95,7 +95,7 @@ class RestTransport:
         except httpx.TimeoutException as error:
             raise errors.DeadlineError(f"No answer in time ({type(error).__name__}).") from None
         except (httpx.HTTPError, RuntimeError) as error:  # the latter of a closed client
-            raise errors.unreachable(self._address, str(error) or type(error).__name__) from None
+            raise unreachable(self._address, str(error) or type(error).__name__) from None
         try:
             body = response.json()
             if not response.is_success:

@@ -21,8 +21,7 @@ from edgegrasp_camera.arrays import Array, Float32
 from edgegrasp_camera.clouds import PointCloud2, read_point_cloud2
 from edgegrasp_camera.depth import ENCODINGS, Intrinsics, intrinsics_of
 from edgegrasp_camera.files import FILE_FORMATS
-from edgegrasp_client.connection import seconds_of
-from edgegrasp_client.errors import invalid
+from edgegrasp_client.connection import invalid, seconds_of
 from edgegrasp_client.options import DetectOptions
 
 SCENE_CELL = 0.005  # metres: the side of a cell in which the scene repeats the object

@@ -1,4 +1,4 @@
-"""The server's answers as typed values, and their parser for both transports."""
+"""The server's answers and errors as typed values, and their parser for both transports."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, is_dataclass
@@ -9,6 +9,7 @@ from typing import Annotated, Any, TypeVar, cast, get_args, get_origin, get_type
 import numpy as np
 
 from edgegrasp_camera.arrays import Float64
+from edgegrasp_client import errors
 from edgegrasp_client.errors import GraspClientError
 from edgegrasp_results import ArmTrajectory, Detection
 
@@ -126,3 +127,36 @@ def _value(hint: Any) -> Callable[[Any], Any]:
         (dtype,) = get_args(get_args(hint)[1])
         return lambda value: np.array(value, dtype=dtype)  # null in JSON becomes NaN
     return lambda value: value
+
+
+# Kinds of errors that a server reports; the last of some are gRPC's codes, as a proxy sends them.
+_KINDS: dict[type[GraspClientError], tuple[str, ...]] = {
+    errors.InvalidRequestError: (
+        "invalid-request",
+        "unsupported-media-type",
+        "headers-too-large",
+        "harmful-request",
+        "invalid-argument",
+    ),
+    errors.StartCollisionError: ("start-collision",),
+    errors.UnknownModelError: ("unknown-model",),
+    errors.PayloadTooLargeError: ("payload-too-large", "resource-exhausted"),
+    errors.AccessDeniedError: ("unauthenticated", "permission-denied"),
+    errors.ServerUnavailableError: ("not-ready", "cancelled", "internal"),
+    errors.OverloadedError: ("overloaded",),
+    errors.WorkerLostError: ("worker-lost",),
+    errors.DeadlineError: ("request-timeout", "deadline-exceeded"),
+    errors.ServerFailedError: ("detector-failed", "disk-full", "unknown"),
+}
+
+
+def error_of_kind(
+    kind: str, message: str, *where: str, retry_after: float | None = None
+) -> GraspClientError:
+    """The exception for an error reported by the server; `where`: field, value and fix."""
+    error = next((one for one, kinds in _KINDS.items() if kind in kinds), errors.ProtocolError)
+    if issubclass(error, errors.OverloadedError) and retry_after is not None:
+        return error(message, retry_after)
+    if issubclass(error, errors.InvalidRequestError):
+        return error(message, *where)
+    return error(message)
