@@ -35,8 +35,7 @@ class Recorder:
     def __init__(self, folder: Path, most: int, hold: Callable[[int], bool]) -> None:
         try:
             folder.mkdir(exist_ok=True)
-            with os.scandir(folder) as found:
-                files = [(one.path, one.stat().st_size) for one in found if one.name[-4:] == ".job"]
+            files = [(one, one.stat().st_size) for one in folder.iterdir() if one.suffix == ".job"]
         except OSError as error:
             why = f"record_folder: got {str(folder)!r}. {error.strerror}."
             raise InvalidSettings(why) from None
@@ -67,12 +66,12 @@ class Recorder:
         try:
             with path.open("wb") as file:
                 file.writelines((*pack(job), *pack(answer)))
-            self._files.append((str(path), path.stat().st_size))
+            self._files.append((path, path.stat().st_size))
             self._bytes += self._files[-1][1]
             while self._bytes > self._most:
                 oldest, size = self._files.popleft()
                 self._bytes -= size
-                Path(oldest).unlink(missing_ok=True)
+                oldest.unlink(missing_ok=True)
         except OSError as error:
             logger.warning("%s is not recorded: %s", job.request_id, error)
             path.unlink(missing_ok=True)
