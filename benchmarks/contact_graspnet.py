@@ -24,7 +24,6 @@ from edgegrasp_lab.planners import request_options
 from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.candidates.edge_grasps import spread_out
 from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector
-from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_model.scene.scene import Scene
@@ -146,21 +145,16 @@ def _points(scene: Scene, observation: Observation, rng: np.random.Generator) ->
     return chosen
 
 
-@compiled()
 def _near(points: Float32, centres: Float32, radius: float) -> Int64:
     """Rows (M, MOST_NEIGHBOURS + 1) within a radius of each centre; centre i also gets point i.
 
     In training, PyTorch Geometric joined point i to centre i as if both were lists of the same
     points: without this link the activations are far from those that the weights were fitted to.
     """
-    row = np.empty((len(centres), MOST_NEIGHBOURS + 1), dtype=np.int64)
-    for i in range(len(centres)):
-        row[i], found = i, 0
-        for j in range(len(points)):
-            x, y, z = points[j] - centres[i]
-            if j != i and x * x + y * y + z * z <= radius * radius:
-                row[i, found] = j
-                found += 1
-                if found == MOST_NEIGHBOURS:
-                    break
+    row = np.repeat(np.arange(len(centres))[:, None], MOST_NEIGHBOURS + 1, axis=1)
+    for i, centre in enumerate(centres):
+        x, y, z = (points - centre).T
+        near = np.flatnonzero(x * x + y * y + z * z <= np.float64(radius) ** 2)
+        near = near[near != i][:MOST_NEIGHBOURS]
+        row[i, : len(near)] = near
     return row
