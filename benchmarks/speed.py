@@ -57,13 +57,11 @@ def main() -> None:
     )
     given = parser.parse_args()
     torch.set_num_threads(1)
-    start = time.perf_counter()
     results: dict[str, Any] = {"machine": machine()}
     for part in (camera, shipped, simulator, server):
         name = part.__name__
         results[name] = part()
         print(name, results[name], flush=True)
-    results["minutes"] = (time.perf_counter() - start) / 60
     write_results(given.output, "speed", results)
     if given.pages:
         write_table(ROOT / "README.md", camera_table(results))
