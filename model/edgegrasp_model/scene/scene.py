@@ -135,6 +135,8 @@ def select_points(
     if options.workspace is not None:
         reach = FOLLOWED_REACH if options.follows_only else HAND_REACH
         sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
+    if len(viewpoints) == 0:
+        sent, viewpoints = _seen_from_above(sent, options.known_up)
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
     # The caller's segments, 0 and below meaning none; else all points are one object.
@@ -250,6 +252,18 @@ def build_scene(
     )
 
 
+def _seen_from_above(sent: CheckedCloud, up: Float64 | None) -> tuple[CheckedCloud, Float64]:
+    """The points around the middle one, as a room would be seen too small, and a place above."""
+    over = np.array([0.0, 0.0, 1.0]) if up is None else up
+    if len(sent.points) == 0:
+        return sent, over[None]
+    beside = sent.points - np.median(sent.points, axis=0)
+    beside -= (beside @ over)[:, None] * over
+    beside -= beside[np.linalg.norm(beside, axis=1).argmin()]  # there may be none at the median
+    near = sent.take(np.linalg.norm(beside, axis=1) < USUAL_DISTANCE)
+    return near, (near.points.mean(axis=0, dtype=np.float64) + 2.5 * USUAL_DISTANCE * over)[None]
+
+
 def _plane_under_hands(plane: SupportPlane, frame: CanonicalFrame, spare: float) -> SupportPlane:
     """The plane that hands stay above, canonical frame: `spare` metres over one that was found."""
     normal = np.asarray(plane.normal)
@@ -310,12 +324,10 @@ def near_workspace_side(
 
 
 def camera_positions(sent: CheckedCloud, options: DetectOptions) -> Float64:
-    """The camera positions (W, 3) of the request, or a place above the cloud."""
-    if options.viewpoint is None:
-        up = np.array([0.0, 0.0, 1.0]) if options.known_up is None else options.known_up
-        return (np.median(sent.points, axis=0) + 2.5 * USUAL_DISTANCE * up)[None]
-    viewpoints = np.asarray(options.viewpoint, dtype=np.float64).reshape(-1, 3)
-    if len(viewpoints) == 1:
+    """The camera positions (W, 3) of the request, none if they are unknown."""
+    known = () if options.viewpoint is None else options.viewpoint
+    viewpoints = np.reshape(np.asarray(known, dtype=np.float64), (-1, 3))
+    if len(viewpoints) < 2:
         return viewpoints
     if sent.view_ids is None:
         fix = "Send one number for each point: which of options.viewpoint saw it, from 0."
