@@ -89,23 +89,19 @@ def segment_cloud(
     points = cloud.points
     number, confidence, seen_up = np.full(len(points), UNDECIDED), np.empty(0), np.zeros(3)
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
+    down: Float64 | None = None
+    rows_of_view: list[Int64 | slice] = [slice(None)]
     if len(viewpoints) > 1:
         assert cloud.view_ids is not None
-        seen = [np.flatnonzero(cloud.view_ids == view) for view in range(len(viewpoints))]
-        views = [
-            CameraView(rows, viewpoint, None)
-            for rows, viewpoint in zip(seen, viewpoints, strict=True)
-            if len(rows)
-        ]
-    else:
-        down = None
-        if cloud.image_size is not None:
-            row = subsample(cloud.row, 5000) // cloud.image_size[1]
-            sight = unit(subsample(points, 5000) - viewpoints[0])
-            down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
-        views = [CameraView(slice(None), viewpoints[0], down)]
-    for rows, viewpoint, down in views:
-        own = segment(points[rows], viewpoint, up, down)
+        rows_of_view = [np.flatnonzero(cloud.view_ids == view) for view in range(len(viewpoints))]
+    elif cloud.image_size is not None:
+        row = subsample(cloud.row, 5000) // cloud.image_size[1]
+        sight = unit(subsample(points, 5000) - viewpoints[0])
+        down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
+    seen = [(rows, points[rows], eye) for rows, eye in zip(rows_of_view, viewpoints, strict=True)]
+    views = [view for view in seen if len(view[1])]
+    for rows, part, viewpoint in views:
+        own = segment(part, viewpoint, up, down)
         number[rows] = np.where(own.number >= 0, own.number + len(confidence), own.number)
         objects[rows], support[rows] = own.object, own.support
         confidence = np.concatenate([confidence, own.confidence])
@@ -113,14 +109,6 @@ def segment_cloud(
     if len(views) > 1:
         number, confidence = merge_views(points, number, confidence)
     return Segmentation(number, objects, support, confidence, unit(seen_up))
-
-
-class CameraView(NamedTuple):
-    """What one camera sees of N points."""
-
-    rows: Int64 | slice  # of its points
-    viewpoint: Float64  # (3,)
-    down: Float64 | None  # (3,) downward in the image; None: unknown
 
 
 def segment(
