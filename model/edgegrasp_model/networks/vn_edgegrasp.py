@@ -6,6 +6,8 @@ a maximum is composed with the linear layer before it, so that one product gives
 and directions side by side, (M, 3, 2C).
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -117,27 +119,38 @@ class VNGlobalFeature(nn.Module):
         vn_3 = layers.packed_linear(_with_reach(self.vn_3, self.maximum_1.reach))
         vn_5 = layers.packed_linear(_with_reach(self.vn_5, self.maximum_2.reach))
         chunks = layers.ball_chunks(local, batch, VN_ROWS)
-        furthest_1 = Furthest(batch.num_balls, self.vn_3.out_features)
-        for chunk in chunks:
-            both = vn_3(relu(vn_2(relu(vn_1(chunk.values)))))  # (p, 3, 2 x 128)
-            furthest_1.add(both, chunk.balls, chunk.sizes)
-        first = self.maximum_1.relu(furthest_1.vectors)  # (B, 3, 128)
-        join = layers.shared_product(self.join.weights, None, first)
-        furthest_2 = Furthest(batch.num_balls, self.vn_5.out_features)
-        for chunk in chunks:
-            both = vn_5(relu(join(chunk.values, chunk.ball_of_point)))  # (p, 3, 2 x 381)
-            furthest_2.add(both, chunk.balls, chunk.sizes)
-        ball: Tensor = self.maximum_2.relu(furthest_2.vectors)
+        first = self.maximum_1(chunks, lambda chunk: vn_3(relu(vn_2(relu(vn_1(chunk.values))))))
+        join = layers.shared_product(self.join.weights, None, first)  # of (B, 3, 128)
+        ball: Tensor = self.maximum_2(
+            chunks, lambda chunk: vn_5(relu(join(chunk.values, chunk.ball_of_point)))
+        )
         return ball
 
 
 class VNBallMaximum(nn.Module):
-    """The maximum over the points of a ball, and the ReLU after it."""
+    """The vectors of each ball that reach furthest along their directions, and a ReLU of them."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.reach = nn.Linear(width, width, bias=False)
         self.relu = VNReLU(width)
+
+    def forward(
+        self, chunks: list[layers.BallChunk], layer: Callable[[layers.BallChunk], Tensor]
+    ) -> Tensor:
+        """Maps `both` (p, 3, 2 width), which a layer gives of each chunk, to (B, 3, width)."""
+        shape = chunks[-1].balls[-1] + 1, 3, self.reach.in_features
+        furthest, best = torch.zeros(shape), torch.full(shape[::2], -torch.inf)
+        for chunk in chunks:
+            both, balls = layer(chunk), slice(chunk.balls[0], chunk.balls[-1] + 1)
+            if layers.float32_inference(both):
+                bounds = np.cumsum([0, *chunk.sizes[:-1]])
+                _furthest_rows(both.numpy(), bounds, best[balls].numpy(), furthest[balls].numpy())
+            else:  # the only chunk
+                parts = torch.split(both, chunk.sizes)[:-1]
+                furthest = torch.stack([_furthest(part, dim=0) for part in parts])
+        activated: Tensor = self.relu(furthest)
+        return activated
 
 
 class VNLinearReLU(nn.Module):
@@ -206,25 +219,6 @@ def _convolved(u: Tensor, offset: Tensor, output: layers.Layer, batch: BallBatch
         bounds = np.arange(0, (part.stop - part.start) * k + 1, k)
         _furthest_rows(output(hidden).numpy(), bounds, best, pooled[part].numpy())
     return pooled
-
-
-class Furthest:
-    """For each channel, the vector of each group that reaches furthest along its direction."""
-
-    def __init__(self, groups: int, width: int) -> None:
-        self._best = torch.full((groups, width), -torch.inf)
-        self.vectors = torch.zeros(groups, 3, width)  # of each group so far
-
-    def add(self, both: Tensor, groups: list[int], sizes: list[int]) -> None:
-        """Add vectors and directions (p, 3, 2 width), and the number of rows of each group."""
-        if layers.float32_inference(both):
-            bounds = np.cumsum([0, *sizes[: len(groups)]])
-            these = slice(groups[0], groups[-1] + 1)
-            best, vectors = self._best[these], self.vectors[these]
-            _furthest_rows(both.numpy(), bounds, best.numpy(), vectors.numpy())
-        else:
-            parts = torch.split(both, sizes)[: len(groups)]
-            self.vectors = torch.stack([_furthest(part, dim=0) for part in parts])
 
 
 def _furthest(both: Tensor, dim: int) -> Tensor:
