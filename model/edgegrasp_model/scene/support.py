@@ -109,32 +109,26 @@ def find_support(
     request = options.support
     if request is None or len(seen.points) == 0:
         return None
-    found: Support | None
+    found: Support | None = None
+    up, rng = options.known_up, np.random.default_rng([options.seed, SUPPORT_STREAM])
     if isinstance(request, SupportPlane):
         found = _given_support(seen, segmentation, request, options, warnings)
+    elif isinstance(request, RansacPlane):
+        cell, count = grid_cells(seen.points, AREA_CELL)  # equal areas count alike
+        plane = fit_plane(seen, inside / count[cell], rng, up, request.max_tilt)
+        if plane is not None:
+            found = measure_support(seen, plane, request.distance, True)
+            found = found if found.share >= request.min_share else None
     else:
-        up, rng = options.known_up, np.random.default_rng([options.seed, SUPPORT_STREAM])
-        if isinstance(request, RansacPlane):
-            cell, count = grid_cells(seen.points, AREA_CELL)  # equal areas count alike
-            plane = fit_plane(seen, inside / count[cell], rng, up, request.max_tilt)
-            found = None if plane is None else measure_support(seen, plane, request.distance, True)
-            found = None if found is None or found.share < request.min_share else found
-        else:
-            assert segmentation is not None
-            found = _fit_support(seen, segmentation, up, rng)
-            if found is None:
-                found = _assume_support(seen, segmentation, options)
-                if found is not None:
-                    warnings.append(
-                        "no support plane is seen: one is assumed under the lowest points. Send "
-                        "support (null if there is none)."
-                    )
-        if found is None:
-            warnings.append(
-                "no support plane is seen: objects are returned without one, and hands may reach "
-                "under them. Send support, or up in the cloud's frame."
-            )
-    if found is not None and heights_over(found.plane, seen.viewpoint) < 0:
+        assert segmentation is not None
+        found = _fit_support(seen, segmentation, up, rng)
+        found = found or _assume_support(seen, segmentation, options, warnings)
+    if found is None:
+        warnings.append(
+            "no support plane is seen: objects are returned without one, and hands may reach "
+            "under them. Send support, or up in the cloud's frame."
+        )
+    elif heights_over(found.plane, seen.viewpoint) < 0:
         warnings.append(
             "the viewpoint lies below the support plane: check viewpoint, up and support."
         )
@@ -212,7 +206,7 @@ def _fit_support(
 
 
 def _assume_support(
-    seen: ViewedPoints, segmentation: Segmentation, options: DetectOptions
+    seen: ViewedPoints, segmentation: Segmentation, options: DetectOptions, warnings: list[str]
 ) -> Support | None:
     """A support under the lowest points of a cloud that was cropped above it."""
     if (segmentation.support > 0.5).mean() > MIN_SUPPORT_SHARE:
@@ -229,6 +223,10 @@ def _assume_support(
     lowest = float(np.percentile(seen.points.astype(np.float64) @ up, OUTLIER_PERCENT))
     plane = SupportPlane.model_construct(
         normal=tuple(up.tolist()), offset=lowest - ASSUMED_PLANE_GAP
+    )
+    warnings.append(
+        "no support plane is seen: one is assumed under the lowest points. Send support (null if "
+        "there is none)."
     )
     return measure_support(seen, plane, 0.0, False)
 
