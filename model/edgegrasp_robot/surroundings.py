@@ -215,7 +215,6 @@ def _voxels(
 
 def _hidden(scene: Scene, voxels: Float64, T_base_scene: Float64) -> Float64:
     """Centers (U, 3) of voxels that others hide from every camera, above the support."""
-    assert scene.viewpoints is not None
     base = np.linalg.inv(T_base_scene)[:3, 3]
     steps = np.arange(VOXEL_SIZE, 2 * MAX_RANGE, VOXEL_SIZE)[:, None, None]
     hidden = []

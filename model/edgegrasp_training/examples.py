@@ -91,7 +91,7 @@ def tried_grasps(
     label = _labels(view)[rows[candidates.pair]]
     seen = None
     if config.architecture == "hand":
-        viewpoints = view.camera_position[None] if viewpoint_known else None
+        viewpoints = view.camera_position[None] if viewpoint_known else np.empty((0, 3), np.float32)
         batch = hand_batch(view, candidates, viewpoints, SPARE_POINTS * config.hand_points)
         seen = replace(batch, description=batch.description.half(), points=batch.points.half())
     frame = CanonicalFrame.of_scene(view.points, view.up, view.camera_position)
@@ -102,7 +102,7 @@ def tried_grasps(
 def hand_batch(
     view: LabelledView,  # what is seen of the scene
     candidates: Candidates,  # E hands to try
-    viewpoints: Float32 | None,  # (W, 3) camera positions, metres; None: not known
+    viewpoints: Float32,  # (W, 3) camera positions, metres; none if they are unknown
     max_points: int,  # points of each hand at most
 ) -> HandBatch:
     """The hand network's inputs for candidates in a simulated scene."""

@@ -49,7 +49,7 @@ def box_on_table(
 def scene_of(points: np.ndarray, **fields: object) -> Scene:
     """A scene of one object's points (N, 3) float32, as they are sent: no plane, no obstacles."""
     every = np.ones(len(points), dtype=bool)
-    plain = {"support": None, "obstacles": None, "viewpoints": None} | fields
+    plain = {"support": None, "obstacles": None, "viewpoints": np.empty((0, 3))} | fields
     return Scene(
         up=UP,
         at_side=~every,

@@ -324,7 +324,7 @@ def test_a_device_is_chosen_only_where_it_is(monkeypatch, gpus, name, device) ->
 def test_a_palm_in_space_that_no_camera_saw_counts_as_colliding(camera, edge, blocked) -> None:
     y, z = np.meshgrid(np.arange(edge, 0.2, 0.004), np.arange(-0.2, 0.3, 0.004))
     plate = np.stack([np.full_like(y, -0.1), y, z], axis=-1).reshape(-1, 3).astype(np.float32)
-    viewpoints = None if camera is None else np.array([camera], dtype=np.float32)
+    viewpoints = np.empty((0, 3)) if camera is None else np.array([camera], dtype=np.float32)
     behind, hand = scene_of(plate, viewpoints=viewpoints), np.eye(4, dtype=np.float32)[None]
     assert collides(behind, hand, np.float32([0.04]), PANDA, Collision()).tolist() == [blocked]
 

@@ -37,7 +37,7 @@ def hand_over(gripper, x, y, half_height, tilt=0.0):
     return pose
 
 
-def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=(), eyes=None):
+def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=(), eyes=()):
     """A scene of boxes on a table, its whole cloud, and a detection with a hand over each box."""
     table = grid(np.arange(0.3, 0.8, 0.01), np.arange(-0.4, 0.4, 0.01), [0.0])
     things = [surface(*box) for box in boxes]
@@ -56,7 +56,7 @@ def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=(), eyes=None):
         frame=frame, cloud=None, up=UP, points_in_cloud=objects, point_of_row=number,
         approach_allowed=every, contact_allowed=every, at_side=~every, object_of_point=number,
         support=SupportPlane(normal=(0.0, 0.0, 1.0), offset=float(foot[2])), obstacles=None,
-        viewpoints=None if eyes is None else frame.points(in_cloud(np.array(eyes))),
+        viewpoints=frame.points(in_cloud(np.reshape(eyes, (-1, 3)))),
     )  # fmt: skip
     poses = [T_cloud_base @ hand_over(robot.gripper, *box) for box in boxes]
     grasps = [

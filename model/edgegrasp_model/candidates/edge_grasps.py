@@ -246,14 +246,14 @@ class Outline(NamedTuple):
 
 def outlines(
     points: Float32,  # (N, 3) canonical frame, metres
-    viewpoints: Float32 | None,  # (W, 3); None where they are unknown
+    viewpoints: Float32,  # (W, 3)
     rows: Int64,  # (M,) of the points to look at
     *,
     leaning: bool = False,  # also from four sides, 30 degrees off above
 ) -> list[Outline]:
     """The outlines of a cloud from above and, if that is another direction, from each camera."""
     toward, lean = [np.broadcast_to(UP, points.shape)], np.radians(30.0)
-    toward += [unit(eye - points) for eye in ([] if viewpoints is None else viewpoints)]
+    toward += [unit(eye - points) for eye in viewpoints]
     if leaning:
         for turn in np.linspace(0.0, 2 * np.pi, 4, endpoint=False):
             level = np.sin(lean) * np.array([np.cos(turn), np.sin(turn)])

@@ -86,7 +86,7 @@ class Sampler:
             wanted = np.clip(size // POINTS_PER_APPROACH, 2 * MIN_PER_OBJECT, MAX_APPROACH_POINTS)
             wanted = np.maximum(wanted, MAX_APPROACH_POINTS // 2 // len(size))
             wanted = np.floor(wanted * min(MAX_APPROACH_POINTS / wanted.sum(), 1.0))
-            views = 1 if scene.viewpoints is None else min(len(scene.viewpoints), 4)
+            views = np.clip(len(scene.viewpoints), 1, 4)
             wanted = np.maximum(wanted.astype(np.int64), MIN_PER_OBJECT) * views
         else:  # the largest objects first where there are fewer approach points than objects
             total = most or MAX_APPROACH_POINTS

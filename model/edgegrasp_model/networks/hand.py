@@ -67,7 +67,7 @@ class HandBatch:
         hands = candidates.T_cloud_hand
         view = hand_views(around.cloud, hands, gripper)
         eye, side = None, np.ones(len(hands), dtype=np.float32)
-        if around.viewpoints is not None and len(around.viewpoints) == 1:
+        if len(around.viewpoints) == 1:
             # If a hand approaches straight from the camera, up decides instead of rounding errors.
             eye = around.viewpoints[0]
             toward = eye + ABOVE_CAMERA * UP - hands[:, :3, 3]

@@ -78,16 +78,15 @@ class Surroundings:
     cloud: Cloud  # N points
     up: Float32  # (3,) away from gravity
     support: SupportPlane | None
-    viewpoints: Float32 | None  # (W, 3) the cameras, if known
+    viewpoints: Float32  # (W, 3) the cameras; none if they are unknown
     at_side: Bools  # (N,) where a side of the workspace cuts the cloud off
     object_of_point: Int64  # (N,) number of each point's object, or BACKGROUND or UNDECIDED
 
     @cached_property
     def depths(self) -> list[DepthMap]:
         """What each camera saw; nothing if the cameras are unknown."""
-        if self.viewpoints is None or len(self.cloud.points) == 0:
-            return []
-        return [DepthMap.of_cloud(self.cloud.points, eye, self.up) for eye in self.viewpoints]
+        eyes = self.viewpoints if len(self.cloud.points) else ()
+        return [DepthMap.of_cloud(self.cloud.points, eye, self.up) for eye in eyes]
 
 
 @dataclass(frozen=True)
@@ -244,7 +243,7 @@ def build_scene(
         object_of_point=number,
         support=None if support is None else _plane_under_hands(support.plane, frame, spare),
         at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, sent.points),
-        viewpoints=None if options.viewpoint is None else eyes.astype(np.float32),
+        viewpoints=(eyes[:0] if options.viewpoint is None else eyes).astype(np.float32),
         confidence=selected.confidence,
         P_image_cloud=projection,
         obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
