@@ -35,7 +35,7 @@ def parse(schema: type[Schema], fields: object, name: str) -> Schema:
         fix = "Send a list"
     if kind in ("too_short", "too_long"):  # "Tuple should have at least 3 items after validation"
         fix = "Send" + fix.partition(" should have")[2].partition(" after")[0]
-    if kind == "union_tag_not_found":
+    if kind in ("union_tag_not_found", "model_attributes_type"):
         fix = "Send an object that names its kind"
     raise InvalidRequest(field, value, f"{fix[:1].upper()}{fix[1:]}.")
 

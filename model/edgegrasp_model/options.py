@@ -548,15 +548,10 @@ def _viewpoints(value: object) -> str:
     return "several" if several else "one"
 
 
-def _support_kind(value: object) -> str | None:
-    """`plane` if no kind is named."""
+def _with_kind(value: object) -> object:
+    """A support as an object with its kind, which is `plane` if none is named."""
     if isinstance(value, Mapping):
-        kind = value.get("kind", "plane")
-        return kind if isinstance(kind, str) else None
-    return getattr(value, "kind", None)
-
-
-def _kind_as_object(value: object) -> object:
+        return {"kind": "plane", **value}
     if value == "none":
         return None
     return {"kind": value} if isinstance(value, str) else value
@@ -572,15 +567,10 @@ Viewpoint = Annotated[
     Discriminator(_viewpoints),
     BeforeValidator(_one_of_one),
 ]
-Plane = Annotated[
-    Annotated[SupportPlane, Tag("plane")]
-    | Annotated[RansacPlane, Tag("ransac")]
-    | Annotated[AutoPlane, Tag("auto")],
-    Discriminator(_support_kind),
-]
-PlaneOrKind = Literal["auto", "ransac", "none"] | Plane | None
+Plane = Annotated[SupportPlane | RansacPlane | AutoPlane, Field(discriminator="kind")]
+PlaneOrKind = Literal["auto", "ransac", "none"] | SupportPlane | RansacPlane | AutoPlane | None
 SupportChoice = Annotated[
-    Plane | None, BeforeValidator(_kind_as_object, json_schema_input_type=PlaneOrKind)
+    Plane | None, BeforeValidator(_with_kind, json_schema_input_type=PlaneOrKind)
 ]
 CollisionChoice = Annotated[
     Collision,
