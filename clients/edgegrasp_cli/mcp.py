@@ -8,7 +8,9 @@ import functools
 import importlib.metadata
 import io
 import json
+import re
 from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,7 +22,6 @@ from edgegrasp_camera.files import pixels
 from edgegrasp_camera.picture import draw_detection
 from edgegrasp_cli.detect import decoded
 from edgegrasp_cli.flags import Server, takes_flags
-from edgegrasp_model.options import DetectOptions
 
 if TYPE_CHECKING:
     from mcp.server import MCPServer
@@ -255,11 +256,18 @@ def _tool(function: Callable[..., Any], folder: Path) -> "Tool":
 @functools.cache
 def _schema_of_options() -> tuple[dict[str, Any], dict[str, Any]]:
     """The JSON Schema of options, without grippers as boxes, and what it refers to."""
-    options = DetectOptions.model_json_schema()
-    definitions = options.pop("$defs")
-    for name in ("GripperGeometry", "HandPart", "Linkage"):
-        del definitions[name]
-    options["properties"]["gripper"] = {"type": ["string", "null"], "description": "its name"}
+    document = resources.files("edgegrasp.v1").joinpath("openapi.json").read_text()
+    schemas = json.loads(document.replace("#/components/schemas/", "#/$defs/"))
+    schemas = schemas["components"]["schemas"]
+    gripper = {"type": ["string", "null"], "description": "its name"}
+    schemas["DetectOptions"]["properties"]["gripper"] = gripper
+    definitions: dict[str, Any] = {}
+    names = ["DetectOptions"]
+    while names:
+        if (name := names.pop()) not in definitions:
+            definitions[name] = schemas[name]
+            names += re.findall(r'"#/\$defs/(\w+)"', json.dumps(schemas[name]))
+    options = definitions.pop("DetectOptions")
     del options["properties"]["robot"], options["properties"]["top_k"]  # arguments of their own
     definitions["RobotArm"]["required"].remove("T_base_cloud")
     return options, definitions
