@@ -90,14 +90,11 @@ def detect_over_both(seen: Observation, seed: int) -> tuple[Detection, Detection
 
 def report(transport: str, detection: Detection) -> None:
     """Print the best grasps of a detection, and its counts."""
-    seconds = detection.seconds["total"]
-    print(
-        f"{len(detection.grasps)} grasps over {transport} from {detection.model}, {seconds:.2f} s:"
-    )
+    number, name, seconds = len(detection.grasps), detection.model, detection.seconds["total"]
+    print(f"{number} grasps over {transport} from {name}, {seconds:.2f} s:")
     print("rank  score  width (mm)   TCP x, y, z (m)        approach direction")
     for rank, grasp in enumerate(detection.grasps[:LISTED], start=1):
-        x, y, z = grasp.T_cloud_tcp[:3, 3]
-        u, v, w = grasp.approach_direction
+        x, y, z, u, v, w = *grasp.T_cloud_tcp[:3, 3], *grasp.approach_direction
         print(
             f"{rank:4}  {grasp.score:.3f}  {1000 * grasp.width:10.1f}   "
             f"{x:.3f}, {y:.3f}, {z:.3f}    {u:+.2f}, {v:+.2f}, {w:+.2f}"

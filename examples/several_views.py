@@ -40,12 +40,6 @@ with ClutterSimulation() as simulation, open_client(DetectorFlags(server=address
         asked = [[image] for image in images] + [images]
         found = [client.detect(depth_images=some).grasps for some in asked]
         counts = [len(grasps) for grasps in found]
-        holds = [
-            bool(grasps and simulation.try_grasp(grasps[0].T_cloud_hand).success)
-            for grasps in found
-        ]
-        print(
-            f"each view: {counts[:3]} grasps, best holds {holds[:3]}; "
-            f"all three: {counts[3]}, {holds[3]}",
-            flush=True,
-        )
+        holds = [bool(one and simulation.try_grasp(one[0].T_cloud_hand).success) for one in found]
+        said = f"each view: {counts[:3]} grasps, best holds {holds[:3]}"
+        print(f"{said}; all three: {counts[3]}, {holds[3]}", flush=True)

@@ -22,7 +22,7 @@ from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer, load_catalogue
 from edgegrasp_service.worker.process import Job
 
-ROOT = Path(__file__).parents[1]
+ROOT, JSON = Path(__file__).parents[1], "application/json"
 entered: set[tuple[str, str]] = set()  # file and function
 
 
@@ -44,9 +44,7 @@ async def send(body: bytes, settings: Settings) -> None:
     await ready.wait()
     async with httpx.AsyncClient(base_url=server.http_url, timeout=120) as client:
         sys.setprofile(note)
-        response = await client.post(
-            "/v1/grasps", content=body, headers={"content-type": "application/json"}
-        )
+        response = await client.post("/v1/grasps", content=body, headers={"content-type": JSON})
         sys.setprofile(None)
     stop.set()
     await serving
@@ -61,9 +59,7 @@ def main() -> None:
     asyncio.run(send(body, settings))
     catalogue = load_catalogue(settings)
     sys.setprofile(note)
-    found = answer(
-        Job("DetectGrasps", "http", body, 120.0, "application/json"), catalogue, settings
-    )
+    found = answer(Job("DetectGrasps", "http", body, 120.0, JSON), catalogue, settings)
     sys.setprofile(None)
     assert found.error is None, found.error
     files = sorted({file for file, _ in entered})

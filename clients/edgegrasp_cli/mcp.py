@@ -259,15 +259,13 @@ def _schema_of_options() -> tuple[dict[str, Any], dict[str, Any]]:
     document = resources.files("edgegrasp.v1").joinpath("openapi.json").read_text()
     schemas = json.loads(document.replace("#/components/schemas/", "#/$defs/"))
     schemas = schemas["components"]["schemas"]
-    gripper = {"type": ["string", "null"], "description": "its name"}
-    schemas["DetectOptions"]["properties"]["gripper"] = gripper
-    definitions: dict[str, Any] = {}
+    options = schemas["DetectOptions"]
+    options["properties"]["gripper"] = {"type": ["string", "null"], "description": "its name"}
     names = ["DetectOptions"]
-    while names:
-        if (name := names.pop()) not in definitions:
-            definitions[name] = schemas[name]
-            names += re.findall(r'"#/\$defs/(\w+)"', json.dumps(schemas[name]))
-    options = definitions.pop("DetectOptions")
+    for name in names:  # which grows by the objects in each
+        named = dict.fromkeys(re.findall(r'"#/\$defs/(\w+)"', json.dumps(schemas[name])))
+        names += [one for one in named if one not in names]
+    definitions = {name: schemas[name] for name in names[1:]}
     del options["properties"]["robot"], options["properties"]["top_k"]  # arguments of their own
     definitions["RobotArm"]["required"].remove("T_base_cloud")
     return options, definitions

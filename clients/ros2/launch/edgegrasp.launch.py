@@ -17,11 +17,8 @@ def generate_launch_description() -> LaunchDescription:
 
     An address that is given comes before that of the file.
     """
-    arguments = [DeclareLaunchArgument(name, default_value=name) for name in TOPICS]
-    arguments += [
-        DeclareLaunchArgument("server", default_value=""),
-        DeclareLaunchArgument("parameters", default_value=str(PARAMETERS)),
-    ]
+    defaults = {name: name for name in TOPICS} | {"server": "", "parameters": str(PARAMETERS)}
+    arguments = [DeclareLaunchArgument(name, default_value=one) for name, one in defaults.items()]
     return LaunchDescription([*arguments, OpaqueFunction(function=_node)])
 
 

@@ -247,7 +247,7 @@ def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64 | None:
     def hidden(eyes: Float64, edge: int) -> Float64:
         ahead = unit(middle - eyes)
         across = unit(np.cross(ahead, (0.0, 1e-3, 1.0)))  # not zero where `ahead` is vertical
-        turn = np.stack([across, np.cross(ahead, across), ahead], axis=1)
+        turn = np.stack([across, np.cross(ahead, across), ahead], axis=2)
         return _hidden_share(seen, eyes, turn, np.linalg.norm(middle - eyes, axis=1), edge)
 
     def best(eyes: Float64) -> Float64:
@@ -275,7 +275,7 @@ def _hidden_share(
 ) -> Float64:
     """Share (K,) of points (N, 3) that lie behind others as seen from each of the eyes (K, 3).
 
-    Each looks along z of its camera's frame, (K, 3, 3), with cells of 11 mm at a `distance` (K,).
+    Columns of `turn` (K, 3, 3) are the axes of cameras; cells are 11 mm wide at a `distance` (K,).
     Points 15 mm behind others are seen, those 45 mm behind are hidden, others count in part; the
     others must be in all cells that are not empty, up to `edge` beside the point's.
     """
@@ -283,11 +283,9 @@ def _hidden_share(
     cell, away = np.empty((len(points), 2), np.int64), np.empty(len(points))
     for k in range(len(eyes)):
         nearest, cells = np.full((2 * half, 2 * half), np.inf), distance[k] / 0.011
+        in_view = (points - eyes[k]) @ turn[k]
         for n in range(len(points)):
-            a, b, c = points[n] - eyes[k]
-            x = turn[k, 0, 0] * a + turn[k, 0, 1] * b + turn[k, 0, 2] * c
-            y = turn[k, 1, 0] * a + turn[k, 1, 1] * b + turn[k, 1, 2] * c
-            z = turn[k, 2, 0] * a + turn[k, 2, 1] * b + turn[k, 2, 2] * c
+            x, y, z = in_view[n]
             cell[n, 0], cell[n, 1], away[n] = -1, -1, np.sqrt(x * x + y * y + z * z)
             if z < 0.05:  # behind the camera
                 share[k] += 1.0
