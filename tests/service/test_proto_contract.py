@@ -21,7 +21,9 @@ def breaks(folder: Path, old: str = "", new: str = "") -> str:
     (folder / FILE).parent.mkdir(parents=True, exist_ok=True)
     (folder / FILE).write_text(text.replace(old, new, 1))
     words = [str(BUF), "breaking", str(folder), "--against", str(CONTRACT)]
-    return subprocess.run(words, capture_output=True, text=True, check=False).stdout
+    run = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert run.returncode == (100 if run.stdout else 0), run.stderr
+    return run.stdout
 
 
 BREAKS = {  # by what is removed: what replaces it, and what is said
