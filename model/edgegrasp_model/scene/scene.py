@@ -134,8 +134,9 @@ def select_points(
     if options.workspace is not None:
         reach = FOLLOWED_REACH if options.follows_only else HAND_REACH
         sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
+    rows: Int64 | slice = slice(None)
     if len(viewpoints) == 0:
-        sent, viewpoints = _seen_from_above(sent, options.known_up)
+        rows, viewpoints = _seen_from_above(sent.points, options.known_up)
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
     # The caller's segments, 0 and below meaning none; else all points are one object.
@@ -144,7 +145,7 @@ def select_points(
         number = np.where(sent.segment_ids > 0, sent.segment_ids, UNDECIDED)
     needed = isinstance(options.support, AutoPlane) or (options.support is not None and not given)
     if needed and len(sent.points) > 0:
-        found = segment_cloud(sent, viewpoints, options.known_up)
+        found = segment_cloud(sent, viewpoints, options.known_up, rows)
         found = found if sent.segment_ids is None else found._replace(number=number)
     seen = ViewedPoints(sent.points, viewpoints.mean(axis=0))
     support = find_support(seen, inside, found, options, warnings)
@@ -251,16 +252,16 @@ def build_scene(
     )
 
 
-def _seen_from_above(sent: CheckedCloud, up: Float64 | None) -> tuple[CheckedCloud, Float64]:
-    """The points around the middle one, as a room would be seen too small, and a place above."""
+def _seen_from_above(points: Float32, up: Float64 | None) -> tuple[Int64, Float64]:
+    """Rows (M,) near the middle, as a room would be seen too small, and a place (1, 3) above."""
     over = np.array([0.0, 0.0, 1.0]) if up is None else up
-    if len(sent.points) == 0:
-        return sent, over[None]
-    beside = sent.points - np.median(sent.points, axis=0)
+    if len(points) == 0:
+        return np.empty(0, dtype=np.int64), over[None]
+    beside = points - np.median(points, axis=0)
     beside -= (beside @ over)[:, None] * over
     beside -= beside[np.linalg.norm(beside, axis=1).argmin()]  # there may be none at the median
-    near = sent.take(np.linalg.norm(beside, axis=1) < USUAL_DISTANCE)
-    return near, (near.points.mean(axis=0, dtype=np.float64) + 2.5 * USUAL_DISTANCE * over)[None]
+    near = np.flatnonzero(np.linalg.norm(beside, axis=1) < USUAL_DISTANCE)
+    return near, (points[near].mean(axis=0, dtype=np.float64) + 2.5 * USUAL_DISTANCE * over)[None]
 
 
 def _plane_under_hands(plane: SupportPlane, frame: CanonicalFrame, spare: float) -> SupportPlane:

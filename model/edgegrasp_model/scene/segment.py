@@ -84,13 +84,14 @@ def segment_cloud(
     cloud: CheckedCloud,  # N points
     viewpoints: Float64,  # (W, 3) of the cameras
     up: Float64 | None,  # (3,) unit, away from gravity; None: unknown
+    near: Int64 | slice,  # rows that are looked at, if there is one camera
 ) -> Segmentation:
     """Segment a cloud view by view; an object seen in several views gets one number."""
     points = cloud.points
     number, confidence, seen_up = np.full(len(points), UNDECIDED), np.empty(0), np.zeros(3)
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
     down: Float64 | None = None
-    rows_of_view: list[Int64 | slice] = [slice(None)]
+    rows_of_view: list[Int64 | slice] = [near]
     if len(viewpoints) > 1:
         assert cloud.view_ids is not None
         rows_of_view = [np.flatnonzero(cloud.view_ids == view) for view in range(len(viewpoints))]
