@@ -134,9 +134,7 @@ def select_points(
     if options.workspace is not None:
         reach = FOLLOWED_REACH if options.follows_only else HAND_REACH
         sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
-    rows: Int64 | slice = slice(None)
-    if len(viewpoints) == 0:
-        rows, viewpoints = _seen_from_above(sent.points, options.known_up)
+    rows, viewpoints = _looked_at(sent.points, viewpoints, options.known_up)
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
     # The caller's segments, 0 and below meaning none; else all points are one object.
@@ -252,8 +250,10 @@ def build_scene(
     )
 
 
-def _seen_from_above(points: Float32, up: Float64 | None) -> tuple[Int64, Float64]:
-    """Rows (M,) near the middle, as a room would be seen too small, and a place (1, 3) above."""
+def _looked_at(points: Float32, eyes: Float64, up: Float64 | None) -> tuple[Int64 | slice, Float64]:
+    """Rows that the eyes (W, 3) look at; without any, those near the middle, from 2 m above."""
+    if len(eyes) > 0:
+        return slice(None), eyes
     over = np.array([0.0, 0.0, 1.0]) if up is None else up
     if len(points) == 0:
         return np.empty(0, dtype=np.int64), over[None]
