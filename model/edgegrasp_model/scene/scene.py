@@ -127,20 +127,21 @@ def select_points(
     for name in ("approach_region", "contact_region"):
         if (region := getattr(options, name)) is not None:
             check_region(region, sent, name)
-    counts["points"], corrected = len(sent.points), None
+    counts["points"], corrected, found = len(sent.points), None, None
     if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
         sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
         corrected = sent.points
     if options.workspace is not None:
         reach = FOLLOWED_REACH if options.follows_only else HAND_REACH
         sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
-    rows, viewpoints = _looked_at(sent.points, viewpoints, options.known_up)
+    rows: Int64 | slice = slice(None)
+    if len(viewpoints) == 0:
+        rows, viewpoints = _seen_from_above(sent.points, options.known_up)
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
     # The caller's segments, 0 and below meaning none; else all points are one object.
-    number, found = np.zeros(len(sent.points), dtype=np.int64), None
-    if sent.segment_ids is not None:
-        number = np.where(sent.segment_ids > 0, sent.segment_ids, UNDECIDED)
+    ids, one = sent.segment_ids, np.zeros(len(sent.points), dtype=np.int64)
+    number = one if ids is None else np.where(ids > 0, ids, UNDECIDED)
     needed = isinstance(options.support, AutoPlane) or (options.support is not None and not given)
     if needed and len(sent.points) > 0:
         found = segment_cloud(sent, viewpoints, options.known_up, rows)
@@ -250,10 +251,8 @@ def build_scene(
     )
 
 
-def _looked_at(points: Float32, eyes: Float64, up: Float64 | None) -> tuple[Int64 | slice, Float64]:
-    """Rows that the eyes (W, 3) look at; without any, those near the middle, from 2 m above."""
-    if len(eyes) > 0:
-        return slice(None), eyes
+def _seen_from_above(points: Float32, up: Float64 | None) -> tuple[Int64, Float64]:
+    """Rows (M,) near the middle, as a room would be seen too small, and a place (1, 3) above."""
     over = np.array([0.0, 0.0, 1.0]) if up is None else up
     if len(points) == 0:
         return np.empty(0, dtype=np.int64), over[None]
