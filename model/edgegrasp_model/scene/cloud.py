@@ -233,8 +233,8 @@ def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64 | None:
     """The place (3,) above points (N, 3) from which the least is hidden: where their camera was.
 
     Of places from which nothing is hidden, the one that is nearest to USUAL_DISTANCE and to 30
-    degrees off `up` (3,). It turns and moves with the cloud. None: several cameras saw the points,
-    as some are hidden from everywhere.
+    degrees off `up` (3,). It turns with the cloud, up to rounding. None: several cameras saw the
+    points, as some are hidden from everywhere.
     """
     some = subsample(points, 20_000)
     apart = np.linalg.norm(some - np.median(some, axis=0), axis=1)

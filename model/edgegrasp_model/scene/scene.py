@@ -135,7 +135,7 @@ def select_points(
         reach = FOLLOWED_REACH if options.follows_only else HAND_REACH
         sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
     rows: Int64 | slice = slice(None)
-    if len(viewpoints) == 0:
+    if len(viewpoints) == 0 and len(sent.points) > 0:
         rows, viewpoints = _seen_from_above(sent.points, options.known_up)
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
@@ -146,7 +146,7 @@ def select_points(
     if needed and len(sent.points) > 0:
         found = segment_cloud(sent, viewpoints, options.known_up, rows)
         found = found if sent.segment_ids is None else found._replace(number=number)
-    seen = ViewedPoints(sent.points, viewpoints.mean(axis=0))
+    seen = ViewedPoints(sent.points, viewpoints.sum(axis=0) / max(len(viewpoints), 1))
     support = find_support(seen, inside, found, options, warnings)
     above_all = np.ones(len(inside), np.float32), np.zeros(len(inside), np.float32)
     height, margin = above_all if support is None else support.heights(seen)
@@ -216,7 +216,7 @@ def build_scene(
         return None
     frame = CanonicalFrame.of_scene(sent.points, selected.up, viewpoints[0])
     eyes = frame.points(viewpoints)
-    projection = sent.projection(frame, eyes)
+    projection = None if options.viewpoint is None else sent.projection(frame, eyes)
     voxels = voxelise(canonical := frame.points(sent.points), voxel_size, max_voxels)
     middles = voxels.mean(canonical)
     cloud, kept = clean_cloud(sent, voxels, middles, frame, eyes)
@@ -254,13 +254,11 @@ def build_scene(
 def _seen_from_above(points: Float32, up: Float64 | None) -> tuple[Int64, Float64]:
     """Rows (M,) near the middle, as a room would be seen too small, and a place (1, 3) above."""
     over = np.array([0.0, 0.0, 1.0]) if up is None else up
-    if len(points) == 0:
-        return np.empty(0, dtype=np.int64), over[None]
     beside = points - np.median(points, axis=0)
     beside -= (beside @ over)[:, None] * over
     beside -= beside[np.linalg.norm(beside, axis=1).argmin()]  # there may be none at the median
     near = np.flatnonzero(np.linalg.norm(beside, axis=1) < USUAL_DISTANCE)
-    return near, (points[near].mean(axis=0, dtype=np.float64) + 2.5 * USUAL_DISTANCE * over)[None]
+    return near, (points[near].mean(axis=0, dtype=np.float64) + USUAL_DISTANCE * over)[None]
 
 
 def _plane_under_hands(plane: SupportPlane, frame: CanonicalFrame, spare: float) -> SupportPlane:

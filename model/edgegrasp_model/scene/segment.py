@@ -99,6 +99,9 @@ def segment_cloud(
         row = subsample(cloud.row, 5000) // cloud.image_size[1]
         sight = unit(subsample(points, 5000) - viewpoints[0])
         down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
+    if not isinstance(near, slice):  # from above: in an image that turns with the points
+        sight = points[near] - viewpoints[0]
+        down = sight[np.linalg.norm(sight, axis=1).argmax()]
     seen = [(rows, points[rows], eye) for rows, eye in zip(rows_of_view, viewpoints, strict=True)]
     views = [view for view in seen if len(view[1])]
     for rows, part, viewpoint in views:
