@@ -22,9 +22,9 @@ from edgegrasp_service.front.grpc import GrpcServer
 from edgegrasp_service.front.http import HttpMiddleware, HttpProtocol, create_router
 from edgegrasp_service.front.service import GraspService, Places
 from edgegrasp_service.observability import LogQueue, Metrics, start_logging, write_line
-from edgegrasp_service.recording import check_outcomes
 from edgegrasp_service.settings import UNIX_PREFIX, Settings
 from edgegrasp_service.worker.process import PIECE_BYTES, Nursery, WorkerPool
+from edgegrasp_service.worker.recording import check_outcomes
 
 logger = logging.getLogger(__name__)
 

@@ -19,10 +19,10 @@ from edgegrasp_lab.replay import answer_again
 from edgegrasp_service.errors import DiskFull, InvalidSettings
 from edgegrasp_service.front.http import OPENAPI_DOCUMENT
 from edgegrasp_service.front.service import Admission
-from edgegrasp_service.recording import Recorder, append_line, check_outcomes
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import answer
 from edgegrasp_service.worker.process import Answer, Facts, Job, pack
+from edgegrasp_service.worker.recording import Recorder, append_line, check_outcomes
 from edgegrasp_training.evaluation import read_outcomes
 
 

@@ -20,10 +20,10 @@ from typing import Any
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service import errors
 from edgegrasp_service.observability import CALL, Call, Metrics, log_call
-from edgegrasp_service.recording import Recorder
 from edgegrasp_service.security import ADMIN_FIX, TOKEN_HEADER, ServerTls, Tokens
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.process import MAX_DEATHS, Answer, Job, WorkerPool
+from edgegrasp_service.worker.recording import Recorder
 
 logger = logging.getLogger(__name__)
 

@@ -45,8 +45,9 @@ from edgegrasp_model.request_cloud import (
 )
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Detection, Scoring, plain
-from edgegrasp_service import errors, recording
+from edgegrasp_service import errors
 from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker import recording
 from edgegrasp_service.worker.process import Answer, Facts, Job, Transport, limited_memory
 
 if TYPE_CHECKING:

@@ -1,0 +1,35 @@
+"""Flags that commands of the laboratory share."""
+
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from edgegrasp_cli.flags import Connection
+
+
+class Cluster(BaseModel, use_attribute_docstrings=True):
+    """The flags that choose the engine, the processes and the cluster."""
+
+    engine: str | None = None
+    """pybullet or mujoco; default: the protocol's, or the one that is installed"""
+    workers: int | None = None
+    """Processes, which do not change results; default: one per core"""
+    ray: str | None = None
+    """Address of a Ray cluster to run on; local: this machine"""
+
+
+class PlannerFlags(Connection):
+    """The flags that choose a planner of the benchmark."""
+
+    timeout: float = 300.0
+    """Seconds to wait for a server"""
+    planner: str = "server"
+    """server, in-process, name of an installed planner, or module:callable"""
+    server: str | None = None
+    """host:port (gRPC) or http://host:port; without it, one is started"""
+    weights: tuple[Path, ...] = ()
+    """Weights besides those that ship"""
+    model: str = ""
+    """Weights to use: a name or a .safetensors file; empty: the default"""
+    robot: str | None = None
+    """Arm that executes the grasps with its own hand, in MuJoCo: name or .toml file"""
