@@ -10,11 +10,11 @@ from pathlib import Path
 
 def main() -> None:
     """Run `edgegrasp` with the dummy detector; given settings as JSON, run its nursery instead."""
-    from edgegrasp_service.worker import process
+    from edgegrasp_service.worker import nursery, process
 
     if sys.argv[1].startswith("{"):
         dummy = runpy.run_path(str(Path(__file__).with_name("dummy.py")))
-        process.main(sys.argv[1], lambda settings: dummy["DummyCatalogue"]())
+        nursery.main(sys.argv[1], lambda settings: dummy["DummyCatalogue"]())
         return
     process.NURSERY_COMMAND = (sys.executable, "-P", __file__)
     from edgegrasp_cli.main import main

@@ -7,12 +7,12 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel
 from rich.console import Console
 from rich.progress import Progress, TimeElapsedColumn
 from typer import Argument, Option
 
-from edgegrasp_cli.flags import Connection, option_flags, parse_option_flags, takes_flags
+from edgegrasp_cli.flags import option_flags, parse_option_flags, takes_flags
+from edgegrasp_lab.flags import Cluster, PlannerFlags
 from edgegrasp_model.gripper import gripper_fields
 from edgegrasp_sim import results
 from edgegrasp_sim.benchmark import BenchmarkConfig, manifest, run_benchmark
@@ -30,34 +30,6 @@ DECIDED = (
     *("model", "gripper", "seed", "viewpoint", "up", "support", "objects", "workspace"),
     *("top_k", "debug", "robot", "previous"),
 )
-
-
-class Cluster(BaseModel, use_attribute_docstrings=True):
-    """The flags that choose the engine, the processes and the cluster."""
-
-    engine: str | None = None
-    """pybullet or mujoco; default: the protocol's, or the one that is installed"""
-    workers: int | None = None
-    """Processes, which do not change results; default: one per core"""
-    ray: str | None = None
-    """Address of a Ray cluster to run on; local: this machine"""
-
-
-class PlannerFlags(Connection):
-    """The flags that choose a planner of the benchmark."""
-
-    timeout: float = 300.0
-    """Seconds to wait for a server"""
-    planner: str = "server"
-    """server, in-process, name of an installed planner, or module:callable"""
-    server: str | None = None
-    """host:port (gRPC) or http://host:port; without it, one is started"""
-    weights: tuple[Path, ...] = ()
-    """Weights besides those that ship"""
-    model: str = ""
-    """Weights to use: a name or a .safetensors file; empty: the default"""
-    robot: str | None = None
-    """Arm that executes the grasps with its own hand, in MuJoCo: name or .toml file"""
 
 
 class BenchmarkFlags(Cluster, PlannerFlags):

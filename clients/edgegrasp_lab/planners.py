@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, cast
 from edgegrasp_cli.detect import OwnDetector
 from edgegrasp_client import GraspClientError, Model, ServerUnavailableError, StartCollisionError
 from edgegrasp_client.connection import local_server
-from edgegrasp_lab.benchmark import PlannerFlags
+from edgegrasp_lab.flags import PlannerFlags
 from edgegrasp_model.errors import StartCollision
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.protocol import PlanningRules

@@ -12,7 +12,7 @@ from rich.progress import Progress, track
 from typer import Argument, Option
 
 from edgegrasp_cli.flags import takes_flags
-from edgegrasp_lab.benchmark import Cluster
+from edgegrasp_lab.flags import Cluster
 from edgegrasp_training.options import GenerationOptions, TrainingOptions
 
 

@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 from tests.cli.conftest import invoke
 
-from edgegrasp_lab.benchmark import PlannerFlags, benchmark_arm
+from edgegrasp_lab.benchmark import benchmark_arm
+from edgegrasp_lab.flags import PlannerFlags
 from edgegrasp_lab.planners import named_planner, open_planner, request_options
 from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_model.errors import InvalidRequest

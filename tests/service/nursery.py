@@ -21,7 +21,7 @@ from edgegrasp_service import errors
 from edgegrasp_service.errors import Overloaded, kind_of
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import answer as answer  # what a nursery imports
-from edgegrasp_service.worker.process import main
+from edgegrasp_service.worker.nursery import main
 
 PATIENCE = 20  # seconds; longer than anything takes
 FOLDER = Path()  # what a test writes into it tells what happens

@@ -1,17 +1,11 @@
-"""Worker processes: the front's pool of them, their messages, and the nursery they fork from.
+"""Worker processes as the front has them: their messages, and the pool that runs jobs in them.
 
-usage: python -m edgegrasp_service.worker.process SETTINGS    as JSON; standard input: the pool's
-socket
-
-`WorkerPool` runs jobs, replaces dead processes and reloads. `main` runs the nursery. It imports and
-loads what a worker needs, then forks a worker whenever the pool asks for one; that takes
-milliseconds, and memory is shared until written to. The nursery never has a second thread. A
-message has plain values as JSON, and a body as bytes.
+`WorkerPool` runs jobs, replaces dead processes and reloads. Its workers are forked by a `Nursery`,
+a process that runs `nursery.py`. A message has plain values as JSON, and a body as bytes.
 """
 
 import asyncio
 import contextlib
-import gc
 import json
 import logging
 import os
@@ -22,7 +16,6 @@ import struct
 import subprocess
 import sys
 import time
-import traceback
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -34,7 +27,7 @@ from edgegrasp_service import errors
 from edgegrasp_service.settings import Settings
 
 # -P: nothing is imported from the folder the server was started in.
-NURSERY_COMMAND = (sys.executable, "-P", "-m", "edgegrasp_service.worker.process")
+NURSERY_COMMAND = (sys.executable, "-P", "-m", "edgegrasp_service.worker.nursery")
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 # Freed memory is kept for the next request: the system hands out new pages slowly.
 KEPT_MEMORY = {"MALLOC_TRIM_THRESHOLD_": str(2**26), "MALLOC_MMAP_THRESHOLD_": str(2**24)}
@@ -48,7 +41,6 @@ PULSE_SECONDS = 10.0  # seconds for it to answer
 KILL_SECONDS = 0.5  # seconds that a worker may use to finish an abandoned job
 RETRY_SECONDS = 1.0  # seconds after a worker or the nursery failed to start
 
-ORPHAN_SECONDS = 10.0  # seconds after its deadline at which a worker ends itself if nobody kills it
 ENDED = struct.Struct("=ii")  # the nursery's message about a worker: process id and wait status
 LOST = "The worker of this request died or ran out of memory. Try again, or send fewer points."
 MESSAGE_HEADER = struct.Struct(">QQ")  # bytes of a message's JSON, and of the body that follows it
@@ -126,6 +118,12 @@ def unpack(text: bytes, body: bytes) -> Any:
         fields["facts"] = Facts(**fields["facts"])
         fields["error"] = fields["error"] and errors.Problem(**fields["error"])
     return MESSAGES[name](**fields)
+
+
+def send(to: socket.socket, message: object) -> None:
+    """Send a message to the other end."""
+    for part in pack(message):
+        to.sendall(part)
 
 
 def receive(file: BinaryIO) -> Any:
@@ -427,80 +425,6 @@ class _Worker:
 # The nursery and its workers
 
 
-def main(settings_json: str, load: Callable[[Settings], Any] | None = None) -> None:
-    """Load, then fork a worker for each socket received on standard input, until it closes.
-
-    `settings_json` holds the settings; `load` replaces `load_catalogue`.
-    """
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # the pool decides when to end
-    gc.disable()  # it would take a fifth of the start, and scan millions of lists of points later
-    # Imported here, since the front imports this module but must not load parsers.
-    from edgegrasp_service.worker.answer import load_catalogue
-
-    pool, settings = socket.socket(fileno=0), Settings(**json.loads(settings_json))
-    load = load or load_catalogue
-    # A GPU's context cannot be forked: with one, every worker loads the weights for itself.
-    catalogue = _loaded(pool, settings, load) if settings.device == "cpu" else None
-    _send(pool, Ready(os.getpid(), []))
-    signal.signal(signal.SIGCHLD, lambda *_: _tell_of_ended(pool))
-    gc.freeze()  # collecting garbage would write to shared pages
-    while True:
-        _, descriptors, _, _ = socket.recv_fds(pool, 1, 1)
-        if not descriptors:
-            return
-        if os.fork() == 0:
-            try:
-                signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-                pool.close()
-                _work(socket.socket(fileno=descriptors[0]), settings, catalogue, load)
-            except Exception:
-                traceback.print_exc()
-            finally:
-                os._exit(0)
-        os.close(descriptors[0])
-
-
-def _tell_of_ended(pool: socket.socket) -> None:
-    with contextlib.suppress(OSError):  # there are no more
-        while (ended := os.waitpid(-1, os.WNOHANG))[0]:
-            pool.send(ENDED.pack(*ended), socket.MSG_DONTWAIT)
-
-
-def _loaded(pool: socket.socket, settings: Settings, load: Callable[[Settings], Any]) -> Any:
-    """Load what answers requests; if that fails, tell the pool why and end this process."""
-    try:
-        return load(settings)
-    except (EdgeGraspError, ModuleNotFoundError) as error:
-        _send(pool, Ready(os.getpid(), [], str(error)))
-        sys.exit()
-
-
-def _work(
-    pool: socket.socket, settings: Settings, catalogue: Any, load: Callable[[Settings], Any]
-) -> None:
-    """Answer jobs, one after the other, until the pool closes the socket."""
-    from edgegrasp_service.worker.answer import answer, load_robots
-
-    catalogue = catalogue or _loaded(pool, settings, load)
-    robots = [robot.describe() for robot in load_robots(settings).values()]
-    with limited_memory(settings.max_worker_bytes):
-        _send(pool, Ready(os.getpid(), catalogue.describe(), robots=robots))
-        jobs = pool.makefile("rb")
-        while (job := receive(jobs)) is not None:
-            signal.setitimer(signal.ITIMER_REAL, max(job.remaining, 0.0) + ORPHAN_SECONDS)
-            try:
-                found = answer(job, catalogue, settings)
-            except BaseException:  # out of memory
-                facts = Facts(traceback=traceback.format_exc(), deaths=1)
-                _send(pool, Answer(b"", facts, errors.report(errors.WorkerLost(LOST))))
-                return
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-            _send(pool, found)
-            del job, found  # otherwise they would add to the next request's
-            gc.collect()
-
-
 @contextlib.contextmanager
 def limited_memory(most: int) -> Iterator[None]:
     """Limit this process to so many more bytes; allocations beyond that fail."""
@@ -514,14 +438,3 @@ def limited_memory(most: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_DATA, before)
-
-
-def _send(to: socket.socket, message: object) -> None:
-    for part in pack(message):
-        to.sendall(part)
-
-
-if __name__ == "__main__":
-    from edgegrasp_service.worker import process  # whose messages workers make
-
-    process.main(sys.argv[1])
