@@ -98,7 +98,8 @@ def _list(schema: Schema) -> str:
     if parts is not None:
         return f"[{', '.join(map(_kind, parts))}]"
     low, high = schema.get("minItems", 0), schema.get("maxItems")
-    size = "" if high is None else f" of {low} to {high}" if low else f" of up to {high}"
+    bounds = f"{high}" if low == high else f"{low} to {high}" if low else f"up to {high}"
+    size = "" if high is None else f" of {bounds}"
     return f"list{size}: {_kind(schema['items'])}"
 
 
