@@ -1,13 +1,13 @@
 """PyBullet, which the published figures were measured in."""
 
 from contextlib import AbstractContextManager
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 import pybullet
 import pybullet_data
+from pybullet_utils.bullet_client import BulletClient
 
 from edgegrasp_camera.arrays import Float64, Int64
 from edgegrasp_sim import engine
@@ -39,8 +39,8 @@ class PybulletWorld(AbstractContextManager["PybulletWorld"]):
     shake_distance, shake_step = 0.05, 0.0125  # at 1 m/s: the hand lags and comes half as far
 
     def __init__(self) -> None:
-        self.client = _Client()
-        if self.client.number < 0:
+        self.client = BulletClient(pybullet.DIRECT)
+        if not self.client.isConnected():
             raise RuntimeError("PyBullet did not start a physics server; close unused worlds")
         self.reset()
 
@@ -48,9 +48,8 @@ class PybulletWorld(AbstractContextManager["PybulletWorld"]):
         self.close()
 
     def close(self) -> None:
-        if self.client.number >= 0:
+        if self.client.isConnected():
             self.client.disconnect()
-            self.client.number = -1
 
     def reset(self) -> None:
         self.client.resetSimulation()
@@ -142,20 +141,10 @@ class PybulletWorld(AbstractContextManager["PybulletWorld"]):
         return depth, np.resize(np.asarray(bodies, dtype=np.int64), shape)
 
 
-class _Client:
-    """PyBullet's functions, for one physics server."""
-
-    def __init__(self) -> None:
-        self.number: int = pybullet.connect(pybullet.DIRECT)
-
-    def __getattr__(self, function: str) -> Any:
-        return partial(getattr(pybullet, function), physicsClientId=self.number)
-
-
 class PybulletBody:
     """A body of a physics server."""
 
-    def __init__(self, client: _Client, uid: int) -> None:
+    def __init__(self, client: BulletClient, uid: int) -> None:
         self.client = client
         self.uid = uid
 
@@ -181,8 +170,7 @@ class PybulletBody:
 
     @property
     def bounds(self) -> Float64:
-        lower, upper = self.client.getAABB(self.uid)
-        return np.asarray((lower, upper), dtype=np.float64)
+        return np.asarray(self.client.getAABB(self.uid), dtype=np.float64)
 
     def contacts(self) -> list[Contact]:
         points = self.client.getContactPoints(self.uid)
@@ -192,7 +180,7 @@ class PybulletBody:
 class PybulletHand(PybulletBody):
     """A hand that a fixed constraint drags; the last two links are its fingers."""
 
-    def __init__(self, client: _Client, model: HandModel, position: Float64) -> None:
+    def __init__(self, client: BulletClient, model: HandModel, position: Float64) -> None:
         self.client, self.model = client, model
         if model.meshes is None:
             palm, *fingers = (_boxes(client, each) for each in (model.palm, *model.fingers))
@@ -285,14 +273,14 @@ class PybulletHand(PybulletBody):
         self.client.setJointMotorControl2(self.uid, link, mode, **goal, **gain)
 
 
-def _hull(client: _Client, mesh: str, quaternion_xyzw: Vector) -> int:
+def _hull(client: BulletClient, mesh: str, quaternion_xyzw: Vector) -> int:
     shape = client.createCollisionShape(
         pybullet.GEOM_MESH, fileName=str(_MESHES / mesh), collisionFrameOrientation=quaternion_xyzw
     )
     return int(shape)
 
 
-def _boxes(client: _Client, parts: Parts) -> int:
+def _boxes(client: BulletClient, parts: Parts) -> int:
     shape = client.createCollisionShapeArray(
         shapeTypes=[pybullet.GEOM_BOX] * len(parts),
         halfExtents=[(np.ptp(part, axis=0) / 2).tolist() for part in parts],
