@@ -204,9 +204,8 @@ def compare(first: ResultFolder, second: ResultFolder) -> dict[str, Any]:
     shared = sorted(rounds[0].keys() & rounds[1].keys())
     if not shared:
         raise ValueError(f"{first.path} and {second.path} share no round; use the same seeds")
-    successes, attempts, objects = np.stack(
-        [count([run[key] for key in shared]) for run in rounds], axis=1
-    )  # (2, S) each
+    counts = [count([run[key] for key in shared]) for run in rounds]
+    successes, attempts, objects = np.stack(counts, axis=1)  # (2, S) each
     figures: dict[str, Any] = {
         "first": runs[0]["planner"],
         "second": runs[1]["planner"],

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float64
-from edgegrasp_sim.engine import TIME_STEP, Body, World
+from edgegrasp_sim.engine import TIME_STEP, Body, Vector, World
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import about_z
 from edgegrasp_sim.surroundings import (
@@ -68,11 +68,7 @@ class SceneObject:
 
 
 def load_object(
-    world: World,
-    model: ObjectModel,
-    position: Sequence[float],
-    quaternion_xyzw: Sequence[float],
-    scale: float,
+    world: World, model: ObjectModel, position: Vector, quaternion_xyzw: Vector, scale: float
 ) -> SceneObject:
     """Load an object with its link frame there; `scale` comes on top of the model's own."""
     if not model.urdf.is_file():

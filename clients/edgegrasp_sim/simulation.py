@@ -14,7 +14,7 @@ from edgegrasp_camera.picture import shaded
 from edgegrasp_results import ArmTrajectory
 from edgegrasp_sim import hand
 from edgegrasp_sim.camera import CAMERA, FARTHEST, Observation, TableView, crop, points_of
-from edgegrasp_sim.engine import ArmModel, make_world
+from edgegrasp_sim.engine import ArmModel, Vector, make_world
 from edgegrasp_sim.engine.urdf import least_width
 from edgegrasp_sim.hand import MIN_OPENING, ArmGripper, GraspResult, Gripper, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
@@ -120,8 +120,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         surround, make = STANDING_IN[kind]
         around = self._clear(table if surround is None else surround(rng))
         scales = scales or SCALES[kind.objects]
-        layout = Layout(self.world, around, objects, rng, num_objects, scales)
-        self._objects = make(layout)
+        self._objects = make(Layout(self.world, around, objects, rng, num_objects, scales))
         self._gripper = self._add_gripper()
         return self.num_objects
 
@@ -139,9 +138,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
             self._objects.append(item)
         self._gripper = self._add_gripper()
 
-    def move(
-        self, number: int, position: Sequence[float], quaternion_xyzw: Sequence[float]
-    ) -> None:
+    def move(self, number: int, position: Vector, quaternion_xyzw: Vector) -> None:
         """Move one of the `placements`, by its index, without simulating."""
         self._rest_state = None
         self._objects[number].body.set_pose(position, quaternion_xyzw)
@@ -168,12 +165,11 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
             points = points + rng_noise.normal(0.0, noise_std, size=points.shape)
             clouds.append(crop(points, box).astype(np.float32, order="C"))
         whole = table not in boxes and len(clouds) == 1
-        positions = np.stack([T[:3, 3] for T in T_world_cameras]).astype(np.float32)
         return Observation(
             cloud=np.concatenate(clouds),
             workspace=workspace.astype(np.float32),
             table_height=TABLE_HEIGHT,
-            camera_positions=positions,
+            camera_positions=np.stack([T[:3, 3] for T in T_world_cameras]).astype(np.float32),
             view_ids=np.repeat(np.arange(len(clouds), dtype=np.int32), [len(c) for c in clouds]),
             table=table,
             pixels=np.flatnonzero(depth < FARTHEST * CAMERA.far) if whole else None,
@@ -219,7 +215,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
             ValueError: The pose is not rigid.
         """
         self._hand.motion = motion
-        result = self._run(T_world_hand, to_the_end=True)
+        result = self._run(T_world_hand, to_the_end=True, shake=False)
         self._rest_state = None
         self._hand.park()
         if result.held is not None:
@@ -239,9 +235,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
             raise RuntimeError("there is no scene yet; call reset or reset_from_poses first")
         return self._gripper
 
-    def _run(
-        self, T_world_hand: ArrayLike, *, to_the_end: bool, shake: bool = False
-    ) -> GraspResult:
+    def _run(self, T_world_hand: ArrayLike, *, to_the_end: bool, shake: bool) -> GraspResult:
         T = require_pose(T_world_hand)
         self._restore_rest()
         objects = {item.body.uid: item for item in self._objects}

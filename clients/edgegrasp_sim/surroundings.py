@@ -79,15 +79,13 @@ class Surroundings:
 
     def add_to(self, world: World) -> frozenset[int]:
         """Add everything to a world; returns the ids of the obstacles' bodies."""
-        bodies = [box.add_to(world).uid for box in self.boxes]
-        pairs = zip(bodies, self.boxes, strict=True)
-        return frozenset(uid for uid, box in pairs if box.obstacle)
+        added = [(box.add_to(world).uid, box) for box in self.boxes]
+        return frozenset(uid for uid, box in added if box.obstacle)
 
     def contain(self, body: Body) -> bool:
         """Whether an object is within the bounds."""
         low, high = np.asarray(self.bounds)
-        position = body.position
-        return bool((position >= low).all() and (position <= high).all())
+        return bool(((low <= body.position) & (body.position <= high)).all())
 
 
 def _slab(size: Vector, top: float, x: float = MIDDLE, y: float = MIDDLE) -> Box:

@@ -226,11 +226,10 @@ def turned(batch: BallBatch, turn: Float32) -> BallBatch:
 
 def random_turn(rng: np.random.Generator, *, upright: bool) -> Float32:
     """A random rotation (3, 3) of balls: any (paper, section IV-D), or about up."""
-    turn = (
-        Rotation.from_rotvec(rng.uniform(0.0, 2 * np.pi) * UP)
-        if upright
-        else Rotation.random(rng=rng)
-    )
+    if upright:
+        turn = Rotation.from_rotvec(rng.uniform(0.0, 2 * np.pi) * UP)
+    else:
+        turn = Rotation.random(rng=rng)
     return turn.as_matrix().astype(np.float32)
 
 
