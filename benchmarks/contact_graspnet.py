@@ -58,8 +58,7 @@ class ContactGraspNet:
         prepared = self.detector.prepare(CloudInput(observation.image), options)
         if (scene := prepared.scene) is None:
             return None
-        rng = np.random.default_rng(seed)
-        points = _points(scene, observation, rng)
+        points = _points(scene, observation, np.random.default_rng(seed))
         middle = points.mean(axis=0)
         with torch.inference_mode():
             contact, T_hand, width, score = self._grasps((points - middle).astype(np.float32))

@@ -78,8 +78,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     os.environ["DUMMY_SECONDS"] = "0.002"
-    dummy = [sys.executable, "-P", serve_dummy.__file__]
-    with local_server(*FLAGS, program=dummy) as server:
+    with local_server(*FLAGS, program=[sys.executable, "-P", serve_dummy.__file__]) as server:
         results = run(server, given.clients, given.minutes * 60, given.seed)
         process = psutil.Process(server.pid)
         process.terminate()

@@ -256,9 +256,8 @@ def _objects_held(scene: RealScene, grasps: Sequence[Any]) -> Int64:
 def _compare(scene: RealScene, normal: Array, offset: float) -> PlaneFigures:
     cosine = float(np.clip(np.asarray(normal, dtype=np.float64) @ scene.normal, -1.0, 1.0))
     angle = float(np.degrees(np.arccos(cosine)))
-    middles = np.array(
-        [np.nanmedian(scene.points[scene.labels == k], axis=0) for k in scene.objects]
-    )
+    of_objects = [scene.points[scene.labels == label] for label in scene.objects]
+    middles = np.array([np.nanmedian(points, axis=0) for points in of_objects])
     height = middles.astype(np.float64) @ scene.normal - scene.offset
     feet = middles - height[:, None] * scene.normal
     apart = float(np.abs(feet @ normal - offset).max())

@@ -40,10 +40,9 @@ class DepthNoise:
         if self.gamma_shape > 0:
             noisy = noisy * rng.gamma(self.gamma_shape, self.gamma_scale)
         if self.correlated_std > 0 and rng.random() < self.correlated_share:
-            height, width = depth.shape
-            step = self.correlated_pixels
-            coarse = rng.normal(0.0, self.correlated_std, (height // step, width // step))
-            factors = (height / coarse.shape[0], width / coarse.shape[1])
+            cells = np.floor_divide(depth.shape, self.correlated_pixels)
+            coarse = rng.normal(0.0, self.correlated_std, cells)
+            factors = np.divide(depth.shape, coarse.shape)
             noisy = noisy + zoom(coarse, factors, order=1, mode="nearest", grid_mode=True)
         return noisy
 

@@ -21,13 +21,14 @@ WORKSPACE = ((0.02, 0.02, BOTTOM), (SIZE - 0.02, SIZE - 0.02, SIZE))
 MIDDLE = SIZE / 2  # metres, x and y of the middle of every scene
 
 Span = tuple[float, float]  # least and greatest, metres
+Spans = tuple[Span, Span, Span]  # of length, width and height
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]  # lowest, highest; metres
 
 # Random bins. Length, width and height inside: the palm of the Panda's hand is 20 cm wide and 5 cm
 # above its fingertips, so that along a higher wall it holds little.
-BIN_INSIDE: tuple[Span, Span, Span] = ((0.40, 0.60), (0.30, 0.42), (0.03, 0.08))
-SMALL_BIN_INSIDE: tuple[Span, Span, Span] = ((0.30, 0.40), (0.24, 0.30), (0.03, 0.08))
-DEEP_BIN_INSIDE: tuple[Span, Span, Span] = ((0.36, 0.60), (0.26, 0.42), (0.08, 0.22))
+BIN_INSIDE: Spans = ((0.40, 0.60), (0.30, 0.42), (0.03, 0.08))
+SMALL_BIN_INSIDE: Spans = ((0.30, 0.40), (0.24, 0.30), (0.03, 0.08))
+DEEP_BIN_INSIDE: Spans = ((0.36, 0.60), (0.26, 0.42), (0.08, 0.22))
 BIN_WALL: Span = (0.008, 0.015)  # its floor is as thick; objects are pressed through thinner ones
 GROUND = 0.2  # metres, depth of a floor into what it stands on, for the same reason
 STAND_SHARE = 0.3  # of the bins, which stand off the table: on a stand, a conveyor
@@ -42,12 +43,12 @@ TABLE_OVER_FLOOR: Span = (0.4, 0.8)
 LARGE_OBJECTS = (1, 3)  # least and most objects too large to grasp
 LARGE_DISTANCE: Span = (0.05, 0.30)  # from the middle to the nearest side of a large object
 # Length, width and height of large objects. No hand would grasp a longer object.
-CARTON: tuple[Span, Span, Span] = ((0.42, 0.60), (0.10, 0.35), (0.05, 0.40))
-PANEL: tuple[Span, Span, Span] = ((0.42, 0.60), (0.02, 0.05), (0.42, 0.55))  # monitors, walls
-KERB: tuple[Span, Span, Span] = ((0.42, 0.60), (0.04, 0.12), (0.02, 0.06))  # books, keyboards
+CARTON: Spans = ((0.42, 0.60), (0.10, 0.35), (0.05, 0.40))
+PANEL: Spans = ((0.42, 0.60), (0.02, 0.05), (0.42, 0.55))  # monitors, walls
+KERB: Spans = ((0.42, 0.60), (0.04, 0.12), (0.02, 0.06))  # books, keyboards
 
 # Random shelves. Width, depth and height inside a compartment, in which a hand has room.
-SHELF_INSIDE: tuple[Span, Span, Span] = ((0.45, 0.90), (0.26, 0.40), (0.34, 0.48))
+SHELF_INSIDE: Spans = ((0.45, 0.90), (0.26, 0.40), (0.34, 0.48))
 SHELF_BOARD: Span = (0.015, 0.030)
 SHELF_MARGIN = 0.06  # metres from its sides and edges where no object is put
 SHELF_OVER_FLOOR: Span = (0.4, 1.2)
@@ -102,9 +103,7 @@ def open_table(thickness: float = OPEN_THICKNESS) -> Surroundings:
 OPEN_TABLE = open_table()
 
 
-def random_bin(
-    rng: np.random.Generator, extents: tuple[Span, Span, Span] = BIN_INSIDE
-) -> Surroundings:
+def random_bin(rng: np.random.Generator, extents: Spans = BIN_INSIDE) -> Surroundings:
     """An open box of inner `extents` on a table or over it, its floor at `TABLE_HEIGHT`."""
     length, width, height = (rng.uniform(*extent) for extent in extents)
     wall = rng.uniform(*BIN_WALL)

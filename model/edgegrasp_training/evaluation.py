@@ -94,11 +94,10 @@ def reliability(
 ) -> dict[float, Range]:
     """Outcomes in each non-empty range of scores, by its lower edge. # (E,), (E,)."""
     place = np.digitize(score, edges[1:-1])
-    ranges = {low: place == k for k, low in enumerate(edges[:-1])}
+    ranges = {edges[k]: place == k for k in np.unique(place)}
     return {
         low: Range(float(score[mine].mean()), float(held[mine].mean()), int(mine.sum()))
         for low, mine in ranges.items()
-        if mine.any()
     }
 
 

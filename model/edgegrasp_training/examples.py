@@ -88,7 +88,10 @@ def tried_grasps(
     rows = view.tried()
     cloud = Cloud(view.points, view.normals)
     candidates = _candidates(view, cloud, rows)
-    label = _labels(view)[rows[candidates.pair]]
+    # A grasp that holds counts a little more where it survives shaking.
+    shaken = UNTRIED if view.firm is None else view.firm
+    firm = np.where(shaken == UNTRIED, FIRM_SHARE, shaken == 1)
+    labels = np.asarray((view.success == 1) * (1.0 - SHAKEN_SHARE * (1.0 - firm)), np.float32)
     seen = None
     if config.architecture == "hand":
         viewpoints = view.camera_position[None] if viewpoint_known else np.empty((0, 3), np.float32)
@@ -96,7 +99,7 @@ def tried_grasps(
         seen = replace(batch, description=batch.description.half(), points=batch.points.half())
     frame = CanonicalFrame.of_scene(view.points, view.up, view.camera_position)
     turn = frame.directions(np.eye(3)).T.astype(np.float32)
-    return TriedGrasps(cloud, candidates, seen, label, turn)
+    return TriedGrasps(cloud, candidates, seen, labels[rows[candidates.pair]], turn)
 
 
 def hand_batch(
@@ -231,13 +234,6 @@ def random_turn(rng: np.random.Generator, *, upright: bool) -> Float32:
     else:
         turn = Rotation.random(rng=rng)
     return turn.as_matrix().astype(np.float32)
-
-
-def _labels(view: LabelledView) -> Float32:
-    """Targets (E,): whether each grasp holds, and a little more where it survives shaking."""
-    held, shaken = view.success == 1, UNTRIED if view.firm is None else view.firm
-    firm = np.where(shaken == UNTRIED, FIRM_SHARE, shaken == 1)
-    return np.asarray(held * (1.0 - SHAKEN_SHARE * (1.0 - firm)), np.float32)
 
 
 def _candidates(view: LabelledView, cloud: Cloud, rows: Int64) -> Candidates:

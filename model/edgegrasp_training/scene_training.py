@@ -32,7 +32,6 @@ CLOSER_SHARE = 0.5  # of the smaller images, a part of a stored image rather tha
 CROPPED_SHARE = 0.12  # share of the images cropped to the objects' surroundings
 HELD_OUT = 2  # files, the first ones, that the network never learns from
 EVALUATED = 200  # of their images, about
-LEARNING_RATE = 3e-3
 WARM_UP = 200  # steps
 SAVE_EVERY = 300  # seconds
 AVERAGED = 0.998  # of the mean weights that stay at each step
@@ -232,7 +231,7 @@ def train(
     seed: int = 0,  # of weights and batches
     start: Path | None = None,  # a checkpoint to go on from
     threads: int = 1,  # of the processor
-    rate: float = LEARNING_RATE,  # the highest learning rate
+    rate: float = 3e-3,  # the highest learning rate
 ) -> None:
     """Train for a given time; `run/scene.safetensors` gets the mean weights every few minutes."""
     torch.manual_seed(seed)

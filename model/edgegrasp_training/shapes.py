@@ -64,8 +64,7 @@ def household_objects(folder: Path, count: int, rng: np.random.Generator) -> Obj
         points = [part.points for part in parts]
         volume = [ConvexHull(each).volume for each in points]
         centre = np.average([each.mean(0) for each in points], axis=0, weights=volume)
-        path = write_parts(name, parts, parts, centre, folder)
-        models.append(ObjectModel(name, path))
+        models.append(ObjectModel(name, write_parts(name, parts, parts, centre, folder)))
     return ObjectSet("household", tuple(models))
 
 
