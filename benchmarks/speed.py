@@ -116,10 +116,9 @@ def server() -> dict[str, float]:
         ready = time.perf_counter() - start
         at_rest = memory(running.pid)
         seen = observe(SceneKind.PILE, **DEMO)
-        viewpoint = tuple(seen.camera_position.tolist())
         with GraspClient(running.grpc_address) as client:
             for seed in range(10):
-                client.detect(seen.cloud, seed=seed, viewpoint=viewpoint)
+                client.detect(seen.cloud, seed=seed, viewpoint=seen.camera_position.tolist())
         return {"ready_seconds": ready, "rest_mb": at_rest, "used_mb": memory(running.pid)}
 
 

@@ -183,8 +183,7 @@ def benchmark_tracking(
     done: dict[str, list[Followed]] = {}
     with open_client(asked) as client:
         for name in names:
-            moving = MOTIONS[name]
-            moving = replace(moving, seconds=moving.seconds if seconds is None else seconds)
+            moving = MOTIONS[name] if seconds is None else replace(MOTIONS[name], seconds=seconds)
             if scenes:
                 made: Any = ((one.name, RecordedScene(one)) for one in load_scenes(scenes))
             else:

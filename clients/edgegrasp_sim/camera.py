@@ -104,8 +104,7 @@ def points_of(depth: Float64, T_world_camera: Float64, camera: Intrinsics) -> Fl
     down = (np.arange(1, camera.height + 1)[:, None] - camera.centre_y) * depth
     right, down = right[seen] / camera.focal_length, down[seen] / camera.focal_length
     in_camera = np.stack((right, down, depth[seen]))
-    in_world = T_world_camera[:3, :3] @ in_camera + T_world_camera[:3, 3:]
-    return in_world.T
+    return (T_world_camera[:3, :3] @ in_camera + T_world_camera[:3, 3:]).T
 
 
 def crop(points: NDArray[Float], box: NDArray[np.floating], margin: float = 0.0) -> NDArray[Float]:

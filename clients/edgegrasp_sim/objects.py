@@ -143,8 +143,7 @@ class ObjectSet:
         names = [path.stem for path in meshes]
         if twice := sorted({each for each in names if names.count(each) > 1}):
             raise ValueError(f"{folder} holds several meshes named {', '.join(twice)}; keep one")
-        models = [ObjectModel(path.stem, prepare_mesh(path)) for path in meshes]
-        return cls(name, tuple(models))
+        return cls(name, tuple(ObjectModel(path.stem, prepare_mesh(path)) for path in meshes))
 
     @classmethod
     def builtin(cls, scene: SceneKind) -> "ObjectSet":
@@ -190,12 +189,8 @@ def prepare_mesh(mesh: Path) -> Path:
         surface.apply_scale(min(SHORTEST_SIDE / sides[0], LONGEST_SIDE / sides[2]))
         surface.apply_translation(-surface.bounds.mean(axis=0))
         coacd.set_log_level("error")
-        solids = coacd.run_coacd(
-            coacd.Mesh(np.asarray(surface.vertices), np.asarray(surface.faces)),
-            threshold=CONCAVITY,
-            seed=0,
-            **SEARCH,
-        )
+        whole = coacd.Mesh(np.asarray(surface.vertices), np.asarray(surface.faces))
+        solids = coacd.run_coacd(whole, threshold=CONCAVITY, seed=0, **SEARCH)
         parts = [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in solids]
         solid: Any = trimesh.util.concatenate(parts)
         visible, hulls = ([(m.vertices, m.faces) for m in meshes] for meshes in ([surface], parts))

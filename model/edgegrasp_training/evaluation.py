@@ -74,9 +74,7 @@ def fit_temperature(logit: Floats, label: Floats) -> float:
     """The t for which sigmoid(logit / t) has the least cross entropy."""
     logit, label = logit.astype(np.float64), label.astype(np.float64)
     best = minimize_scalar(
-        lambda log_t: cross_entropy(logit / np.exp(log_t), label),
-        bounds=(-2.0, 2.0),
-        method="bounded",
+        lambda log_t: cross_entropy(logit / np.exp(log_t), label), bounds=(-2.0, 2.0)
     )
     return float(np.exp(best.x))
 

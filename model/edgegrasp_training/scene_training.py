@@ -104,10 +104,8 @@ def _example(
     count = np.bincount(number[number >= 0], minlength=1)
     weight = np.where(number >= 0, 1.0 / np.sqrt(count[np.maximum(number, 0)] + 20.0), 0.0)
     links = np.full((2, *number.shape), -1, dtype=np.int64)
-    links[0, :, :-1] = np.where(
-        (number[:, :-1] >= 0) & seen[:, 1:], number[:, :-1] == number[:, 1:], -1
-    )
-    links[1, :-1] = np.where((number[:-1] >= 0) & seen[1:], number[:-1] == number[1:], -1)
+    for link, mine, read in ((links[0].T, number.T, seen.T), (links[1], number, seen)):
+        link[:-1] = np.where((mine[:-1] >= 0) & read[1:], mine[:-1] == mine[1:], -1)
     numbers = votes.transpose(2, 0, 1), weight, links, true_up
     return features, classes, *(each.astype(np.float32) for each in numbers)
 
@@ -123,9 +121,8 @@ def _cropped(points: Float32, label: Int64, plane: Float32, rng: np.random.Gener
     height = points @ plane[:3] - plane[3]
     away = points - np.median(objects, axis=0)
     away -= (away @ plane[:3])[..., None] * plane[:3]
-    kept = (height > rng.uniform(-0.03, 0.012)) & (
-        np.linalg.norm(away, axis=-1) < rng.uniform(0.12, 0.5)
-    )
+    distance = np.linalg.norm(away, axis=-1)
+    kept = (height > rng.uniform(-0.03, 0.012)) & (distance < rng.uniform(0.12, 0.5))
     return np.where(kept[..., None], points, np.float32(np.nan))
 
 

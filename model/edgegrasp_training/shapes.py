@@ -215,8 +215,7 @@ def _pot(rng: np.random.Generator) -> list[Rings]:
     ring = oval(1.0, corners) * (1.0, rng.uniform(0.5, 1.0))
     height = rng.uniform(0.5, 2.5)
     inside = 1.0 - wall, max(bottom - wall, 0.1)
-    heights = [0.0, height, height, floor * height]
-    return [lofted(ring, [bottom, 1.0, *inside], heights)]
+    return [lofted(ring, [bottom, 1.0, *inside], [0.0, height, height, floor * height])]
 
 
 _KINDS = (_bodies, _hoop, _bottle, _plate, _bodies, _pot, _bow, _hoop)

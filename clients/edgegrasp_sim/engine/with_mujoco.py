@@ -118,11 +118,6 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
             self._places.clear()
         return self._data
 
-    @property
-    def model(self) -> Any:
-        """The model, with all bodies."""
-        return self.data.model
-
     def places(self, uid: int) -> tuple[Float64, Float64]:
         """Positions and velocities of a body's joints and its links': views of the state."""
         data = self.data
@@ -139,7 +134,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
 
     def step(self, steps: int = 1) -> None:
         """Advance the world by `steps` time steps of 1/80 s."""
-        model, data, hand = self.model, self.data, self._hand
+        model, data, hand = self.data.model, self.data, self._hand
         for _ in range(steps):
             if hand is None or hand.way is None:
                 mujoco.mj_step(model, data, self.substeps)
@@ -152,7 +147,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
 
     def first_hits(self, starts: Float64, ends: Float64) -> list[int]:
         """The body that each ray meets first, -1 for none; (R, 3) metres each, world frame."""
-        model, data = self.model, self.data
+        model, data = self.data.model, self.data
         solid = np.arange(6) == _SOLID
         hits, geom = [], np.empty(1, np.int32)
         for start, end in zip(starts, ends, strict=True):
@@ -162,17 +157,17 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
 
     def detect_collisions(self) -> None:
         """Refresh the contact points without advancing time."""
-        mujoco.mj_forward(self.model, self.data)
+        mujoco.mj_forward(self.data.model, self.data)
 
     def save_state(self) -> Any:
         """Keep the present state until `reset`; valid for the bodies that are there now."""
-        kept = mujoco.MjData(self.model)
-        mujoco.mj_copyData(kept, self.model, self.data)
+        kept = mujoco.MjData(self.data.model)
+        mujoco.mj_copyData(kept, self.data.model, self.data)
         return kept
 
     def restore_state(self, state: Any) -> None:
         """Return to a saved state."""
-        mujoco.mj_copyData(self.data, self.model, state)
+        mujoco.mj_copyData(self.data, self.data.model, state)
         if self._hand is not None:
             self._hand.way = None
 
@@ -185,15 +180,11 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         body.add_freejoint()
         corners = np.concatenate([hull.points for hull in shape.hulls])
         _weigh(body, engine.OBJECT_MASS, corners)
+        kind, shell = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
         for number, surface in enumerate(shape.visible):
             name = f"{body.name} visible {number}"  # which the camera sees, and nothing touches
-            self.spec.add_mesh(
-                name=name,
-                uservert=surface.points.ravel(),
-                userface=surface.faces.ravel().astype(np.int32),
-                inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
-            )
-            kind = mujoco.mjtGeom.mjGEOM_MESH
+            points, faces = surface.points.ravel(), surface.faces.ravel().astype(np.int32)
+            self.spec.add_mesh(name=name, uservert=points, userface=faces, inertia=shell)
             body.add_geom(type=kind, meshname=name, contype=0, conaffinity=0, group=_VISIBLE)
         for number, hull in enumerate(shape.hulls):
             friction = (engine.OBJECT_FRICTION, 0, 0)
@@ -287,7 +278,6 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
                 name=finger.name,
                 type=mujoco.mjtJoint.mjJNT_SLIDE,
                 axis=(0.0, side, 0.0),
-                limited=True,
                 range=(0.0, 0.5 * model.max_opening),
                 armature=FINGER_INERTIA,
                 solref_limit=(CONTACT_SECONDS, 1.0),
@@ -305,7 +295,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
     def render_depth(self, T_world_camera: Float64, camera: Intrinsics) -> Float64:
         """Depth (height, width) at the pixels' lower left corners, metres; `far` if empty."""
         _gl_context(camera.width, camera.height)
-        model, data = self.model, self.data
+        model, data = self.data.model, self.data
         if self._drawn is not model:
             self.close()
             self._drawn = model
