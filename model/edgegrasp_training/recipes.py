@@ -1,6 +1,7 @@
 """The networks that can be trained: their sizes, first weights, and the unit they train in."""
 
 from copy import deepcopy
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -20,28 +21,22 @@ CONSTANT = 1e-6  # standard deviation below which a number of the description co
 # With PyTorch's initial weights the dozen layers of a ball network would shrink signals to nothing.
 GAIN = 3**0.5
 LOCAL = (32, 64, 128)  # widths of the layers that see a point and its neighbours
+_sized = partial(NetworkConfig, crop_radius=CROP_RADIUS)
 # Of the networks of balls: widths of those, before each maximum over the ball, of the classifier.
 RECIPES = {
     # The paper's network (section IV-B and the authors' release): 3.05 M parameters.
-    "edgegrasp": NetworkConfig(
-        "edgegrasp", LOCAL, (256, 512, 512), (1024, 1024), (512, 256, 128), crop_radius=CROP_RADIUS
-    ),
+    "edgegrasp": _sized("edgegrasp", LOCAL, (256, 512, 512), (1024, 1024), (512, 256, 128)),
     # An eighth of the paper's network (0.39 M parameters), for machines without a GPU.
-    "edgegrasp-small": NetworkConfig(
-        "edgegrasp", LOCAL, (128, 128, 128), (256, 256), (256, 128), crop_radius=CROP_RADIUS
-    ),
+    "edgegrasp-small": _sized("edgegrasp", LOCAL, (128, 128, 128), (256, 256), (256, 128)),
     # Scores each edge grasp in the frame of its own hand; 0.13 M parameters.
-    "edgegrasp-plus": NetworkConfig(
+    "edgegrasp-plus": _sized(
         architecture="hand",
         hand_widths=LOCAL,
         classifier_widths=(256, 128),
         description_size=HAND_DESCRIPTION_SIZE,
-        crop_radius=CROP_RADIUS,
     ),
     # The paper's rotation-invariant variant, of Vector Neurons: 1.70 M parameters.
-    "vn-edgegrasp": NetworkConfig(
-        "vn-edgegrasp", LOCAL, (128, 128, 128), (381, 381), (256, 128, 64), crop_radius=CROP_RADIUS
-    ),
+    "vn-edgegrasp": _sized("vn-edgegrasp", LOCAL, (128, 128, 128), (381, 381), (256, 128, 64)),
 }
 
 
