@@ -78,7 +78,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     os.environ["DUMMY_SECONDS"] = "0.002"
-    with local_server(*FLAGS, program=[sys.executable, "-P", serve_dummy.__file__]) as server:
+    dummy = [sys.executable, "-P", serve_dummy.__file__]
+    with local_server(*FLAGS, program=dummy) as server:
         results = run(server, given.clients, given.minutes * 60, given.seed)
         process = psutil.Process(server.pid)
         process.terminate()
@@ -225,11 +226,10 @@ def poisons(number: int) -> dict[str, bytes]:
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_LZMA) as archive:
         archive.writestr("points.npy", b"x" * 100 + str(number).encode())
-    lzma = file.getvalue().replace(struct.pack("<I", 2**23), b"\xff" * 4, 1)
     return {
         "json": json.dumps({"point_cloud2": cloud, "options": {"seed": number}}).encode(),
         "x-npy": b"\x93NUMPY\x02\x00" + struct.pack("<I", len(header)) + header,
-        "x-npz": lzma,
+        "x-npz": file.getvalue().replace(struct.pack("<I", 2**23), b"\xff" * 4, 1),
     }
 
 

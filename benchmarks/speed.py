@@ -6,7 +6,6 @@ machine too.
 
 import argparse
 import itertools
-import math
 import re
 import statistics
 import time
@@ -95,7 +94,7 @@ def camera() -> dict[str, float]:
     ours, seen = ModelCatalogue.load().get(""), observe(SceneKind.PILE, **DEMO)
     sent = {"the demo's scene": (seen.cloud, seen.camera_position)}
     for scene in load_scenes([SHARED]) if SHARED.exists() else []:
-        if len(scene.points) == math.prod(IMAGE):
+        if len(scene.points) == np.prod(IMAGE):
             image = scene.points.reshape(*IMAGE, 3)
             sent[f"640 x 480, {scene.name}"] = image, np.zeros(3)
             # Twice as many rows and columns; a little noise keeps points from lying on one another.
@@ -116,9 +115,10 @@ def server() -> dict[str, float]:
         ready = time.perf_counter() - start
         at_rest = memory(running.pid)
         seen = observe(SceneKind.PILE, **DEMO)
+        viewpoint = tuple(seen.camera_position.tolist())
         with GraspClient(running.grpc_address) as client:
             for seed in range(10):
-                client.detect(seen.cloud, seed=seed, viewpoint=seen.camera_position.tolist())
+                client.detect(seen.cloud, seed=seed, viewpoint=viewpoint)
         return {"ready_seconds": ready, "rest_mb": at_rest, "used_mb": memory(running.pid)}
 
 

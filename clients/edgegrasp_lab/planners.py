@@ -19,7 +19,6 @@ from edgegrasp_sim.trial import PlannedGrasp, Planner, StartCollides
 
 GROUP = "edgegrasp.planners"  # entry points under which packages may name their planners
 SHIPPED = ("server", "in-process")
-SUFFIX = ".safetensors"
 
 
 class ChosenPlanner(NamedTuple):
@@ -52,7 +51,7 @@ def open_planner(
     weights, model = [path.resolve() for path in choice.weights], choice.model
     if choice.server and (weights or choice.planner == "in-process"):
         raise ValueError(f"server is {choice.server}; leave out --weights and --planner in-process")
-    if model.endswith(SUFFIX):
+    if model.endswith(".safetensors"):
         if choice.server:
             raise ValueError(f"model is {model}; name one of the server's own weights")
         if not (file := Path(model)).is_file():

@@ -21,7 +21,6 @@ from edgegrasp_sim.workers import run_tasks
 
 # Makes the planner in the process that uses it; must be picklable if there are several.
 PlannerFactory: TypeAlias = Callable[[], Planner]
-Task: TypeAlias = tuple[int, int]  # seed and index of a round
 PACKAGES = ("edgegrasp", "numpy", "scipy", "pybullet", "mujoco", "torch", "open3d-cpu")
 
 
@@ -148,7 +147,7 @@ class RoundRunner:
         self.config, self.simulation = config, config.simulation(digest)
         self.planner: Planner = make_planner()
 
-    def __call__(self, task: Task) -> Round:
+    def __call__(self, task: tuple[int, int]) -> Round:
         """Run the round of a seed and an index."""
         seed, index = task
         where = self.simulation, self.config.scene, self.config.protocol

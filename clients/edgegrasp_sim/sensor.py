@@ -111,8 +111,7 @@ class DepthSensor:
             lower = np.minimum(np.delete(step, 0, axis), np.delete(step, -1, axis))
             inner = slope[1:-1] if axis == 0 else slope[:, 1:-1]
             inner += lower * lower
-        tangent = np.sqrt(slope) * camera.focal_length / depth
-        angle = np.degrees(np.arctan(tangent))
+        angle = np.degrees(np.arctan(np.sqrt(slope) * camera.focal_length / depth))
         limit = self.grazing + 4.0 * rng.standard_normal(depth.shape, dtype=np.float32)
         return np.asarray(angle > limit)
 

@@ -68,7 +68,8 @@ def import_checkpoint(directory: Path) -> tuple[nn.Module, CheckpointMetadata]:
         )
     number = found[0].stem.rpartition("-")[2]
     is_vn = (directory / f"std-ckpt-{number}.pt").exists()
-    config = replace(RECIPES["vn-edgegrasp" if is_vn else "edgegrasp"], crop_radius=CROP_RADIUS)
+    config = RECIPES["vn-edgegrasp" if is_vn else "edgegrasp"]
+    config = replace(config, crop_radius=CROP_RADIUS)
     theirs = {
         f"{stem.partition('_')[0]}.{name}": weight
         for stem in _FILES[: 4 if is_vn else 3]

@@ -104,8 +104,8 @@ def _example(
     count = np.bincount(number[number >= 0], minlength=1)
     weight = np.where(number >= 0, 1.0 / np.sqrt(count[np.maximum(number, 0)] + 20.0), 0.0)
     links = np.full((2, *number.shape), -1, dtype=np.int64)
-    for link, mine, read in ((links[0].T, number.T, seen.T), (links[1], number, seen)):
-        link[:-1] = np.where((mine[:-1] >= 0) & read[1:], mine[:-1] == mine[1:], -1)
+    for link, objects, read in ((links[0].T, number.T, seen.T), (links[1], number, seen)):
+        link[:-1] = np.where((objects[:-1] >= 0) & read[1:], objects[:-1] == objects[1:], -1)
     numbers = votes.transpose(2, 0, 1), weight, links, true_up
     return features, classes, *(each.astype(np.float32) for each in numbers)
 

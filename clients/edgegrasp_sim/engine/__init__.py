@@ -4,7 +4,6 @@ Each is a file, with classes of the same methods: a world, its bodies, a hand. `
 their docstrings. Nothing else knows which one runs.
 """
 
-import importlib
 import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
