@@ -54,7 +54,7 @@ def open_planner(
     if model.endswith(".safetensors"):
         if choice.server:
             raise ValueError(f"model is {model}; name one of the server's own weights")
-        if not (file := Path(model)).is_file():
+        if not (file := Path(model).resolve()).is_file():
             raise ValueError(f"model is {model}; there is no such file")
         weights, model = [*weights, file], file.stem
     asked = {"model": model, **options}
