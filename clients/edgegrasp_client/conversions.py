@@ -45,7 +45,7 @@ class HandFrame:
 
     @property
     def T_hand_frame(self) -> Float64:  # noqa: N802
-        """Maps its coordinates to those of our hand frame.  # (4, 4)."""
+        """Maps its coordinates to those of our hand frame, (4, 4)."""
         approach, closing = _AXES[self.approach], _AXES[self.closing]
         transform = np.eye(4)
         # Rows: our x, y and z axes in its coordinates.

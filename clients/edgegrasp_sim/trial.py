@@ -76,7 +76,7 @@ class Attempt:
 
     @property
     def T_cloud_hand(self) -> NDArray[np.float32]:  # noqa: N802
-        """The pose as `Picture.grasps` takes it: clouds are in the world's frame.  # (4, 4)."""
+        """The pose (4, 4) as `Picture.grasps` takes it: clouds are in the world's frame."""
         return np.asarray(self.T_world_hand, np.float32)
 
 

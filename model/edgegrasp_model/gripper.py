@@ -47,7 +47,7 @@ class Gripper:
 
     @cached_property
     def T_hand_tcp(self) -> Float32:  # noqa: N802
-        """Maps TCP coordinates to hand coordinates.  # (4, 4)."""
+        """Maps TCP coordinates to hand coordinates, (4, 4)."""
         transform = np.eye(4, dtype=np.float32)
         transform[2, 3] = self.tcp_z
         return transform
@@ -104,7 +104,7 @@ class Gripper:
 
     @cached_property
     def open_boxes(self) -> Float64:
-        """`boxes` of the open gripper, to be copied before a change.  # (B, 2, 3)."""
+        """`boxes` (B, 2, 3) of the open gripper, to be copied before a change."""
         return self.boxes(self.max_opening)
 
     def opened_to(self, opening: float) -> "Gripper":

@@ -172,7 +172,7 @@ def _closing_line(gripper: Gripper) -> tuple[Float32, Float32]:
 
 
 def _grid(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Float32:
-    """All points with these coordinates.  # (X * Y * Z, 3)."""
+    """All points (X * Y * Z, 3) with these coordinates."""
     grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
     return grid.astype(np.float32)
 

@@ -50,14 +50,14 @@ class Evaluation:
 
 
 def evaluate_scores(logit: Float32, label: Float32) -> Evaluation:
-    """All figures for scores and outcomes. # (E,), (E,)."""
+    """All figures for scores (E,) and outcomes (E,)."""
     accuracy = float(np.mean((logit > 0) == (label > 0.5)))
     loss, rank = cross_entropy(logit, label), auroc(logit, label)
     return Evaluation(loss, accuracy, rank, fit_temperature(logit, label), logit, label)
 
 
 def cross_entropy(logit: Floats, label: Floats) -> float:
-    """Mean binary cross entropy, nats.  # (E,), (E,)."""
+    """Mean binary cross entropy of logits (E,) and labels (E,), nats."""
     return float(np.mean(np.logaddexp(0.0, logit) - label * logit))
 
 
@@ -90,7 +90,7 @@ class Range(NamedTuple):
 def reliability(
     score: Floats, held: NDArray[np.generic], edges: tuple[float, ...] = TENTHS
 ) -> dict[float, Range]:
-    """Outcomes in each non-empty range of scores, by its lower edge. # (E,), (E,)."""
+    """Outcomes (E,) in each non-empty range of scores (E,), by its lower edge."""
     place = np.digitize(score, edges[1:-1])
     ranges = {edges[k]: place == k for k in np.unique(place)}
     return {
