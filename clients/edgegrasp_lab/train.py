@@ -131,9 +131,11 @@ def generate_scenes(
 
     Example: edgegrasp generate-scenes data/scenes --objects OBJECTS --files 110
     """
+    from edgegrasp_sim.engine import choose_engine
     from edgegrasp_sim.workers import run_tasks
     from edgegrasp_training.scene_images import FILE, generate
 
+    choose_engine("pybullet")  # which reads the robot arms in the background
     meshes = sorted(objects.glob("*/train/*_visual.obj"))
     if not meshes:
         raise ValueError(f"objects: got {objects}. Give a folder with */train/*_visual.obj.")

@@ -50,7 +50,8 @@ def test_the_same_scene_is_made_again_from_its_seed(pool: list[PoolMesh]) -> Non
 
 
 def test_a_file_is_made_and_learned_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in {"SCENES_PER_FILE": 2, "NUM_POOL": 12, "ARMS": ()}.items():
+    few = {"SCENES_PER_FILE": 2, "NUM_POOL": 12, "make_arms": lambda rng: []}
+    for name, value in few.items():
         monkeypatch.setattr(scene_images, name, value)
     for name, value in {"HELD_OUT": 1, "BATCH": 2}.items():
         monkeypatch.setattr(scene_training, name, value)
