@@ -53,19 +53,26 @@ def cluster() -> Iterator[Any]:
             "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
         }.items():
             patch.setenv(name, value)
-        first = {"include_dashboard": False, "dashboard_agent_listen_port": None}
-        for left in (2, 1, 0):
-            try:
-                made = Cluster(initialize_head=True, head_node_args=first)
-                break
-            except Exception as error:  # Ray gives its head 30 s, too few on a busy machine
-                if not left or "timed out during startup" not in str(error):
-                    raise
+        made = two_nodes(Cluster)
         try:
-            made.add_node()
             yield made
         finally:
             made.shutdown()
+
+
+def two_nodes(kind: Any) -> Any:
+    """Ray gives each node 30 s to start, too few on a busy or newly installed machine."""
+    for left in (3, 2, 1, 0):
+        made = kind()
+        try:
+            made.add_node(include_dashboard=False, dashboard_agent_listen_port=None)
+            made.add_node()
+            break
+        except Exception:
+            made.shutdown()
+            if not left:
+                raise
+    return made
 
 
 @contextmanager
