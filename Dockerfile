@@ -59,7 +59,7 @@ RUN kinds=generic \
             from edgegrasp_service.worker.answer import Settings, load_catalogue; \
             load_catalogue(Settings())' || exit 1; \
     done \
-    && mkdir /venv/share/edgegrasp \
+    && mkdir -p /venv/share/edgegrasp \
     && /tools/bin/cyclonedx-py environment /venv/bin/python -o /venv/share/edgegrasp/sbom.json \
     && /tools/bin/pip-licenses --python /venv/bin/python --format markdown \
         --output-file /venv/share/edgegrasp/licences.md
