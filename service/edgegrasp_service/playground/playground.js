@@ -184,9 +184,9 @@ async function ask() {
 
 function gripperOf(asked, model) {
   if (asked.gripper && typeof asked.gripper === "object") {
-    const { hand, finger, swing, ...rest } = asked.gripper;
-    const palm_z = Math.max(...hand.boxes.map(([, high]) => high[2]).filter((z) => z < rest.contact_z));
-    return { ...rest, hand_boxes: hand.boxes, finger_boxes: finger.boxes, linkage: swing ?? null, palm_z };
+    const { hand, contact_z } = asked.gripper;
+    const palm_z = Math.max(...hand.boxes.map(([, high]) => high[2]).filter((z) => z < contact_z));
+    return { ...asked.gripper, palm_z };
   }
   const own = state.models.find(({ name }) => name === model)?.gripper;
   return state.grippers[asked.robot ? robot().gripper : asked.gripper || own] ?? state.grippers.panda;

@@ -261,9 +261,9 @@ export class View {
 
   /** How far swinging fingertips are ahead of where they are in the open gripper, metres. */
   _advance(width) {
-    const { linkage, max_opening: open } = this.gripper;
-    if (!linkage) return 0;
-    const { radius, reach } = linkage;
+    const { swing, max_opening: open } = this.gripper;
+    if (!swing) return 0;
+    const { radius, reach } = swing;
     const outward = reach - (open - Math.min(Math.max(width, 0), open)) / 2;
     return Math.sqrt(radius ** 2 - outward ** 2) - Math.sqrt(radius ** 2 - reach ** 2);
   }
@@ -279,9 +279,9 @@ export class View {
         hand.add(part);
       }
     };
-    for (const box of this.gripper.hand_boxes) add(box, 0, 0, 0.15);
+    for (const box of this.gripper.hand.boxes) add(box, 0, 0, 0.15);
     const [half, ahead] = [grasp.width / 2, this._advance(grasp.width)];
-    for (const [low, high] of this.gripper.finger_boxes) {
+    for (const [low, high] of this.gripper.finger.boxes) {
       add([low, high], half, ahead, 1);
       add([[low[0], -high[1], low[2]], [high[0], -low[1], high[2]]], -half, ahead, 1);
     }
