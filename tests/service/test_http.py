@@ -2,7 +2,7 @@
 
 import asyncio
 import re
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import httpx
@@ -33,6 +33,15 @@ async def test_the_front_page_is_the_playground_or_that_of_the_api(serve, tmp_pa
         assert (await http.get("/playground/")).status_code == status
     with pytest.raises(InvalidSettings, match=r"samples: got '.*none', which is not a folder"):
         await serve(samples=tmp_path / "none")
+
+
+def test_the_page_draws_grippers_by_fields_that_they_have(dummy_server) -> None:
+    with httpx.Client(base_url=f"{dummy_server.http_url}/playground/") as http:
+        drawn = set(re.findall(r"this\.gripper\.([\w.]*\w)", http.get("view.js").text))
+        assert len(drawn) >= 4
+        for gripper in http.get("grippers.json").json().values():
+            for path in (*drawn, "swing"):
+                reduce(dict.__getitem__, path.split("."), gripper)
 
 
 def test_head_is_get_without_the_body_and_answers_say_what_a_browser_may_do(dummy_server) -> None:
