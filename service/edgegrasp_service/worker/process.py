@@ -422,7 +422,7 @@ class _Worker:
             self._writer.close()
 
 
-# The nursery and its workers
+# In a worker
 
 
 @contextlib.contextmanager
