@@ -19,6 +19,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64
+from edgegrasp_model.scene.network import smoothly_enlarged
 from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.engine import Intrinsics
 from edgegrasp_sim.engine.urdf import parse_obj
@@ -57,7 +58,8 @@ ARMS = (  # of PyBullet's models and RoboPlan's
 SOFT_SHARE = 0.25  # of the objects, bent and crumpled as bags, clothes and blister packs are
 LEVEL = 0.85  # least z of a support's normal: its edges are labelled other
 WRONG = 0.02, 0.01  # metres, and share of the depth, by which a reading shows nothing real
-UNSEEN_WALLS = 0.25  # of the images, in which steep background has no readings, or few
+UNSEEN_WALLS = 0.35  # of the images, in which steep background has no readings, or few
+COARSE = 0.15  # of the images, as of a small camera or a thinned cloud
 
 # From a camera and its pose T_world_camera: depth (H, W) in metres, `far` where nothing is hit,
 # labels (H, W), and where it is steep.
@@ -115,9 +117,15 @@ def _make_image(scene: SceneMeshes, render: Render) -> SceneImage | None:
     if close > 0.15 or (scene.centres and not (seen > 25).any()):
         return None
     noisy, label = _faults(scene, depth, label, camera, pose)
-    if rng.random() < UNSEEN_WALLS:  # which leaves their rims floating
+    if rng.random() < UNSEEN_WALLS:  # which leaves their rims floating, in pieces
         unseen = _blobs(rng, depth.shape) < rng.uniform(0.3, 1.0)
-        noisy[steep & (label == OTHER) & unseen] = np.nan
+        walls = steep & (label == OTHER) & unseen
+        walls = ndimage.binary_dilation(walls, iterations=int(rng.integers(1, 5)))
+        noisy[walls & (label == OTHER)] = np.nan
+        if rng.random() < 0.5:  # and little of what is behind them
+            noisy[(label == OTHER) & (_blobs(rng, depth.shape) < rng.uniform(0.1, 0.9))] = np.nan
+    if rng.random() < COARSE:
+        noisy, label = _coarse(noisy, label, int(rng.integers(2, 5)))
     stored = np.nan_to_num(np.clip(noisy / DEPTH_UNIT, 0, 65535)).astype(np.uint16)
     turn, place = pose[:3, :3], pose[:3, 3]
     centre = np.zeros((MAX_OBJECTS, 3))
@@ -207,6 +215,17 @@ def _coarser(sensor: DepthSensor, factor: float) -> DepthSensor:
     window = 2 * round(factor * sensor.window / 2) + 1 if sensor.window > 1 else 1
     pixels = round(factor * sensor.noise_pixels) if sensor.noise_pixels > 1 else 1
     return replace(sensor, window=window, noise_pixels=pixels)
+
+
+def _coarse(
+    depth: Float64, label: NDArray[np.uint8], step: int
+) -> tuple[Float64, NDArray[np.uint8]]:
+    """One in `step` pixels of an image (H, W) in each direction, enlarged as for the network."""
+    rows, columns = (np.arange(side) // step * step + step // 2 for side in depth.shape)
+    kept = np.minimum(rows, HEIGHT - 1)[:, None], np.minimum(columns, WIDTH - 1)
+    small = depth[kept[0][::step], kept[1][::step]]
+    enlarged = smoothly_enlarged(small.astype(np.float32), step)
+    return enlarged[:HEIGHT, :WIDTH].astype(np.float64), label[kept]
 
 
 def _blobs(rng: np.random.Generator, shape: tuple[int, ...], size: int = 10) -> Float64:

@@ -27,6 +27,7 @@ REACH = 0.9  # metres that it extends to either side
 APART = np.array([0.015, 0.015, 0.0])  # metres between objects that do not touch
 LONGEST_OBJECT = 0.36  # metres; a longer one is background
 EMPTY_SHARE, FEW_SHARE = 0.03, 0.2  # of the scenes that have no object; one to three
+FULL_SHARE = 0.3  # of the bins, in which objects lie from wall to wall
 CROWDED_SHARE = 0.35  # of the tables and floors, with large background close to the objects
 
 
@@ -161,8 +162,9 @@ def _bin(scene: SceneMeshes) -> None:
         y, z = rng.uniform(-0.5, 0.5, (2, 3000))
         points = np.stack([np.full(3000, place), y * size[1], (z + 0.5) * size[2]], axis=1)
         heights.put(points)
-    fill = rng.uniform(-0.15, 1.5)
-    around = rng.uniform(0.3, 1.0) * max(half)
+    fill, around = rng.uniform(-0.15, 1.5), rng.uniform(0.3, 1.0) * max(half)
+    if rng.random() < FULL_SHARE:
+        fill, around = rng.uniform(0.5, 1.5), rng.uniform(1.0, 2.0) * max(half)
     while fill > 0 and len(scene.centres) < 70:
         if heights.within(half).mean() > fill * depth * 0.9:
             break

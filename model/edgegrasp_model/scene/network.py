@@ -171,7 +171,9 @@ def range_image(
     coarse = int(np.ceil(depth * pixel_size / MAX_PIXEL_SIZE))
     if (times := min(round(pixel_size / finest), coarse)) > 1:
         pixel_size /= times
-        filled = _enlarged(filled[..., 2], times, corner, pixel_size)
+        z = smoothly_enlarged(filled[..., 2], times)
+        y, x = (np.indices(z.shape) + 0.5) * pixel_size + corner[::-1, None, None]
+        filled = np.stack([x * z, y * z, z], axis=-1).astype(np.float32)
     return RangeImage(filled, pixel_size, turn, corner)
 
 
@@ -200,17 +202,15 @@ def _view(points: Float64) -> tuple[Float64, Float64]:
     return low.round(9), high.round(9)
 
 
-def _enlarged(depth: Float32, times: int, corner: Float64, pixel_size: float) -> Float32:
-    """The image of a sparse cloud with pixels as fine as the network knows.
+def smoothly_enlarged(depth: Float32, times: int) -> Float32:
+    """The image (H, W) of a sparse cloud with pixels as fine as the network knows, metres.
 
     Depths are interpolated on a surface, and repeated beside its edges.
     """
     nearest = depth.repeat(times, axis=0).repeat(times, axis=1)
     between = ndimage.zoom(depth, times, order=1, mode="nearest", grid_mode=True)
     smooth = np.abs(between - nearest) < SURFACE_DEPTH  # false for NaN
-    z = np.where(smooth, between, nearest)
-    y, x = (np.indices(z.shape) + 0.5) * pixel_size + corner[::-1, None, None]
-    return np.stack([x * z, y * z, z], axis=-1).astype(np.float32)
+    return np.where(smooth, between, nearest)
 
 
 @compiled("contract")
