@@ -13,10 +13,10 @@ benchmark scales them to the hand and decomposes them. Shapes: forty more of the
 trained on these.
 """
 
-import sys
 from pathlib import Path
 
 import numpy as np
+import typer
 
 from edgegrasp_training.shapes import free_shape, household_objects
 
@@ -34,4 +34,4 @@ def write(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    write(Path(sys.argv[1]))
+    typer.run(write)
