@@ -223,8 +223,8 @@ def _coarse(
     """One in `step` pixels of an image (H, W) in each direction, enlarged as for the network."""
     rows, columns = (np.arange(side) // step * step + step // 2 for side in depth.shape)
     kept = np.minimum(rows, HEIGHT - 1)[:, None], np.minimum(columns, WIDTH - 1)
-    small = depth[kept[0][::step], kept[1][::step]]
-    enlarged = smoothly_enlarged(small.astype(np.float32), step)
+    small = depth[kept][::step, ::step].astype(np.float32)
+    enlarged = smoothly_enlarged(small, step)
     return enlarged[:HEIGHT, :WIDTH].astype(np.float64), label[kept]
 
 
