@@ -1,6 +1,6 @@
 """A hand, floating or on an arm, and a grasp with it: approach, close, retreat, the outcome."""
 
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cache
@@ -63,7 +63,8 @@ class GraspResult:
     target: SceneObject | None = None  # between the fingers before the hand came
     cause: FailureCause | None = None  # why it failed, None if it did not
     held_after_shaking: bool | None = None  # None if the hand was not shaken
-    touched_on_the_way: bool = False  # whether an arm overlapped anything before its pregrasp
+    # (T, 3) where an arm overlapped something before its pregrasp, world frame, metres.
+    touched_on_the_way: tuple[Sequence[float], ...] = ()
 
     @property
     def success(self) -> bool:
@@ -85,19 +86,20 @@ def run_grasp(
     gripper.world.detect_collisions()
     start_contact = any(contact.distance < 0.0 for contact in gripper.body.contacts())
     target = _object_between_fingers(gripper, T_world_hand, objects)
-    touched = False
+    touched: list[Sequence[float]] = []
 
     def result(cause: FailureCause | None, held: SceneObject | None = None) -> GraspResult:
         seen = gripper.body.opening, start_contact, held, target, cause
-        return GraspResult(*seen, touched_on_the_way=touched)
+        return GraspResult(*seen, touched_on_the_way=tuple(touched))
 
-    if _cut_into(gripper) & obstacles:
+    if _cut_into(gripper).keys() & obstacles:
         return result(FailureCause.START_COLLISION)
     collided = False
     for _ in gripper.approach(T_world_hand):
         cut = _cut_into(gripper)
-        touched = touched or (gripper.on_the_way and bool(cut))
-        if cut & obstacles:
+        if gripper.on_the_way:
+            touched += cut.values()
+        if cut.keys() & obstacles:
             return result(FailureCause.APPROACH_COLLISION)
         collided = collided or bool(cut)
     _close(gripper, objects, to_the_end=to_the_end)
@@ -340,9 +342,10 @@ def _holds_when_shaken(
     return not gripper.is_shut and held in _touched(gripper, objects)
 
 
-def _cut_into(gripper: Gripper) -> set[int]:
+def _cut_into(gripper: Gripper) -> dict[int, Sequence[float]]:
+    """The bodies that the hand or its arm overlaps, and where."""
     contacts, depth = gripper.body.contacts(), gripper.world.collision_depth
-    return {each.other_uid for each in contacts if each.distance < -depth}
+    return {each.other_uid: each.position for each in contacts if each.distance < -depth}
 
 
 def _touched(gripper: Gripper, objects: Mapping[int, SceneObject]) -> list[SceneObject]:

@@ -109,6 +109,7 @@ def key_figures(summary: dict[str, Any]) -> Iterator[Row]:
         reached = f"{arm['scenes_with_a_reachable_grasp']} of {summary['rounds']}"
         yield "scenes with a grasp within the arm's reach", reached
         yield "motions that touched something before the pregrasp", arm["touched_on_the_way"]
+        yield "of those, something that the camera had seen", arm["touched_seen"]
         yield "a motion out and home, median", f"{arm['motion_seconds']:.1f} s"
         yield "picks per hour", f"{arm['picks_per_hour']:.0f}"
 

@@ -4,7 +4,7 @@ A planner is any callable; what runs behind it is up to the caller.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TypeAlias
@@ -21,6 +21,7 @@ from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.surroundings import open_table
 
 MIN_SEEN = 100  # points above the table; with fewer the planner is not asked
+SEEN_DISTANCE = 0.01  # metres; what no seen point is as near to was hidden from the camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +69,7 @@ class Attempt:
     T_world_hand: list[list[float]]  # (4, 4) row-major pose of the hand
     motion_seconds: float = 0.0  # that an arm took from home to the grasp, away and home again
     touched_on_the_way: bool = False  # whether an arm overlapped anything before its pregrasp
+    touched_seen: bool = False  # and within SEEN_DISTANCE of where, the camera saw something
 
     @property
     def success(self) -> bool:
@@ -123,7 +125,7 @@ class RoundDriver:
             rules.packed_scale if upright else rules.pile_scale,
             open_table(rules.table_thickness),
         )
-        self.view, self._points = -1, 0
+        self.view, self._cloud = -1, np.empty((0, 3), np.float32)
         names = tuple(model.name for model in simulation.object_models)
         wide = tuple(model.name for model in simulation.too_wide)
         self._round = Round(seed, index, names, (), 0, RoundEnd.CLEARED, too_wide=wide)
@@ -168,7 +170,7 @@ class RoundDriver:
             faults=rules.noise.faults(self._noise),
             table=rules.planning.table,
         )
-        self.view, self._points = self.view + 1, len(seen.cloud)
+        self.view, self._cloud = self.view + 1, seen.cloud
         return seen
 
     def execute(self, grasp: PlannedGrasp, planning_seconds: float = 0.0) -> Attempt:
@@ -186,11 +188,15 @@ class RoundDriver:
             opening=result.opening,
             start_contact=result.start_contact,
             view=self.view,
-            points=self._points,
+            points=len(self._cloud),
             planning_seconds=planning_seconds,
             T_world_hand=np.asarray(grasp.T_world_hand, dtype=np.float64).tolist(),
             motion_seconds=0.0 if grasp.motion is None else seconds_of(grasp.motion),
-            touched_on_the_way=result.touched_on_the_way,
+            touched_on_the_way=bool(result.touched_on_the_way),
+            touched_seen=any(map(self._is_seen, result.touched_on_the_way)),
         )
         self._round.attempts += (attempt,)
         return attempt
+
+    def _is_seen(self, place: Sequence[float]) -> bool:
+        return bool((np.linalg.norm(np.subtract(self._cloud, place), axis=1) <= SEEN_DISTANCE).any())

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from itertools import combinations
+from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,8 @@ from edgegrasp_model.scene.support import heights_over
 from edgegrasp_robot.robot import HAND, Robot, touching
 
 VOXEL_SIZE = 0.01  # metres, side of a voxel
+# Around a point, in voxels: noise and the arm's controller are off by millimetres.
+MARGIN = 0.4 * np.array(list(product((-1, 1), repeat=3)), dtype=np.float32)
 MAX_RANGE = 2.0  # metres from the arm's base; farther points are left out
 SELF_DISTANCE = 0.02  # metres; points this near to the arm are the arm itself
 MAX_VOXELS_INSIDE = 10  # voxels of objects that may lie inside the arm, given camera errors
@@ -209,7 +211,8 @@ def _voxels(
     cells = flat[kept] @ (T[:3, :3].T / VOXEL_SIZE).astype(flat.dtype)
     cells += ((T[:3, 3] - base) / VOXEL_SIZE).astype(flat.dtype)
     cells = cells[np.einsum("ij,ij->i", cells, cells) < (MAX_RANGE / VOXEL_SIZE) ** 2]
-    centers = _centers(cells + (base / VOXEL_SIZE).astype(flat.dtype))
+    cells = cells[:, None] + (MARGIN + base / VOXEL_SIZE).astype(flat.dtype)
+    centers = _centers(cells.reshape(-1, 3))
     return centers[~_near_robot(robot, joints, moved(T_base_scene, centers), SELF_DISTANCE)]
 
 

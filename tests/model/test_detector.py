@@ -446,8 +446,7 @@ def test_a_rim_is_grasped_across_its_wall() -> None:
     hands = np.array([grasp.T_cloud_hand for grasp in straight])
     closing = np.abs(np.einsum("ed,ed->e", hands[:, :3, 1], radial))
     assert np.mean(closing > FIFTEEN_DEGREES) > 0.9
-    distance = np.linalg.norm(hands[:, :2, 3], axis=1)
-    np.testing.assert_allclose(distance, 0.072, atol=0.003)
+    np.testing.assert_allclose(np.linalg.norm(hands[:, :2, 3], axis=1), 0.072, atol=0.003)
 
 
 def test_a_network_of_edges_gets_edge_grasps_where_they_are_good(catalogue) -> None:

@@ -112,10 +112,7 @@ def test_scores_depend_neither_on_point_order_nor_on_other_balls(architecture, s
 
 @pytest.mark.parametrize(
     "config",
-    [
-        SMALL,
-        replace(SMALL, architecture="vn-edgegrasp", conv_widths=(32, 48, 64)),
-    ],
+    [SMALL, replace(SMALL, architecture="vn-edgegrasp", conv_widths=(32, 48, 64))],
     ids=["edgegrasp", "vn-edgegrasp"],
 )
 def test_a_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it(config):
@@ -140,8 +137,7 @@ def test_neither_single_precision_nor_recorded_gradients_change_a_score(architec
     network.double()
     exact = scores(network, scene.batch())
     torch.testing.assert_close(single.double(), exact, rtol=0, atol=0.01 * float(exact.std()))
-    recorded = network(scene.batch()).detach()
-    torch.testing.assert_close(recorded, exact, rtol=0, atol=1e-12)
+    torch.testing.assert_close(network(scene.batch()).detach(), exact, rtol=0, atol=1e-12)
 
 
 # What a hand sees of the cloud in its own frame, and the network that scores it by that.

@@ -477,8 +477,7 @@ def test_a_mask_of_the_caller_wins() -> None:
     cloud = render(boxes, pose)
     mask = seen_box(boxes, pose) == 0
     assert detect(cloud).objects
-    segments = mask.astype(np.int32)
-    (panel,) = detect(CloudInput(cloud, segment_ids=segments)).objects
+    (panel,) = detect(CloudInput(cloud, segment_ids=mask.astype(np.int32))).objects
     assert panel.number == 1
     region = {"include": [{"kind": "mask", "mask": mask}]}
     held = detect(cloud, approach_region=region, contact_region=region, min_score=0.0)

@@ -17,7 +17,7 @@ from examples.your_planner import plan
 
 from edgegrasp_sim.benchmark import BenchmarkConfig, RoundRunner, manifest, run_benchmark
 from edgegrasp_sim.camera import Observation
-from edgegrasp_sim.hand import FailureCause
+from edgegrasp_sim.hand import FailureCause, GraspResult
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.protocol import FOLDER, Protocol, load_protocol, protocol_from, protocol_names
 from edgegrasp_sim.results import (
@@ -219,8 +219,7 @@ def run(simulation, planner: Planner, scene: SceneKind, number: int, seed=0, ind
 def test_two_failures_in_a_row_or_no_grasp_three_times_end_a_round(simulation) -> None:
     done = run(simulation, lambda seen, seed: PlannedGrasp(IN_THE_AIR, 1.0, 0.04), PACKED, 2)
     assert done.end is RoundEnd.FAILURES
-    found = [(attempt.cause, attempt.target) for attempt in done.attempts]
-    assert found == [(FailureCause.MISSED, None)] * 2
+    assert [(one.cause, one.target) for one in done.attempts] == [(FailureCause.MISSED, None)] * 2
     asked: list[tuple[int, int]] = []
     done = run(simulation, lambda seen, seed: asked.append((len(seen.cloud), seed)), PACKED, 2)
     assert done.end is RoundEnd.NO_GRASP
@@ -245,6 +244,16 @@ def test_cubes_are_cleared_though_the_first_view_shows_nothing(engine: str, monk
     assert (done.end, done.no_grasp, done.successes) == (RoundEnd.CLEARED, 1, 3)
     for attempt in done.attempts:
         assert attempt.object == ("cube" if attempt.success else None)
+
+
+def test_a_touch_is_of_something_seen_next_to_a_point_that_was_seen(simulation, monkeypatch):
+    driver = RoundDriver(simulation, PACKED, paper_with(2), seed=0, index=0)
+    point = driver.look().cloud[0]
+    for away, seen in ((0.005, True), (2.0, False)):
+        touched = GraspResult(0.0, False, None, touched_on_the_way=(point + away,))
+        monkeypatch.setattr(simulation, "execute_grasp", Mock(return_value=touched))
+        attempt = driver.execute(PlannedGrasp(IN_THE_AIR, 1.0, 0.04))
+        assert (attempt.touched_on_the_way, attempt.touched_seen) == (True, seen)
 
 
 def test_an_arm_that_cannot_start_in_a_view_takes_another_one(simulation) -> None:
@@ -305,6 +314,7 @@ def test_an_arm_s_figures_are_those_of_its_motions() -> None:
         "picks_per_hour": pytest.approx(3600 / 8.0),
         "motion_seconds": 3.75,
         "touched_on_the_way": 1,
+        "touched_seen": 0,
         "scenes_with_a_reachable_grasp": 1,
     }
     assert summarise(ROUNDS)["arm"] is None

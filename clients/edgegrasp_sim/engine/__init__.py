@@ -81,6 +81,7 @@ class Contact(NamedTuple):
 
     other_uid: int  # the body that is touched
     distance: float  # metres; negative where the two overlap
+    position: Sequence[float]  # (3,) where, world frame, metres
 
 
 Parts: TypeAlias = tuple[Float64, ...]  # convex ones, each by its points, (P, 3) metres

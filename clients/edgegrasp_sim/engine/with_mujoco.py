@@ -415,11 +415,11 @@ class MujocoBody:
     def contacts(self) -> list[Contact]:
         """The contact points found by the last step or collision detection."""
         found, uids = self.world.data.contact, self.world.uid_of_geom
-        pairs = [(uids[one], uids[other]) for one, other in found.geom.tolist()]
+        rows = zip(found.geom.tolist(), found.dist.tolist(), found.pos.tolist(), strict=True)
         return [
-            Contact(other if one == self.uid else one, distance)
-            for (one, other), distance in zip(pairs, found.dist.tolist(), strict=True)
-            if self.uid in (one, other)
+            Contact(uids[other if uids[one] == self.uid else one], distance, position)
+            for (one, other), distance, position in rows
+            if self.uid in (uids[one], uids[other])
         ]
 
 

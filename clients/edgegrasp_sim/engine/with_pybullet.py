@@ -174,7 +174,7 @@ class PybulletBody:
 
     def contacts(self) -> list[Contact]:
         points = self.client.getContactPoints(self.uid)
-        return [Contact(other_uid=point[2], distance=point[8]) for point in points]
+        return [Contact(other_uid=at[2], distance=at[8], position=at[6]) for at in points]
 
 
 class PybulletHand(PybulletBody):
