@@ -343,7 +343,6 @@ def _holds_when_shaken(
 
 
 def _cut_into(gripper: Gripper) -> dict[int, Sequence[float]]:
-    """The bodies that the hand or its arm overlaps, and where."""
     contacts, depth = gripper.body.contacts(), gripper.world.collision_depth
     return {each.other_uid: each.position for each in contacts if each.distance < -depth}
 

@@ -21,7 +21,7 @@ from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.surroundings import open_table
 
 MIN_SEEN = 100  # points above the table; with fewer the planner is not asked
-SEEN_DISTANCE = 0.01  # metres; what no seen point is as near to was hidden from the camera
+SEEN_DISTANCE = 0.01  # metres from a seen point, within which a touched surface was seen too
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class Attempt:
     T_world_hand: list[list[float]]  # (4, 4) row-major pose of the hand
     motion_seconds: float = 0.0  # that an arm took from home to the grasp, away and home again
     touched_on_the_way: bool = False  # whether an arm overlapped anything before its pregrasp
-    touched_seen: bool = False  # and within SEEN_DISTANCE of where, the camera saw something
+    touched_seen: bool = False  # whether the camera had seen the surface that was touched
 
     @property
     def success(self) -> bool:
@@ -199,4 +199,5 @@ class RoundDriver:
         return attempt
 
     def _is_seen(self, place: Sequence[float]) -> bool:
-        return bool((np.linalg.norm(np.subtract(self._cloud, place), axis=1) <= SEEN_DISTANCE).any())
+        distance = np.linalg.norm(np.subtract(self._cloud, place), axis=1)
+        return bool((distance <= SEEN_DISTANCE).any())
