@@ -40,8 +40,7 @@ def _rpc(method: str) -> Callable[..., Awaitable[Any]]:
         if (problem := found.error) is not None:
             grpc_context.set_code(StatusCode[problem.code])
             grpc_context.set_details(problem.detail)
-            detail = error_detail(problem).SerializeToString()
-            trailing = [(ERROR_METADATA, detail)]
+            trailing = [(ERROR_METADATA, error_detail(problem).SerializeToString())]
             grpc_context.set_trailing_metadata(trailing)  # type: ignore[arg-type]
         return response.FromString(found.body)
 

@@ -136,8 +136,7 @@ def _error_of(error: Any, address: str) -> GraspClientError:
     except (DecodeError, KeyError):
         if code == grpc.StatusCode.UNAVAILABLE:
             return unreachable(address, message)
-        kind = code.name.lower().replace("_", "-")
-        return error_of_kind(kind, f"{code.name}: {message}")
+        return error_of_kind(code.name.lower().replace("_", "-"), f"{code.name}: {message}")
     return _described(message, detail)
 
 

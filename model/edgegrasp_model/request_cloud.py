@@ -270,8 +270,7 @@ def _depth(depth: object, max_points: int, field: str) -> Array:
     if len(image.data) != expected:
         value = f"{len(image.data)} bytes where height, width and encoding ask for {expected}"
         raise InvalidRequest(f"{field}.data", value, "Send the whole image.")
-    pixels = np.frombuffer(image.data, dtype)
-    return pixels.reshape(image.height, image.width)
+    return np.frombuffer(image.data, dtype).reshape(image.height, image.width)
 
 
 # Options as text

@@ -163,8 +163,7 @@ def _palm_ways(gripper: Gripper) -> list[Float32]:
 def _closing_line(gripper: Gripper) -> tuple[Float32, Float32]:
     """The y (PLACES,) of places from beyond one finger to beyond the other, and points at each."""
     half, length = gripper.pad_half_width, gripper.tip_z - gripper.seen_palm_z
-    thick = gripper.finger_thickness
-    end = gripper.max_opening / 2 + thick
+    end = gripper.max_opening / 2 + gripper.finger_thickness
     y = np.linspace(-end, end, PLACES, dtype=np.float32)
     across = _grid([-0.5 * half, 0.5 * half], [0.0], gripper.tip_z - np.array([0.1, 0.3]) * length)
     line = across + y[:, None, None] * np.array([0.0, 1.0, 0.0], dtype=np.float32)

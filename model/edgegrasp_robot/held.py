@@ -103,8 +103,7 @@ def load_of(
         T_cloud_box = np.linalg.inv(scene.frame.T_canonical_cloud) @ T_scene_box
     foot = _lowest(scene, (T_cloud_box[:3, 3] - half[2] * T_cloud_box[:3, 2])[None])
     below = foot if scene.support is not None and 0.0 < foot < MAX_HIDDEN_FOOT else 0.0
-    points = moved(T_base_cloud, held.points)
-    return Load(points, T_base_cloud @ T_cloud_box, half, below)
+    return Load(moved(T_base_cloud, held.points), T_base_cloud @ T_cloud_box, half, below)
 
 
 def places_for(

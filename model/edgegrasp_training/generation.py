@@ -200,8 +200,7 @@ def _views(
         guide = detector(options.weights)
     for _ in range(options.views_per_scene):
         if simulation.num_objects == 0 or failures == FAILURES:
-            count = 1 + int(rng.poisson(FURTHER_OBJECTS[kind]))
-            simulation.reset(kind, rng, count, sizes)
+            simulation.reset(kind, rng, 1 + int(rng.poisson(FURTHER_OBJECTS[kind])), sizes)
             failures = 0
         models = [model.origin or model for model in simulation.object_models]
         cameras, guided = seen_from.sample(camera), guide is not None

@@ -201,8 +201,7 @@ def _faults(
     if rng.random() < 0.08:  # ghosts: reflections and wrong matches
         ghost = _blobs(rng, depth.shape, 16) < rng.uniform(0.002, 0.02)
         noisy[ghost] *= rng.uniform(0.6, 1.1)
-    far = rng.uniform(2.5, 13.0)
-    noisy[noisy > far] = np.nan
+    noisy[noisy > rng.uniform(2.5, 13.0)] = np.nan
     if rng.random() < 0.3:  # a camera's least distance
         noisy[noisy < rng.uniform(0.2, 0.35)] = np.nan
     # Flying pixels and ghosts show nothing that is there.

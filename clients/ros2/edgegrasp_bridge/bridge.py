@@ -151,8 +151,7 @@ class Inbox:
         latest = {each.header.frame_id: each for each in sources} if mask is None else {}
         latest.pop(source.header.frame_id, None)
         others = tuple((each, self._camera_of(each)) for each in latest.values())
-        camera = self._camera_of(source)
-        return Scene(None, source, camera, mask, others, self._joints)
+        return Scene(None, source, self._camera_of(source), mask, others, self._joints)
 
     def _camera_of(self, depth: Any) -> Any:
         """The CameraInfo of an image: that of its frame, or the only one."""

@@ -149,8 +149,7 @@ def in_chunks(rows: int, *values: Tensor) -> list[tuple[Tensor, ...]]:
 
 def by_chunks(layer: Layer, values: Tensor, rows: int = ROWS) -> Tensor:
     """A layer that maps the rows of values (M, ...) one by one."""
-    parts = [layer(part) for (part,) in in_chunks(rows, values)]
-    return torch.cat(parts)[: len(values)]
+    return torch.cat([layer(part) for (part,) in in_chunks(rows, values)])[: len(values)]
 
 
 def ball_maximum(chunks: list[BallChunk], layer: Callable[[BallChunk], Tensor]) -> Tensor:

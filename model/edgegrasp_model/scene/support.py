@@ -311,8 +311,7 @@ def fit_plane(
     if len(normals) == 0:
         return None
     heights = points @ normals.T - np.einsum("td,td->t", normals, origin)
-    worth = (np.abs(heights) < thick[:, None]).sum(axis=0)
-    best = int(worth.argmax())
+    best = int((np.abs(heights) < thick[:, None]).sum(axis=0).argmax())
     offset = float(normals[best] @ origin[best])
     plane = SupportPlane.model_construct(normal=tuple(normals[best].tolist()), offset=offset)
     for within in (1.0, 0.7, 0.5):

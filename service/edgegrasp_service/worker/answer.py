@@ -158,8 +158,7 @@ class _Work:
             raise errors.UnsupportedMediaType("Content-Type", repr(kind[:40]), fix)
         if path is None:  # Ray has this path without the setting too
             raise InvalidRequest("path", "/v1/outcomes", "Set the setting `outcomes_file`.")
-        fields = read_json("body", self.job.body)
-        tried = parse(recording.TriedGrasp, fields, "body")
+        tried = parse(recording.TriedGrasp, read_json("body", self.job.body), "body")
         self.catalogue.get(tried.model)  # raises UnknownModel
         digests = {row["name"]: row["digest"] for row in self.catalogue.describe()}
         line = tried.model_dump() | {"digest": digests[tried.model]}
@@ -291,8 +290,7 @@ def read_request(job: Job) -> dict[str, Any]:
             if name not in known:
                 raise _unknown(name, known, "field")
     else:
-        boundary = named.get("boundary", "")
-        fields = _fields_of_form(job.body, boundary, (*known, *CAMERA))
+        fields = _fields_of_form(job.body, named.get("boundary", ""), (*known, *CAMERA))
     if not isinstance(fields.setdefault("options", {}), dict):
         raise InvalidRequest("options", brief(fields["options"]), "Send a JSON object.")
     return fields
