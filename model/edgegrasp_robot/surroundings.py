@@ -21,8 +21,7 @@ from edgegrasp_model.scene.support import heights_over
 from edgegrasp_robot.robot import HAND, Robot, touching
 
 VOXEL_SIZE = 0.01  # metres, side of a voxel
-# Around a point, in voxels: noise and the arm's controller are off by millimetres.
-MARGIN = 0.4 * np.array(list(product((-1, 1), repeat=3)), dtype=np.float32)
+MARGIN = 0.4  # voxels around a point: noise and the arm's controller are off by millimetres
 MAX_RANGE = 2.0  # metres from the arm's base; farther points are left out
 SELF_DISTANCE = 0.02  # metres; points this near to the arm are the arm itself
 MAX_VOXELS_INSIDE = 10  # voxels of objects that may lie inside the arm, given camera errors
@@ -211,8 +210,8 @@ def _voxels(
     cells = flat[kept] @ (T[:3, :3].T / VOXEL_SIZE).astype(flat.dtype)
     cells += ((T[:3, 3] - base) / VOXEL_SIZE).astype(flat.dtype)
     cells = cells[np.einsum("ij,ij->i", cells, cells) < (MAX_RANGE / VOXEL_SIZE) ** 2]
-    cells = cells[:, None] + (MARGIN + base / VOXEL_SIZE).astype(flat.dtype)
-    centers = _centers(cells.reshape(-1, 3))
+    cells += (base / VOXEL_SIZE).astype(flat.dtype)
+    centers = _centers(cells, shifts=(-MARGIN, MARGIN))
     return centers[~_near_robot(robot, joints, moved(T_base_scene, centers), SELF_DISTANCE)]
 
 
@@ -230,17 +229,22 @@ def _hidden(scene: Scene, voxels: Float64, T_base_scene: Float64) -> Float64:
     return _centers(*hidden)
 
 
-def _centers(*groups: Floats) -> Float64:
-    """Centers (V, 3) of the voxels in which each group of places (N, 3), in cells, has one."""
-    cells = [np.floor(np.ascontiguousarray(places.T)).astype(np.int32) for places in groups]
-    if not all(cell.size for cell in cells):
+def _centers(*groups: Floats, shifts: Sequence[float] = (0.0,)) -> Float64:
+    """Centers (V, 3) of the voxels in which each group of places (N, 3), in cells, has one.
+
+    Each place is one at every combination of the ascending shifts along the axes.
+    """
+    columns = [np.ascontiguousarray(places.T) for places in groups]
+    if not all(column.size for column in columns):
         return np.empty((0, 3))
-    corner = np.min([cell.min(axis=1) for cell in cells], axis=0)[:, None]
-    size = np.max([cell.max(axis=1) for cell in cells], axis=0) - corner[:, 0] + 1
-    common = np.ones(size, dtype=bool)
+    cells = [[np.floor(column + s).astype(np.int32) for s in shifts] for column in columns]
+    corner = np.min([cell[0].min(axis=1) for cell in cells], axis=0)[:, None]
+    size = np.max([cell[-1].max(axis=1) for cell in cells], axis=0) - corner[:, 0] + 1
+    common, strides = np.ones(size, dtype=bool), np.array([[size[1] * size[2]], [size[2]], [1]])
     for cell in cells:
-        taken = np.zeros(size, dtype=bool)
-        taken[tuple(cell - corner)] = True
+        taken, steps = np.zeros(size, dtype=bool), [(each - corner) * strides for each in cell]
+        for x, y, z in product(steps, repeat=3):
+            taken.reshape(-1)[x[0] + y[1] + z[2]] = True
         common &= taken
     return np.asarray((np.argwhere(common) + corner.T + 0.5) * VOXEL_SIZE)
 
