@@ -11,7 +11,7 @@ import numpy as np
 
 from edgegrasp_camera.arrays import Float64
 from edgegrasp_results import ArmTrajectory
-from edgegrasp_sim.engine import TIME_STEP, ArmModel, Hand, HandModel, Parts, World
+from edgegrasp_sim.engine import TIME_STEP, ArmModel, Contact, Hand, HandModel, Parts, World
 from edgegrasp_sim.engine.urdf import read_obj
 from edgegrasp_sim.poses import quaternion_xyzw, translation
 from edgegrasp_sim.scene import SceneObject
@@ -92,14 +92,14 @@ def run_grasp(
         seen = gripper.body.opening, start_contact, held, target, cause
         return GraspResult(*seen, touched_on_the_way=tuple(touched))
 
-    if _cut_into(gripper).keys() & obstacles:
+    if any(each.other_uid in obstacles for each in _cut_into(gripper)):
         return result(FailureCause.START_COLLISION)
     collided = False
     for _ in gripper.approach(T_world_hand):
         cut = _cut_into(gripper)
         if gripper.on_the_way:
-            touched += cut.values()
-        if cut.keys() & obstacles:
+            touched += [each.position for each in cut]
+        if any(each.other_uid in obstacles for each in cut):
             return result(FailureCause.APPROACH_COLLISION)
         collided = collided or bool(cut)
     _close(gripper, objects, to_the_end=to_the_end)
@@ -342,9 +342,9 @@ def _holds_when_shaken(
     return not gripper.is_shut and held in _touched(gripper, objects)
 
 
-def _cut_into(gripper: Gripper) -> dict[int, Sequence[float]]:
+def _cut_into(gripper: Gripper) -> list[Contact]:
     contacts, depth = gripper.body.contacts(), gripper.world.collision_depth
-    return {each.other_uid: each.position for each in contacts if each.distance < -depth}
+    return [each for each in contacts if each.distance < -depth]
 
 
 def _touched(gripper: Gripper, objects: Mapping[int, SceneObject]) -> list[SceneObject]:

@@ -20,8 +20,9 @@ from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.trial import Attempt, Round
 
 PAIRED = ("scene", "engine", "protocol", "objects", "constants")  # equal in paired runs
-TOUCHED = ("touched_on_the_way", "touched_seen")  # of an arm's attempts
 COUNTS = ("successes", "attempts", "objects")
+# Of an attempt: times, and what is known of arms only.
+UNDIGESTED = ("planning_seconds", "motion_seconds", "touched_on_the_way", "touched_seen")
 RATE_LABELS = {"grasp_success_rate": "GSR", "declutter_rate": "DR"}
 GATED = ("scene", "engine", "protocol", "protocol_version")
 RESAMPLES = 10_000
@@ -146,7 +147,8 @@ def _arm_figures(rounds: Sequence[Round]) -> dict[str, Any] | None:
     return {
         "picks_per_hour": 3600 * sum(a.success for a in attempts) / seconds,
         "motion_seconds": median(a.motion_seconds for a in attempts),
-        **{name: sum(getattr(a, name) for a in attempts) for name in TOUCHED},
+        "touched_on_the_way": sum(a.touched_on_the_way for a in attempts),
+        "touched_seen": sum(a.touched_seen for a in attempts),
         "scenes_with_a_reachable_grasp": sum(bool(item.attempts) for item in rounds),
     }
 
@@ -183,7 +185,7 @@ def attempts_digest(rounds: Sequence[Round]) -> str:
     for table in tables:
         del table["too_wide"], table["start_collisions"]
         for attempt in table["attempts"]:
-            for name in ("planning_seconds", "motion_seconds", *TOUCHED):
+            for name in UNDIGESTED:
                 del attempt[name]
     return hashlib.sha256(json.dumps(tables, sort_keys=True).encode()).hexdigest()
 

@@ -253,7 +253,8 @@ def test_a_touch_is_of_something_seen_next_to_a_point_that_was_seen(simulation, 
         touched = GraspResult(0.0, False, None, touched_on_the_way=(point + away,))
         monkeypatch.setattr(simulation, "execute_grasp", Mock(return_value=touched))
         attempt = driver.execute(PlannedGrasp(IN_THE_AIR, 1.0, 0.04))
-        assert (attempt.touched_on_the_way, attempt.touched_seen) == (True, seen)
+        assert attempt.touched_on_the_way is True  # as JSON has it
+        assert attempt.touched_seen is seen
 
 
 def test_an_arm_that_cannot_start_in_a_view_takes_another_one(simulation) -> None:
