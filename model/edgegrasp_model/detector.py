@@ -295,13 +295,13 @@ class GraspDetector:
         """An evaluation of each given edge or hand pose, in order."""
         candidates, gripper = given.candidates, prepared.gripper
         logits = self._logits(prepared, scene, candidates).astype(np.float64)
+        if given.T_cloud_hand is not None:
+            candidates = replace(candidates, T_cloud_hand=given.T_cloud_hand)
         with prepared.timed("network"):
             held = expit(logits / self.metadata.temperature)
             _, score = self._scores(scene, candidates.contact_index, held)
             hands = candidates.T_cloud_hand, candidates.opening
             free = ~collides(scene, *hands, gripper, request)
-            if given.T_cloud_hand is not None:
-                candidates = replace(candidates, T_cloud_hand=given.T_cloud_hand)
             grasps = ranking.grasps_in_cloud(scene, candidates, gripper, score, free)
         evaluations = [Evaluation(None, reason) for reason in given.reason]
         for number, grasp in zip(candidates.pair.tolist(), grasps, strict=True):

@@ -4,6 +4,7 @@ import numpy as np
 from tests.many_options import OWN_GRIPPER
 
 from edgegrasp_model.given import FLIPPED
+from edgegrasp_model.gripper import gripper_fields
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import NoGrasp
 from edgegrasp_model.scene.cloud import CloudInput
@@ -108,10 +109,11 @@ def test_edges_along_the_normal_or_deeper_than_the_fingers_define_no_grasp() -> 
 
 
 def test_hand_poses_of_detected_grasps_find_their_own_contacts() -> None:
-    cloud = box_on_table()
-    found = detector().detect(cloud, ask(collision="avoid", min_score=0.0))
+    cloud, hand = box_on_table(), gripper_fields("panda")
+    hand["hand"]["boxes"].append([[0.0316, -0.03, 0.02], [0.1, 0.03, 0.09]])  # a camera on one side
+    found = detector().detect(cloud, ask(collision="avoid", min_score=0.0, gripper=hand))
     poses = np.stack([grasp.T_cloud_hand for grasp in found.grasps])
-    scored = detector().score(cloud, ask(), hand_poses=poses)
+    scored = detector().score(cloud, ask(gripper=hand), hand_poses=poses)
     assert len(scored.evaluations) == len(poses) > 20
     near = 0
     for pose, theirs, mine in zip(poses, found.grasps, scored.evaluations, strict=True):
@@ -124,7 +126,8 @@ def test_hand_poses_of_detected_grasps_find_their_own_contacts() -> None:
         assert abs(contact[0]) < PANDA.pad_half_width
         assert abs(contact[1]) < PANDA.max_opening / 2
     assert near > 0.8 * len(poses)
-    flipped = detector().score(cloud, ask(), hand_poses=poses @ FLIPPED)
+    flipped = detector().score(cloud, ask(gripper=hand), hand_poses=poses @ FLIPPED)
+    assert not all(each.grasp.collision_free for each in flipped.evaluations)
     for one, other in zip(scored.evaluations, flipped.evaluations, strict=True):
         np.testing.assert_allclose(one.grasp.score, other.grasp.score, atol=1e-3)
         np.testing.assert_allclose(one.grasp.contact_point, other.grasp.contact_point, atol=1e-6)
