@@ -23,7 +23,18 @@ from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Detection, Grasp
 from edgegrasp_training.recipes import build_network
 
-from .rendered import FOCAL_LENGTH, HEIGHT, SCENE, WIDTH, box, boxes_on_table, camera, render, table
+from .rendered import (
+    FOCAL_LENGTH,
+    HEIGHT,
+    SCENE,
+    WIDTH,
+    box,
+    boxes_on_table,
+    camera,
+    render,
+    table,
+    to_world,
+)
 from .scenes import PANDA, TINY, box_on_table, detector, scene_of
 
 CLOUD = box_on_table()
@@ -142,6 +153,11 @@ def test_a_raw_cloud_is_seen_from_its_origin_and_the_answer_says_so(catalogue) -
     assert same(given, assumed)
     assert len(assumed.grasps) > 0
     assert any("the camera is assumed at the origin" in each for each in assumed.warnings)
+    # Not below a table that is given.
+    above = to_world(camera(0.7, 0.0, 0.9), cloud) + np.array([0.0, 0.0, 1.0])
+    support = {"normal": (0.0, 0.0, 1.0), "offset": 1.0}
+    found = network.detect(above, DetectOptions.model_validate({"support": support}))
+    assert found.grasps[0].score > 0.8
 
 
 def test_one_of_the_objects_by_number_by_pixel_or_by_place(catalogue) -> None:

@@ -187,7 +187,7 @@ def assumed_viewpoint(
 
     InvalidRequest: the place is needed to the millimetre.
     """
-    if seen_from_origin(points, options.up):
+    if seen_from_origin(points, options.known_up):
         warnings.append(
             "viewpoint is not given: the camera is assumed at the origin, as the whole cloud "
             "lies in front of it; if the camera is elsewhere, send its position."
