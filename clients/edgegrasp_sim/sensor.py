@@ -51,6 +51,7 @@ class DepthNoise:
 class DepthSensor:
     """A depth camera: what `apply` does to an image, in this order."""
 
+    name: str  # of its kind
     baseline: float  # metres along x to the projector or second camera; 0: nothing is hidden
     window: int  # pixels of the window that smooths steps smaller than `EDGE`; 1: not smoothed
     fattening: float  # share of the pixels behind an edge that get the depth of its front
@@ -118,18 +119,21 @@ class DepthSensor:
 
 # A first-generation Kinect, an active stereo camera, a time-of-flight camera; at arm's length.
 STRUCTURED_LIGHT = DepthSensor(
-    baseline=0.075, window=5, fattening=0.15, flying=0.0, noise_floor=0.0002, noise_growth=0.0014,
-    noise_pixels=2, warp=0.001, disparity_step=0.125, grazing=78.0, missing=0.01,
+    name="structured-light", baseline=0.075, window=5, fattening=0.15, flying=0.0,
+    noise_floor=0.0002, noise_growth=0.0014, noise_pixels=2, warp=0.001, disparity_step=0.125,
+    grazing=78.0, missing=0.01,
 )  # fmt: skip
 STEREO = DepthSensor(
-    baseline=0.05, window=7, fattening=0.35, flying=0.05, noise_floor=0.0003, noise_growth=0.0022,
-    noise_pixels=4, warp=0.001, disparity_step=0.0625, grazing=80.0, missing=0.02,
+    name="stereo", baseline=0.05, window=7, fattening=0.35, flying=0.05, noise_floor=0.0003,
+    noise_growth=0.0022, noise_pixels=4, warp=0.001, disparity_step=0.0625, grazing=80.0,
+    missing=0.02,
 )  # fmt: skip
 TIME_OF_FLIGHT = DepthSensor(
-    baseline=0.0, window=1, fattening=0.0, flying=0.5, noise_floor=0.0010, noise_growth=0.0010,
-    noise_pixels=1, warp=0.002, disparity_step=0.0, grazing=82.0, missing=0.005,
+    name="time-of-flight", baseline=0.0, window=1, fattening=0.0, flying=0.5, noise_floor=0.0010,
+    noise_growth=0.0010, noise_pixels=1, warp=0.002, disparity_step=0.0, grazing=82.0,
+    missing=0.005,
 )  # fmt: skip
-SENSORS = {"structured-light": STRUCTURED_LIGHT, "stereo": STEREO, "time-of-flight": TIME_OF_FLIGHT}
+SENSORS = {kind.name: kind for kind in (STRUCTURED_LIGHT, STEREO, TIME_OF_FLIGHT)}
 
 
 def random_sensor(rng: np.random.Generator) -> DepthSensor:

@@ -2,11 +2,12 @@
 
 `python -m edgegrasp_training.evaluation data/held-out --weights A.safetensors B.safetensors`
 compares weights of hand networks on labelled views that none of them has learned from: by kind of
-scene, and by whether the camera saw the far side.
+scene, depth camera and object, and by whether the camera saw the far side.
 """
 
 import argparse
 import json
+import re
 import sys
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -201,7 +202,7 @@ def recalibrate(weights: Path, outcomes_file: Path, folder: Path) -> str:
 class Scored(NamedTuple):
     """Labelled grasps of some views, and the scores of several networks."""
 
-    kind: NDArray[np.str_]  # (E,) of scene
+    groups: NDArray[np.str_]  # (3, E) kinds of scene, depth camera and object
     far_side_hidden: Bools  # (E,)
     held: Bools  # (E,)
     logit: Float64  # (W, E) calibrated, of each network
@@ -226,17 +227,32 @@ def score_views(paths: list[Path], weights: list[Path]) -> Scored:
                 logit = network(packed.batch).double().numpy()
             logits.append(logit / metadata.temperature)
         hidden = (description[:, UNSEEN_NUMBERS] > MAX_HIDDEN_DEPTH).any(dim=1).numpy()
-        kind = np.full(len(hidden), scene_of(path).split("_")[0])
-        parts.append(Scored(kind, hidden, packed.label.numpy() > 0.5, np.stack(logits)))
+        scene, sensor = (
+            f"{scene_of(path).split('_')[0]} scenes",
+            f"{view.sensor or 'unknown'} camera",
+        )
+        names = (
+            view.targets if view.targets is not None else np.full(len(view.success), "unknown-0")
+        )
+        families = map(family_of, names[view.tried()[grasps.candidates.pair]])
+        groups = np.array([(scene, sensor, family) for family in families]).T
+        parts.append(Scored(groups, hidden, packed.label.numpy() > 0.5, np.stack(logits)))
     if not parts:
         raise ValueError("data: no grasp of these views was tried. Send others.")
     return Scored(*(np.concatenate(column, axis=-1) for column in zip(*parts, strict=True)))
 
 
+def family_of(name: str) -> str:
+    """Kind of the object with this name, "": nothing was between the fingers."""
+    household = re.fullmatch(r"([a-z]+)-\d+", name)
+    kind = "computed" if name.startswith(("made-", "blob_")) else "scanned"
+    return household[1] if household else f"{kind} object" if name else "no object"
+
+
 def reliability_tables(scored: Scored, names: list[str]) -> str:
     """Markdown: figures for each group of grasps, and the share that held by score."""
     groups = {"all": np.ones(len(scored.held), dtype=bool)}
-    groups |= {f"{kind} scenes": scored.kind == kind for kind in np.unique(scored.kind)}
+    groups |= {name: row == name for row in scored.groups for name in np.unique(row)}
     groups |= {"far side hidden": scored.far_side_hidden, "far side seen": ~scored.far_side_hidden}
     rows = []
     for group, mine in groups.items():

@@ -75,7 +75,8 @@ MAX_NOISE = 0.004  # metres
 FREE_SHARE = 0.75  # of the grasps chosen at random, those that are collision-free
 LIKELY, LIKELY_SHARE = 1 / 3, 0.7  # best part of an object's grasps, most of which are tried there
 
-Query = tuple[Observation, DetectOptions]  # a view of a scene, and a request for grasps in it
+# A view of a scene, a request for grasps in it, and the kind of depth camera.
+Query = tuple[Observation, DetectOptions, str]
 detector = lru_cache(maxsize=2)(GraspDetector.load)  # loads weights once in a process
 USUAL = WEIGHTS_FOLDER / "edgegrasp-plus.safetensors"  # prepares views without a guide
 
@@ -234,9 +235,10 @@ def ask(
     """
     open_table = kind in (PACKED, PILE)
     around = not open_table or noise.random() < AROUND_SHARE
-    draw, seen = noise.random(), dict[str, Any](noise_std=NOISE_STD)
+    draw, seen, sensor = noise.random(), dict[str, Any](noise_std=NOISE_STD), "ideal"
     if draw < SENSOR_SHARE:  # a camera's faults
-        seen = {"noise_std": 0.0, "faults": [random_sensor(noise)]}
+        fault = random_sensor(noise)
+        seen, sensor = {"noise_std": 0.0, "faults": [fault]}, fault.name
     elif draw < SENSOR_SHARE + OTHER_NOISE:
         seen = {"noise_std": noise.uniform(0.0, MAX_NOISE)}
     table: TableView = "around" if around else "known"
@@ -255,7 +257,7 @@ def ask(
         "collision": {"mode": "avoid" if guided else "penalise"},
         "gripper": simulation.gripper,
     }
-    return observation, DetectOptions.model_validate(request)
+    return observation, DetectOptions.model_validate(request), sensor
 
 
 def _plane(rng: np.random.Generator) -> SupportPlane:
@@ -291,7 +293,7 @@ def label(
     guide: GraspDetector | None,  # guides the choice
 ) -> tuple[LabelledView, Float32 | None]:
     """Sample candidates as the detector does and try some; also the guide's best hand (4, 4)."""
-    observation, _ = query
+    observation, _, sensor = query
     found = choose_grasps(query, options, rng, guide)
     if found is None:
         nothing, rows = np.empty((0, 3), dtype=np.float32), np.empty(0, dtype=np.int64)
@@ -300,6 +302,7 @@ def label(
     prepared, scene, candidates, best = found
     T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
+    targets = [result.target.model.name if result.target else "" for result in results]
     # Points far from every grasp carry no information.
     behind = prepared.gripper.tip_z - FINGERTIP
     places = T_world_hand[:, :3, 3] + np.float32(behind) * T_world_hand[:, :3, 2]
@@ -320,6 +323,8 @@ def label(
         support=np.array([0.0] * 4 if plane is None else [*plane.normal, plane.offset], np.float32),
         at_side=scene.at_side[kept],
         object_of_point=scene.object_of_point[kept].astype(np.int16),
+        targets=np.array(targets, np.str_),
+        sensor=sensor,
     )
     return view, None if best is None else T_world_hand[best]
 
@@ -331,7 +336,7 @@ def choose_grasps(
 
     The last is the row of the guide's best among them.
     """
-    observation, request = query
+    observation, request, _ = query
     if len(observation.cloud) < (request.num_approach_points or 1):
         return None
     prepared = (guide or detector(USUAL)).prepare(observation.cloud, request)

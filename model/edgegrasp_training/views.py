@@ -25,7 +25,7 @@ STORED_TYPES = {"normals": np.float16, "approach_index": np.uint16, "contact_ind
 # What the arrays of a file are read as.
 TYPES: dict[str, Callable[[Any], Any]] = {
     **{"normals": np.float32, "approach_index": np.int64, "contact_index": np.int64},
-    **{"engine": str, "gripper": str, "objects": tuple, "object_digests": tuple},
+    **{"engine": str, "sensor": str, "gripper": str, "objects": tuple, "object_digests": tuple},
 }
 # The table and the limits of the simulated scenes, for views whose file does not have them.
 TABLE = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.05)
@@ -52,6 +52,8 @@ class LabelledView:
     object_of_point: NDArray[np.int16] | None = None  # (N,) -1: on no object; None: not known
     objects: tuple[str, ...] = ()  # names of the objects in the scene, where they are known
     object_digests: tuple[str, ...] = ()  # SHA-256 of their files, in the same order
+    targets: NDArray[np.str_] | None = None  # (E,) objects between the fingers, "": none
+    sensor: str = ""  # kind of depth camera whose faults the cloud has, "": unknown
 
     def save(self, path: Path) -> None:
         """Write the view; a reader sees the whole file or none."""

@@ -152,15 +152,21 @@ def test_the_temperature_undoes_overconfidence() -> None:
 
 
 def test_views_are_scored_by_hand_networks_alone(tmp_path: Path) -> None:
-    made_up_view(1).save(tmp_path / "pile_0-000000_0.npz")
-    made_up_view(2).save(tmp_path / "table_0-000001_0.npz")
+    plate, other = made_up_view(1), made_up_view(2)
+    seen = {"sensor": "stereo", "targets": np.full(len(plate.success), "plate-001")}
+    replace(plate, **seen).save(tmp_path / "pile_0-000000_0.npz")
+    other.save(tmp_path / "table_0-000001_0.npz")
     paths = sorted(tmp_path.glob("*.npz"))
     hands, balls = (tmp_path / f"{name}.safetensors" for name in ("hands", "balls"))
     for file in (hands, balls):
         metadata = CheckpointMetadata(file.stem, NETWORKS[file.stem], 0.0045, "panda")
         save_checkpoint(file, build_network(metadata.network), metadata)
     scored = score_views(paths, [hands, hands])
-    assert set(scored.kind.tolist()) == {"pile", "table"}
+    groups = {
+        ("pile scenes", "stereo camera", "plate"),
+        ("table scenes", "unknown camera", "unknown"),
+    }
+    assert set(map(tuple, scored.groups.T.tolist())) == groups
     assert scored.logit.shape == (2, len(scored.held))
     np.testing.assert_array_equal(*scored.logit)
     assert 0 < scored.held.mean() < 1
