@@ -140,8 +140,7 @@ def _points(scene: Scene, observation: Observation, rng: np.random.Generator) ->
         z = (scene.support.offset - normal[0] * x - normal[1] * y) / normal[2]
         points = np.concatenate([points, np.stack([x, y, z], axis=2).reshape(-1, 3)])
     inside = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
-    chosen: Float64 = points[rng.permutation(inside)[:MOST_POINTS]]
-    return chosen
+    return np.asarray(points[rng.permutation(inside)[:MOST_POINTS]])
 
 
 def _near(points: Float32, centres: Float32, radius: float) -> Int64:

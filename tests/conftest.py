@@ -6,7 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -68,9 +68,7 @@ class RunningServer:
 
 
 @contextlib.contextmanager
-def running_server(
-    *flags: str, program: Sequence[str] = EDGEGRASP[1:], seconds: float = 0.0, **more: Any
-) -> Iterator[RunningServer]:
+def running_server(*flags, program=EDGEGRASP[1:], seconds=0.0, **more) -> Iterator[RunningServer]:
     words = (sys.executable, *program, "serve", "--http-port", "0", "--grpc-port", "0", *flags)
     environment = os.environ | {"DUMMY_SECONDS": str(seconds)}
     with started(*words, env=environment, **more) as process:

@@ -138,11 +138,7 @@ def fuse_depth_images(depths: Sequence[Array], views: Sequence[Any]) -> CloudInp
 
 
 def _intrinsics_warnings(camera: Intrinsics, shape: tuple[int, ...], field: str) -> Iterator[str]:
-    """Doubts about intrinsics for an image (H, W), as sentences.
-
-    Raises:
-        InvalidRequest: They cannot belong to an image of that size.
-    """
+    """Doubts about intrinsics for images (H, W), as sentences; InvalidRequest: impossible ones."""
     height, width = shape
     image = f"an image of {width} x {height} pixels"
     fix = "Send those of this very image: where it was scaled, scaled with it. Do not crop it."

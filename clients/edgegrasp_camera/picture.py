@@ -277,8 +277,7 @@ def shaded(depth: Floats, fx: float, fy: float) -> Float64:
     x, y = right * fx / depth, down * fy / depth
     # The surface's normal is (x, y, -1), not of unit length.
     facing = (LIGHT[0] * x + LIGHT[1] * y - LIGHT[2]) / np.sqrt(x**2 + y**2 + 1)
-    light: Float64 = np.clip(np.nan_to_num(facing), 0.0, 1.0)
-    return light
+    return np.asarray(np.clip(np.nan_to_num(facing), 0.0, 1.0))
 
 
 def fork(
@@ -297,8 +296,7 @@ def fork(
         [(0.0, half, palm), (0.0, half, tip)],
     ]
     transform = np.asarray(T_cloud_hand, dtype=np.float64)
-    in_cloud: Float64 = in_hand @ transform[:3, :3].T + transform[:3, 3]
-    return in_cloud
+    return np.asarray(in_hand @ transform[:3, :3].T + transform[:3, 3])
 
 
 def _lines_of(shape: Mapping[str, Any]) -> Iterator[Float64]:

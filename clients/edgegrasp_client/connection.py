@@ -14,8 +14,8 @@ from edgegrasp_client.errors import InvalidRequestError, OverloadedError, Server
 
 HTTP_OVER_UNIX = "http+unix:"
 
-# Of a call while the server is away: as long as a restart takes; few before its first answer, since
-# it is probably not there.
+# Retries of a call while the server is away, enough for a restart; fewer before its first answer,
+# as there is probably no server.
 RETRIES, FEW_RETRIES = 8, 4
 FIRST_DELAY, LONGEST_DELAY = 0.1, 2.0  # seconds; each is twice the one before
 STOP_SECONDS = 15.0  # for a local server to drain

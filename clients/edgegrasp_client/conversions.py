@@ -276,8 +276,7 @@ def matrix_from_quaternion(quaternion: ArrayLike) -> Float64:
         raise ValueError(f"quaternion: got {q.tolist()}. Give x, y, z, w that are not all zero.")
     x, y, z, w = q / length
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # cross @ v: the axis times v
-    rotation: Float64 = np.eye(3) + 2 * w * cross + 2 * cross @ cross
-    return rotation
+    return np.asarray(np.eye(3) + 2 * w * cross + 2 * cross @ cross)
 
 
 def _matrix(pose: ArrayLike | None) -> Float64:

@@ -132,10 +132,7 @@ def _value(hint: Any) -> Callable[[Any], Any]:
 # Kinds of errors that a server reports; the last of some are gRPC's codes, as a proxy sends them.
 _KINDS: dict[type[GraspClientError], tuple[str, ...]] = {
     errors.InvalidRequestError: (
-        "invalid-request",
-        "unsupported-media-type",
-        "headers-too-large",
-        "harmful-request",
+        *("invalid-request", "unsupported-media-type", "headers-too-large", "harmful-request"),
         "invalid-argument",
     ),
     errors.StartCollisionError: ("start-collision",),

@@ -84,10 +84,8 @@ class GraspTracker:
                 if self._searching or one.number == object_
             ][:MAX_OBJECTS]
             if not self._searching:
-                plane = last.support and {
-                    "normal": last.support.normal.tolist(),
-                    "offset": last.support.offset,
-                }
+                seen = last.support
+                plane = seen and {"normal": seen.normal.tolist(), "offset": seen.offset}
                 asked = options.get("support", "auto")
                 kind = asked.get("kind") if isinstance(asked, Mapping) else asked
                 options |= {"support": plane if kind in SEARCHED_SUPPORTS else asked, "up": last.up}

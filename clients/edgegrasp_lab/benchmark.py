@@ -140,11 +140,8 @@ def benchmark_arm(
         robot.joint_names,
         robot.home,
     )
-    asked = {
-        "name": robot.name,
-        "T_base_cloud": np.linalg.inv(T_world_base).tolist(),
-        "joints": robot.home.tolist(),
-    }
+    T_base_world = np.linalg.inv(T_world_base).tolist()
+    asked = {"name": robot.name, "T_base_cloud": T_base_world, "joints": robot.home.tolist()}
     hand = None if robot.gripper.name == "panda" else robot.hand.model_dump()
     return arm, hand, {"robot": asked, "collision": LIFT}
 

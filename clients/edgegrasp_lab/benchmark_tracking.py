@@ -24,7 +24,7 @@ from edgegrasp_sim.sensor import STRUCTURED_LIGHT
 from edgegrasp_sim.simulation import ClutterSimulation
 
 RATE = 30.0  # images a second
-NOISE, MISSING = (0.0003, 0.0015), 0.005  # metres, and for each square metre of depth; of pixels
+NOISE, MISSING = (0.0003, 0.0015), 0.005  # metres, and metres per depth squared; share of pixels
 EYE, TARGET = np.array([0.15, -0.35, 0.65]), np.array([0.15, 0.15, 0.05])  # of the camera, metres
 OBJECTS = 3  # in a simulated scene
 REPEATED = 8  # images of a still scene in which the first grasp is looked for anew

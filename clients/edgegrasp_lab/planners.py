@@ -158,11 +158,7 @@ class ClientPlanner:
 
 
 def model_used(client: Any, name: str) -> Model:
-    """The model that a request naming `name` gets; the default for an empty one.
-
-    Raises:
-        GraspClientError: the server does not answer, or has no such model.
-    """
+    """The model that a request naming `name` gets, the default if empty. GraspClientError: none."""
     models: list[Model] = client.models()
     for model in models:
         if model.name == name or (model.default and not name):
@@ -180,11 +176,8 @@ def request_options(
     """
     low, high = observation.workspace.tolist()
     positions = observation.camera_positions.tolist()
-    support = {
-        "normal": (0.0, 0.0, 1.0),
-        "offset": observation.table_height,
-        "max_depth_error": rules.max_depth_error,
-    }
+    plane = {"normal": (0.0, 0.0, 1.0), "offset": observation.table_height}
+    support = plane | {"max_depth_error": rules.max_depth_error}
     options: dict[str, Any] = {
         "seed": seed,
         "num_approach_points": rules.num_approach_points,

@@ -12,7 +12,7 @@ import numpy as np
 from edgegrasp_camera.arrays import Float64
 from edgegrasp_results import ArmTrajectory
 from edgegrasp_sim.engine import TIME_STEP, ArmModel, Contact, Hand, HandModel, Parts, World
-from edgegrasp_sim.engine.urdf import read_obj
+from edgegrasp_sim.engine.urdf import parse_obj
 from edgegrasp_sim.poses import quaternion_xyzw, translation
 from edgegrasp_sim.scene import SceneObject
 
@@ -191,9 +191,7 @@ class Gripper:
 class ArmGripper(Gripper):
     """The hand on an arm."""
 
-    def __init__(
-        self, world: World, hand: HandModel, arm: ArmModel, min_opening: float = MIN_OPENING
-    ) -> None:
+    def __init__(self, world: World, hand: HandModel, arm: ArmModel, min_opening: float) -> None:
         self.world, self.model, self.min_opening = world, hand, min_opening
         self.body = self._arm = world.add_arm(arm, hand)
 
@@ -242,7 +240,7 @@ def seconds_of(motion: ArmTrajectory) -> float:
 @cache
 def panda() -> HandModel:
     """The Panda's hand, of the convex hulls of its meshes: palm at z = 0.0658, metres."""
-    shapes = dict(read_obj(SHAPES))
+    shapes = dict(parse_obj(SHAPES.read_text()))
     finger = shapes["finger"].points
     return HandModel(
         palm=(shapes["palm"].points,),
@@ -305,7 +303,7 @@ def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: 
 def _is_clear(
     gripper: Gripper, objects: Mapping[int, SceneObject], opening: float
 ) -> Iterator[bool]:
-    """After every time step of a retreat: is it clear what the hand, that open before, will hold?
+    """After every time step of a retreat, whether it is clear what the hand will hold.
 
     The fingers are empty then, or hold one object that rests on nothing else.
     """

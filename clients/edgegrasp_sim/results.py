@@ -21,7 +21,7 @@ from edgegrasp_sim.trial import Attempt, Round
 
 PAIRED = ("scene", "engine", "protocol", "objects", "constants")  # equal in paired runs
 COUNTS = ("successes", "attempts", "objects")
-# Of an attempt: times, and what is known of arms only.
+# Fields of an attempt that its digest leaves out: times, and what only arms have.
 UNDIGESTED = ("planning_seconds", "motion_seconds", "touched_on_the_way", "touched_seen")
 RATE_LABELS = {"grasp_success_rate": "GSR", "declutter_rate": "DR"}
 GATED = ("scene", "engine", "protocol", "protocol_version")
@@ -36,11 +36,7 @@ class ResultFolder:
     path: Path
 
     def open(self, manifest: dict[str, Any]) -> None:
-        """Start a benchmark in this folder, or resume an interrupted one.
-
-        Raises:
-            ValueError: The folder holds another benchmark.
-        """
+        """Start a benchmark in this folder, or resume its own. ValueError: it holds another one."""
         known = self.path / "manifest.json"
         manifest = json.loads(json.dumps(manifest))  # tuples become lists, as in the file
         if known.is_file():

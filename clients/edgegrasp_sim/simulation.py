@@ -209,11 +209,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
     def execute_grasp(
         self, T_world_hand: ArrayLike, motion: ArmTrajectory | None = None
     ) -> GraspResult:
-        """Grasp to the end: a held object leaves the scene, and the others come to rest.
-
-        Raises:
-            ValueError: The pose is not rigid.
-        """
+        """Grasp until a held object has left the scene and others rest; ValueError: not rigid."""
         self._hand.motion = motion
         result = self._run(T_world_hand, to_the_end=True, shake=False)
         self._rest_state = None

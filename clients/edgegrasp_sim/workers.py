@@ -17,7 +17,7 @@ from typing import Any, TypeAlias, TypeVar
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-# Makes, in the process that uses it, what does a task; must be picklable unless that is this one.
+# Makes the callable that does a task, in the process that uses it; picklable for other processes.
 MakeRunner: TypeAlias = Callable[[], Callable[[Task], Result]]
 
 MAX_CRASHES = 3  # of processes in a row without a result between them; of one task on a cluster

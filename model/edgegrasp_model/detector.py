@@ -43,7 +43,7 @@ NO_APPROACH_POINT = (
     "list at least half of its points; to select around a single point, send a sphere."
 )
 NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
-# Rating of a grasp from which its object gets no approach points in each round.
+# In each round, an object with a grasp rated this high gets no further approach points.
 ENOUGH_SCORES = (1.0, ranking.SURE_SCORE, ranking.GOOD_SCORE, ranking.GOOD_SCORE)
 MAX_BALLS_AT_ONCE = 64
 MIN_TRAINING_HANDS = 20  # grippers in the last training run from which weights suit any gripper
@@ -183,7 +183,7 @@ class GraspDetector:
                 continue
             logits = self._logits(prepared, scene, sample.candidates) / self.metadata.temperature
             sample = replace(sample, logits=logits.astype(np.float32))
-            scored = sample if scored is None else scored.and_further(sample)
+            scored = sample if scored is None else scored.followed_by(sample)
         return scored
 
     def finish(self, prepared: Prepared, sample: Sample | None) -> Detection:
@@ -405,8 +405,7 @@ class ModelCatalogue:
     def warm_up(self) -> None:
         """Detect once with the default model, so that the first request is not slow.
 
-        Raises:
-            InvalidCheckpoint: A network does not give the logits that it was written with.
+        InvalidCheckpoint: a network does not give the logits that it was written with.
         """
         rng = np.random.default_rng(0)
         box = rng.uniform(-1.0, 1.0, (2000, 3)) * (0.02, 0.03, 0.04)
@@ -437,11 +436,7 @@ class ModelCatalogue:
 
 
 def choose_device(name: str) -> torch.device:
-    """The device of that name; `auto` is the first GPU if there is one, else the processor.
-
-    Raises:
-        InvalidDevice: It is no device's name, or there is no such device here.
-    """
+    """The device of that name; `auto`: the first GPU, else the processor. Raises InvalidDevice."""
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     first = {"auto": "cuda:0", "cuda": "cuda:0"} if gpus else {"auto": "cpu"}
     known = {"cpu": "cpu", **first} | {here: here for here in map("cuda:{}".format, range(gpus))}

@@ -78,8 +78,7 @@ class Gripper:
             return np.zeros_like(opening, dtype=np.float64)
         radius, reach = self.swing.radius, self.swing.reach
         outward = reach - (self.max_opening - np.clip(opening, 0.0, self.max_opening)) / 2
-        advance: Floats = np.sqrt(radius**2 - outward**2) - np.sqrt(radius**2 - reach**2)
-        return advance
+        return np.asarray(np.sqrt(radius**2 - outward**2) - np.sqrt(radius**2 - reach**2))
 
     def furthest_advance(self, opening: ArrayLike) -> Floats:
         """The greatest `tip_advance` until it has closed to an opening (...)."""
@@ -110,10 +109,8 @@ class Gripper:
     def opened_to(self, opening: float) -> "Gripper":
         """The same gripper, opening to at most `opening` metres."""
         ahead = float(self.tip_advance(opening))
-        forward = tuple(
-            ((low[0], low[1], low[2] + ahead), (high[0], high[1], high[2] + ahead))
-            for low, high in self.finger.boxes
-        )
+        boxes = self.finger.boxes
+        forward = tuple(((*a[:2], a[2] + ahead), (*b[:2], b[2] + ahead)) for a, b in boxes)
         swing = self.swing
         if swing is not None:
             reach = swing.reach - (self.max_opening - opening) / 2

@@ -192,9 +192,9 @@ def non_max_suppression(
 ) -> tuple[Int64, Int64]:
     """Keep the first of each group of near duplicates in `order` (M,), `most` at most.
 
-    Those are within `near` metres of each other, T_cloud_tcp (E, 4, 4), and `angle` radians; half a
-    turn about the approach counts as none. Returns the rows kept, in order, and the duplicates
-    dropped.
+    Those are within `near` metres of each other, T_cloud_tcp (E, 4, 4), and `angle` radians; a turn
+    by 180 degrees about the approach is ignored. Returns the rows kept, in order, and the
+    duplicates dropped.
     """
     kept, dropped = np.zeros((2, len(order)), np.bool_)
     rows, found = np.empty(len(order), np.int64), 0
@@ -222,8 +222,8 @@ def mean_over_similar(
 ) -> Float32:
     """The mean value (E,) of the other hands on the same object that are like each one.
 
-    Those are within `near` metres of it, T_cloud_tcp (E, 4, 4), and `angle` radians; half a turn
-    about the approach counts as none. `number` (E,) are the objects. NaN where there is none.
+    Those are within `near` metres of it, T_cloud_tcp (E, 4, 4), and `angle` radians; a turn by
+    180 degrees about the approach is ignored. `number` (E,) are the objects. NaN: there is none.
     """
     total, count = np.zeros(len(values)), np.zeros(len(values), np.int64)
     place, mean = T_cloud_tcp[:, :3, 3].copy(), np.empty_like(values)

@@ -55,8 +55,7 @@ HandLength = Annotated[float, Field(gt=0.0, le=1.0), numeric]  # metres
 SAME_LENGTH = 1e-6  # metres; lengths of a gripper that differ by less are the same
 NearHand = Annotated[float, Field(ge=-1.0, le=1.0), numeric]  # metres
 Corner = Annotated[
-    tuple[NearHand, NearHand, NearHand],
-    Field(description="x, y, z in the hand frame, metres"),
+    tuple[NearHand, NearHand, NearHand], Field(description="x, y, z in the hand frame, metres")
 ]
 MAX_APPROACH_POINTS = 256
 MAX_CANDIDATES = 16_000
@@ -103,10 +102,7 @@ class Strict(BaseModel):
     """Base of every option object: unknown fields are refused, instances are frozen."""
 
     model_config = ConfigDict(
-        extra="forbid",
-        frozen=True,
-        use_attribute_docstrings=True,
-        json_schema_extra=_in_one_line,
+        extra="forbid", frozen=True, use_attribute_docstrings=True, json_schema_extra=_in_one_line
     )
 
 

@@ -28,7 +28,7 @@ SURE_SCORE = 0.9  # score from which the order `highest` goes by height (the pap
 FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
 MAX_HIDDEN_DEPTH = 0.004  # metres of unseen space into which an object may extend
 FLAT_HEIGHT = 0.012  # metres of visible height below which the support may block grasps
-MAX_DRAWBACK, FAR = 0.02, 0.1  # of a rating; metres from an object's middle
+MAX_DRAWBACK, FAR = 0.02, 0.1  # most that each drawback takes off a rating; metres off the middle
 # Best hands that are compared; weight of the logarithm of how many good ones are around each; loss
 # of rating by which a good one counts 1/e as much.
 COMPARED_HANDS, DENSITY_WEIGHT, RATING_SCALE = 100, 0.1, 0.02
@@ -121,7 +121,7 @@ def densest_first(order: Int64, worth: Floats, T_cloud_tcp: Floats) -> Int64:
 def _drawbacks(
     scene: Scene, contact_index: Int64, T_cloud_hand: Float32, gripper: Gripper
 ) -> Floats:
-    """What is taken off ratings (E,), of which noise would else decide among equal ones.
+    """What to subtract from ratings (E,), so that noise does not decide between equal hands.
 
     A hand should be vertical, near the middle of its object as seen from above, and close level and
     across the line of sight, where both sides are seen; its object should be large. Above all it
@@ -160,7 +160,7 @@ def ranked(
     options: DetectOptions,
     clearance: Floats | None,  # (E,) for `clearance`
 ) -> tuple[Int64, Floats]:
-    """Rows best first, by the order asked for and then by what scores are worth (E,), and that."""
+    """Rows in the order asked for, best first, and the worth (E,) of scores, which breaks ties."""
     collision_free = collision_free | (options.collision.mode == "ignore")
     if options.order == "score":
         score = score - _drawbacks(scene, contact_index, hands, gripper)
@@ -175,11 +175,7 @@ def ranked(
 
 
 def grasps_in_cloud(
-    scene: Scene,
-    candidates: Candidates,
-    gripper: Gripper,
-    score: Floats,
-    collision_free: Bools,
+    scene: Scene, candidates: Candidates, gripper: Gripper, score: Floats, collision_free: Bools
 ) -> list[Grasp]:
     """Grasps in the cloud's frame, of E candidates; all arrays are (E,)."""
     T_cloud_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
@@ -257,12 +253,7 @@ def detected_objects(
 
 
 def _reason(
-    scene: Scene,
-    number: int,
-    size: Float32,
-    sample: Sample | None,
-    score: Floats,
-    gripper: Gripper,
+    scene: Scene, number: int, size: Float32, sample: Sample | None, score: Floats, gripper: Gripper
 ) -> Ungraspable | None:
     """Why an object with a box of this size (3,), the last upward, has no good grasp."""
     if sample is None:

@@ -32,13 +32,8 @@ from edgegrasp_model.options import (
 )
 
 # Packed points and per-point arrays: numbers per row, and their type.
-PACKED = {
-    "points": (3, "float32"),
-    "normals": (3, "float32"),
-    "colors": (3, "float32"),
-    "segment_ids": (1, "int32"),
-    "view_ids": (1, "int32"),
-}
+PACKED = dict.fromkeys(("points", "normals", "colors"), (3, "float32"))
+PACKED |= dict.fromkeys(("segment_ids", "view_ids"), (1, "int32"))
 PER_POINT = tuple(PACKED)[1:]
 GIVEN = ("edges", "hand_poses")  # what a caller may have scored
 SOURCES = ("points", "cloud", "point_cloud2", "depth_images")  # `cloud` is a File

@@ -48,7 +48,7 @@ TANGENT_WEIGHT = 0.3  # weight of distances beyond that, relative to 1 across th
 STILL_PRIOR = (0.5,) * 3 + (0.3,) * 3
 MIN_REGISTERED_POINTS = 6  # points that say how an object moved
 FOUND_SHARE, WELL_SEEN_SHARE = 0.5, 0.75  # share of its points on the cloud: found; well seen
-# From an object's surface, within which points belong to it: metres, and spacings of its points.
+# Points this near to an object's surface belong to it: metres, or spacings of the surface's points.
 OBJECT_REACH, REACH_SPACINGS = 0.012, 1.5
 
 
@@ -200,21 +200,21 @@ def merged(
         kept = [kept[row] for row in np.flatnonzero(fit)]
     grasps = kept + [replace(one, id=followed.next_id + row) for row, one in enumerate(found)]
     order = _order(grasps, options, scene, gripper, len(kept))
-    became, first = untracked(previous).first, [one.id for one in previous.grasps[:1]]
+    outcome, first = untracked(previous).first, [one.id for one in previous.grasps[:1]]
     held = next((row for row in order if grasps[row].id in first), None)
     if held is not None and (worth := _worth(grasps[held], options)) >= MIN_FOLLOWED_SCORE:
         # Without a search the others are the earlier answer's own, whose scores vary with noise.
         better = previous.search and _worth(grasps[order[0]], options) > worth + SWITCH_MARGIN
-        became = Following.REPLACED if better else Following.KEPT
+        outcome = Following.REPLACED if better else Following.KEPT
         order = order if better else [held, *(row for row in order if row != held)]
-    tracking = Tracking(became, followed.next_id + len(found))
+    tracking = Tracking(outcome, followed.next_id + len(found))
     return [grasps[row] for row in order[: options.top_k]], tracking
 
 
 def untracked(previous: Previous) -> Tracking:
     """The tracking state if nothing is seen."""
-    became = Following.LOST if previous.grasps else Following.STARTED
-    return Tracking(became, previous.free_id)
+    outcome = Following.LOST if previous.grasps else Following.STARTED
+    return Tracking(outcome, previous.free_id)
 
 
 def _order(

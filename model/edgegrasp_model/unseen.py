@@ -104,8 +104,7 @@ def leaves_image(
 
 def unseen(behind: Float32) -> Float32:
     """How unknown space is, by its distance (...) behind the first surface: 0 seen, 1 unknown."""
-    share: Float32 = np.clip((behind - np.float32(THICKNESS)) / np.float32(UNKNOWN_DEPTH), 0.0, 1.0)
-    return share
+    return np.asarray(np.clip((behind - THICKNESS) / UNKNOWN_DEPTH, 0.0, 1.0))
 
 
 @lru_cache(maxsize=16)

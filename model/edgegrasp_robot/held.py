@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_camera.arrays import Float64
+from edgegrasp_camera.arrays import Float64, Floats
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.options import Collision, Place
 from edgegrasp_model.scene.cloud import pose_matrix
@@ -55,7 +55,7 @@ def held_by(grasp: Grasp, scene: Scene, gripper: Gripper) -> Held:
 def can_leave(
     held: Held,
     scene: Scene,
-    way: Float64,  # (3,) metres, cloud frame
+    way: Floats,  # (3,) metres, cloud frame
     collision: Collision,  # obstacles beside the cloud
 ) -> bool:
     """Whether what is held can go along a straight way without meeting anything seen."""

@@ -12,7 +12,7 @@ from roboplan import core
 from roboplan.rrt import RRT, RRTOptions
 from roboplan.toppra import PathParameterizerTOPPRA, SplineFittingMode, TOPPRAOptions
 
-from edgegrasp_camera.arrays import Float64
+from edgegrasp_camera.arrays import Float64, Floats
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions, Place, RobotArm
 from edgegrasp_model.results import Following
@@ -25,7 +25,7 @@ from edgegrasp_robot.surroundings import HELD_NAME, Load, Surroundings, carrying
 
 MAX_TRIED = 200  # most grasps that are tried with the arm, in their order
 MAX_PLACES = 6  # in a region, that the arm may be asked for with one grasp
-MIN_LEVEL = 0.9  # of the base's z, how much of it is up at least for a region
+MIN_LEVEL = 0.9  # least cosine between the base's z and up with which a region is allowed
 EXTRA_GRASPS = 4  # grasps tried beyond top_k, as some may get no motion
 LINE_STEP = 0.025  # metres between poses of a straight motion
 MAX_JUMP = 1.0  # most radians that a joint turns between two of them
@@ -37,8 +37,8 @@ PATH_CHECK_STEP = 0.03  # radians between the joints that are checked along a pa
 PATH_SECONDS = 1.0  # of a request, for searches that find no path; others take milliseconds
 IK_RESTARTS = 2  # of the inverse kinematics, from joints at random
 TRAVEL_COST = 0.02  # cost, as a share of a score, per radian of the joint that turns most
-# Of a hand about its z, by columns of its pose.
-AS_IT_IS, HALF_TURN = np.ones(4, np.float32), np.float32([-1.0, -1.0, 1.0, 1.0])
+# Factors for the columns of a hand's pose: unchanged, and turned by 180 degrees about its z.
+AS_IT_IS, HALF_TURN = np.array([[1.0, 1.0, 1.0, 1.0], [-1.0, -1.0, 1.0, 1.0]], np.float32)
 FAILURES = ["out_of_reach", "arm_collision", "no_place"]  # the last that holds is counted
 NO_REACH = "no grasp is within the arm's reach; see counts."
 
@@ -205,12 +205,12 @@ class _Arm:
 
     def _reach(
         self,
-        poses: Float64,  # (S, 4, 4) T_base_hand along a straight way
+        poses: Floats,  # (S, 4, 4) T_base_hand along a straight way
         starts: Sequence[Float64],  # joints (J,) to find others from
         first: core.Scene,  # in which its begin must touch nothing
         along: core.Scene,  # in which the whole of it must
     ) -> tuple[list[Float64], str]:
-        """Joints (J,) at the poses, each close to the last, and what became of it; or none."""
+        """Joints (J,) at the poses, each near the one before, or none; and how it ended."""
         outcome = "out_of_reach"
         for start in starts:
             line: list[Float64] = []
@@ -309,9 +309,9 @@ class _Arm:
         options.max_planning_time = max(1e-3, min(self._path_seconds, self._until - begin))
         planner = RRT(scene, options)
         planner.setRngSeed(seed)
-        ends = [core.JointConfiguration(names, joints) for joints in (start, end)]
+        first, last = (core.JointConfiguration(names, joints) for joints in (start, end))
         try:
-            path = planner.plan(*ends)
+            path = planner.plan(first, last)
         except RuntimeError:  # no path within these limits
             self._path_seconds -= time.monotonic() - begin
             return []
@@ -326,10 +326,7 @@ class _Arm:
         path.joint_names, path.positions = self._robot.joint_names, list(joints)
         mode = SplineFittingMode.Cubic if straight else SplineFittingMode.Adaptive
         options = TOPPRAOptions(
-            dt=STEP_SECONDS,
-            mode=mode,
-            velocity_scale=LIMIT_SHARE,
-            acceleration_scale=LIMIT_SHARE,
+            dt=STEP_SECONDS, mode=mode, velocity_scale=LIMIT_SHARE, acceleration_scale=LIMIT_SHARE
         )
         try:
             found = PathParameterizerTOPPRA(scene, GROUP).generate(path, options)
@@ -354,7 +351,7 @@ def _touches(scene: core.Scene, joints: Sequence[Float64] | Float64, step: float
     )
 
 
-def _straight(T_base_hand: Float64, direction: Float64, begin: float, end: float) -> Float64:
+def _straight(T_base_hand: Floats, direction: Floats, begin: float, end: float) -> Floats:
     """Poses (S, 4, 4) along a direction of the base frame, `begin` to `end` metres from a hand."""
     steps = max(1, int(np.ceil(abs(end - begin) / LINE_STEP)))
     poses = np.repeat(T_base_hand[None], steps + 1, axis=0)

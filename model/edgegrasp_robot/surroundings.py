@@ -40,7 +40,7 @@ class Load(NamedTuple):
     points: Float64  # (H, 3)
     T_base_box: Float64  # (4, 4) its z is up
     half: Float64  # (3,)
-    below: float  # metres that it may go on below the box, where no camera looked
+    below: float  # metres by which it may extend below the box, where no camera looked
 
     @property
     def above_its_foot(self) -> tuple[float, Float64]:
@@ -78,7 +78,7 @@ class Surroundings(NamedTuple):
 
 @contextmanager
 def carrying(
-    robot: Robot, around: Surroundings, load: Load, T_base_hand: Float64
+    robot: Robot, around: Surroundings, load: Load, T_base_hand: Floats
 ) -> Iterator[core.Scene]:
     """A scene in which the hand holds a load, by its pose at the grasp; its foot may touch."""
     scene, (off, half) = robot.carrying, load.above_its_foot
@@ -249,6 +249,6 @@ def _centers(*groups: Floats, shifts: Sequence[float] = (0.0,)) -> Float64:
     return np.asarray((np.argwhere(common) + corner.T + 0.5) * VOXEL_SIZE)
 
 
-def moved(T_b_a: Float64, points: ArrayLike) -> Float64:
+def moved(T_b_a: Floats, points: ArrayLike) -> Float64:
     """Points (N, 3) of frame a in frame b."""
     return np.asarray(np.asarray(points, np.float64) @ T_b_a[:3, :3].T + T_b_a[:3, 3])

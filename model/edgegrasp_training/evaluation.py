@@ -227,13 +227,10 @@ def score_views(paths: list[Path], weights: list[Path]) -> Scored:
                 logit = network(packed.batch).double().numpy()
             logits.append(logit / metadata.temperature)
         hidden = (description[:, UNSEEN_NUMBERS] > MAX_HIDDEN_DEPTH).any(dim=1).numpy()
-        scene, sensor = (
-            f"{scene_of(path).split('_')[0]} scenes",
-            f"{view.sensor or 'unknown'} camera",
-        )
-        names = (
-            view.targets if view.targets is not None else np.full(len(view.success), "unknown-0")
-        )
+        scene = f"{scene_of(path).split('_')[0]} scenes"
+        sensor = f"{view.sensor or 'unknown'} camera"
+        unknown = np.full(len(view.success), "unknown-0")
+        names = unknown if view.targets is None else view.targets
         families = map(family_of, names[view.tried()[grasps.candidates.pair]])
         groups = np.array([(scene, sensor, family) for family in families]).T
         parts.append(Scored(groups, hidden, packed.label.numpy() > 0.5, np.stack(logits)))

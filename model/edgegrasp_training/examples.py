@@ -37,8 +37,8 @@ SPARE_POINTS = 2  # factor of points kept per hand, from which each step picks
 TRIED_WEIGHT = 4.0  # weight of a simulated label in the loss; a teacher's score has weight 1
 SHAKEN_SHARE = 0.2  # part of a successful grasp's label that depends on surviving shaking
 FIRM_SHARE = 0.78  # share of successful grasps that survive shaking; used if shaking was not tried
-TAUGHT_BALLS = 24  # of a view, in which a teacher scores candidates,
-OWN_BALLS = 16  # of them at most around approach points of its tried grasps
+TAUGHT_BALLS = 24  # balls of a view in which a teacher scores candidates
+OWN_BALLS = 16  # most of these balls that are around approach points of tried grasps
 GRASPS_PER_BALL = 64  # scored at most; about a third of a ball's candidates
 
 

@@ -50,7 +50,7 @@ VIEWS = {
     TABLE: ViewRange((0.5, 1.2), (20.0, 75.0), _ANY_SIDE, _LOW),
     SHELF: ViewRange((0.45, 1.0), (45.0, 90.0), (230.0, 310.0), _LOW),
 }
-# Of household objects, more from one side: a tall or wide one hides its back there.
+# Household objects are seen more from the side, where a tall or wide one hides its back.
 SIDE_VIEWS = ViewRange((0.5, 1.2), (40.0, 80.0), _ANY_SIDE, _LOW)
 # Metres from the nearest hand that was tried: from where the frame of a Panda's hand would be.
 KEPT_DISTANCE = 0.18
@@ -374,7 +374,7 @@ def _likely(
 ) -> Int64:
     """Ascending rows of candidates to try, some `total`: the best of each object, others like it.
 
-    Of scores that are trained on grasps drawn at random the best ones are too high.
+    Scores trained on randomly drawn grasps are too high for the best grasps.
     """
     chosen, likely = np.zeros((2, len(number)), dtype=bool)
     for each in np.unique(number):

@@ -114,7 +114,7 @@ def _glass(rng: Random) -> list[Part]:
 
 
 def _carton(rng: Random) -> list[Part]:
-    """A closed box; half of them fit the hand on no side."""
+    """A closed box; half of the boxes are too wide for the hand on every side."""
     least = 0.085 if rng.random() < 0.5 else 0.02
     size = np.exp(rng.uniform(np.log(least), np.log(0.28), size=3))
     return [_box(size, (0.0, 0.0, 0.0), rng.uniform(0.0, 0.03))]
@@ -279,7 +279,7 @@ FAMILIES = (
 
 
 def oval(sharp: float = 1.0, corners: int = FINE) -> Float64:
-    """(corners, 2) a circle of radius one; below one, `sharp` squares it off."""
+    """A circle of radius one (corners, 2); a `sharp` below one makes it squarer."""
     angle = 2 * np.pi * (np.arange(corners) + 0.5) / corners
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return np.asarray(np.sign(ring) * np.abs(ring) ** sharp)
@@ -337,7 +337,7 @@ def _rod(start: Float64, end: Float64, first: float, last: float = 0.0) -> Part:
 
 
 def _wedges(section: Float64, angles: Float64) -> list[Part]:
-    """A convex section (P, 2) of radius and height, swept about z: a part between two angles."""
+    """A convex section (P, 2) of radius and height swept about z, one part per pair of angles."""
     rings = swept(section, angles)
     return [rings[k : k + 2] for k in range(len(angles) - 1)]
 

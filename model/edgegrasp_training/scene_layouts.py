@@ -297,11 +297,9 @@ def _frame(rng: np.random.Generator, start: ArrayLike) -> Mesh:
         way[2] = abs(way[2]) * (0.1 if spokes else 1.0)
         way *= longest * rng.uniform(0.4, 1.0) / np.linalg.norm(way)
         first = ends[0 if spokes else int(rng.integers(len(ends)))]
-        bar = trimesh.creation.cylinder(
-            width * rng.uniform(0.6, 1.0) / 2,
-            sections=int(rng.choice([4, 8])),
-            segment=np.stack([first, first + way]),
-        )
+        radius, sections = width * rng.uniform(0.6, 1.0) / 2, int(rng.choice([4, 8]))
+        ends_of_bar = np.stack([first, first + way])
+        bar = trimesh.creation.cylinder(radius, sections=sections, segment=ends_of_bar)
         bars.append((bar.vertices, bar.faces))
         ends += [first + way, first + way * rng.random()]
     points, triangles = merged(bars)

@@ -69,11 +69,7 @@ def household_objects(folder: Path, count: int, rng: np.random.Generator) -> Obj
 
 
 def stretched(model: ObjectModel, factors: Float64, folder: Path) -> ObjectModel:
-    """Write an object that is stretched by factors (3,) along x, y and z.
-
-    Raises:
-        ValueError: It does not consist of meshes alone.
-    """
+    """Write an object of meshes stretched by factors (3,) along x, y, z; ValueError: not meshes."""
     tree = ElementTree.parse(model.urdf)
     for shape in (*tree.iter("visual"), *tree.iter("collision")):
         mesh, origin = shape.find("geometry/mesh"), shape.find("origin")

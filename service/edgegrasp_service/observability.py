@@ -45,13 +45,13 @@ class Call:
     in_stream: bool = False  # one request of a stream
     start: float = field(default_factory=time.monotonic)  # as the event loop's clock
     deadline: float = float("inf")
-    timeout: asyncio.Timeout | None = None  # that ends it, once it is let in
-    refusal: EdgeGraspError | None = None  # why that was early
+    timeout: asyncio.Timeout | None = None  # ends it at its deadline; set once it is admitted
+    refusal: EdgeGraspError | None = None  # why it was ended before its deadline
     held_bytes: int = 0
     at_work: bool = False  # whether a worker has it
     bytes_in: int = 0
     bytes_out: int = 0
-    code: str = ""  # it ended with: a gRPC code or an HTTP status
+    code: str = ""  # gRPC code or HTTP status that it ended with
     problem: Problem | None = None
     facts: Facts = field(default_factory=Facts)
     stages: dict[str, float] = field(default_factory=dict)  # seconds of each, in order

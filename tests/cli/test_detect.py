@@ -133,9 +133,7 @@ def test_several_depth_images_are_one_cloud(camera_files, dummy_server, run, ref
 ARM = ("--robot", "fr3", "--base", "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1")
 
 
-def test_input_that_cannot_be_used_is_named(
-    camera_files, file, refused, dummy_server, tmp_path
-) -> None:
+def test_input_that_cannot_be_used_is_named(camera_files, file, refused, dummy_server, tmp_path):
     depth, mask, *_ = camera_files
     absent, foreign, unknown = (tmp_path / name for name in ("no.npy", "foreign.npy", "cloud.las"))
     foreign.write_bytes(b"foreign")

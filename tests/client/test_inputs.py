@@ -21,9 +21,8 @@ def contacts(detection: Detection) -> list[list[float]]:
 def ros_message(cloud: np.ndarray, **changes: Any) -> SimpleNamespace:
     layout = point_cloud2(cloud)
     fields = [SimpleNamespace(**field) for field in layout["fields"]]
-    return SimpleNamespace(
-        **layout | {"fields": fields, "is_dense": True, "header": None} | changes
-    )
+    layout |= {"fields": fields, "is_dense": True, "header": None}
+    return SimpleNamespace(**layout | changes)
 
 
 def depth_image(**changes: Any) -> Any:

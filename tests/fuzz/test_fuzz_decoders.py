@@ -93,9 +93,7 @@ def chunk_places(image: bytes) -> Iterator[tuple[int, int]]:
 
 PNG = png(np.arange(400, 800, dtype=np.uint16).reshape(20, 20))
 PNG_CHUNKS = [PNG[start : start + 12 + size] for start, size in chunk_places(PNG)]
-PNG_CHUNKS += [
-    b"\0\0\0\0" + kind + b"\0\0\0\0" for kind in (b"tRNS", b"iCCP", b"zTXt", b"acTL", b"gAMA")
-]
+PNG_CHUNKS += [bytes(4) + kind + bytes(4) for kind in (b"tRNS", b"iCCP", b"zTXt", b"acTL", b"gAMA")]
 
 
 @given(mutated([PNG]))
@@ -311,12 +309,8 @@ def test_long_words_come_back_short(channel: grpc.Channel) -> None:
 
 SHORT = ("--phases", "fuzzing", "--max-examples", "5")
 LONG = ("--phases", "coverage,fuzzing", "--max-examples", "100", "--max-time", "120")
-OF_ANSWERS = ("status_code", "content_type", "response_headers", "response_schema")
-CHECKS = (
-    "not_a_server_error",
-    "unsupported_method",
-    *(f"{part}_conformance" for part in OF_ANSWERS),
-)
+CHECKS = "not_a_server_error,unsupported_method,status_code_conformance,content_type_conformance"
+CHECKS += ",response_headers_conformance,response_schema_conformance"
 
 
 def test_the_server_keeps_to_its_document(start_dummy, tmp_path: Path) -> None:
@@ -334,8 +328,7 @@ def test_the_server_keeps_to_its_document(start_dummy, tmp_path: Path) -> None:
         # What the document allows may be shorter than any answer takes: a 504 is no fault.
         command += ["--header", "X-Request-Timeout: 60", "--request-timeout", "60"]
         command += ["--suppress-health-check", "too_slow"]  # of a busy machine
-        checks = ("--checks", ",".join(CHECKS))
-        done = run(*command, *checks, *(LONG if long else SHORT), cwd=tmp_path)
+        done = run(*command, "--checks", CHECKS, *(LONG if long else SHORT), cwd=tmp_path)
         counted = re.search(r"(\d+) generated, (\d+) passed", done.stdout)
         assert counted, done.stdout[-5000:]
         assert int(counted[1]) == int(counted[2]) > 10

@@ -40,9 +40,8 @@ INFER = {
     "id": "1", "inputs": [TENSOR], "outputs": [{"name": "score"}],
     "parameters": {"top_k": 3, "timeout": 1000000, "up": "[0, 0, 1]"},
 }  # fmt: skip
-BINARY = json.dumps(
-    {"inputs": [TENSOR | {"data": None, "parameters": {"binary_data_size": 480}}]}
-).encode()
+BESIDE = {"data": None, "parameters": {"binary_data_size": 480}}  # the numbers follow the JSON
+BINARY = json.dumps({"inputs": [TENSOR | BESIDE]}).encode()
 
 
 def infer(body: bytes, header: str | None = None) -> None:

@@ -8,7 +8,6 @@ import json
 import re
 import threading
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -141,9 +140,7 @@ def test_two_planners_are_compared_scene_by_scene(in_process, top_down, run, tmp
         assert low <= compared[name]["difference"] <= high
 
 
-def test_a_server_killed_and_restarted_changes_nothing(
-    start_dummy: Callable, dummy_server, tmp_path: Path
-) -> None:
+def test_a_server_killed_and_restarted_changes_nothing(start_dummy, dummy_server, tmp_path) -> None:
     address = dummy_server.grpc_address
     calm = benchmark(tmp_path / "calm", "server", "--server", address, rounds=2)
     shaken = tmp_path / "shaken"
@@ -195,9 +192,7 @@ LITTLE = {"num_approach_points": 8, "num_candidates": 100}
 def planned(**changes: object) -> PlannedGrasp:
     choice = PlannerFlags(planner="in-process", **changes)
     with open_planner(choice, PAPER, LITTLE) as made:
-        grasp = made.make()(seen_under("edgegrasp"), 3)
-    assert grasp is not None
-    return grasp
+        return made.make()(seen_under("edgegrasp"), 3)
 
 
 def test_a_planner_has_the_weights_and_the_time_of_its_flags(tmp_path: Path) -> None:

@@ -43,9 +43,8 @@ def boxes_on_table(seed: int, count: int = 4) -> list[SolidBox]:
 
 def camera(polar: float, azimuth: float, distance: float) -> np.ndarray:
     """T_world_camera (4, 4), looking at the origin; x right, y down, z forward."""
-    out = np.array(
-        [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
-    )
+    level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    out = np.sin(polar) * level + (0.0, 0.0, np.cos(polar))
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3] = np.stack([right, np.cross(-out, right), -out], axis=1)
@@ -58,9 +57,7 @@ def to_world(T_world_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
 
 
-def render(
-    boxes: list[SolidBox], T_world_camera: np.ndarray, seed: int = 0, zoom: float = 1.0
-) -> np.ndarray:
+def render(boxes: list[SolidBox], T_world_camera: np.ndarray, seed=0, zoom=1.0) -> np.ndarray:
     """The organised cloud (HEIGHT, WIDTH, 3) in the camera's frame, NaN where nothing is seen."""
     row, column = np.indices((HEIGHT, WIDTH))
     x, y = np.array([column - WIDTH / 2, row - HEIGHT / 2]) / (FOCAL_LENGTH * zoom)

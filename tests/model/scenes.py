@@ -30,9 +30,7 @@ def detector() -> GraspDetector:
 
 
 @cache
-def box_on_table(
-    count: int = 2000, table: bool = False, size: tuple[float, ...] = (0.04, 0.06, 0.08)
-) -> np.ndarray:
+def box_on_table(count: int = 2000, table=False, size=(0.04, 0.06, 0.08)) -> np.ndarray:
     """The top and two sides of a box (metres) on z = 0, with its table if wanted."""
     rng = np.random.default_rng(0)
     u, v = rng.uniform(-0.5, 0.5, (2, count))

@@ -251,9 +251,8 @@ def check_pose(fields: dict, grasp: Grasp, gripper: Gripper) -> None:
     tcp = grasp.T_cloud_hand @ [0.0, 0.0, gripper.tcp_z, 1.0]
     np.testing.assert_allclose(grasp.T_cloud_tcp[:, 3], tcp, atol=1e-6)
     assert 0.0 < grasp.width <= gripper.max_opening + 1e-6
-    a, c = (
-        (p - grasp.T_cloud_hand[:3, 3]) @ turn for p in (grasp.approach_point, grasp.contact_point)
-    )
+    ends = np.array([grasp.approach_point, grasp.contact_point])
+    a, c = (ends - grasp.T_cloud_hand[:3, 3]) @ turn
     assert abs(c[1]) < gripper.max_opening / 2
     assert abs(a[1]) < gripper.max_opening / 2
     assert a[2] > gripper.palm_z - 0.006  # retracted at most to the tips
@@ -349,9 +348,7 @@ def check_suppression(fields: dict, grasps: list[Grasp]) -> None:
     tcp = np.array([grasp.T_cloud_tcp[:3, 3] for grasp in grasps])
     for i in range(1, len(grasps)):
         one, others = turns[i], turns[:i]
-        angle = np.minimum(
-            (one.inv() * others).magnitude(), ((one * flip).inv() * others).magnitude()
-        )
+        angle = np.min([(way.inv() * others).magnitude() for way in (one, one * flip)], axis=0)
         near = np.linalg.norm(tcp[:i] - tcp[i], axis=1) < rule["translation"] - 1e-6
         assert not (near & (angle < rule["rotation"] - 2e-3)).any()
 

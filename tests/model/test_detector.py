@@ -136,10 +136,8 @@ def test_each_camera_orients_the_normals_of_what_it_saw() -> None:
     upper = found.debug.points[:, 2] > 0.25
     assert (found.debug.normals[upper, 2] > 0.99).all()
     assert (found.debug.normals[~upper, 2] < -0.99).all()
-    for views, value in (
-        (None, "nothing, for 2 viewpoints"),
-        (np.repeat([0, 2], 3000), "values from 0 to 2"),
-    ):
+    of_a_third = np.repeat([0, 2], 3000)
+    for views, value in ((None, "nothing, for 2 viewpoints"), (of_a_third, "values from 0 to 2")):
         with refusal("view_ids", value):
             detect(CloudInput(sheets, view_ids=views), **asked)
 
@@ -215,11 +213,8 @@ def test_no_grasp_is_an_answer_that_says_why() -> None:
     assert nowhere.counts["in_approach_region"] == 0
     assert any("approach region" in warning for warning in nowhere.warnings)
 
-    tilted = {"normal": (0.0, 0.6, 0.8), "offset": 0.2}
-    for below in (
-        {"support": ASKED["support"] | {"offset": 0.2}},
-        {"support": tilted, "workspace": NOWHERE},
-    ):
+    high, tilted = ({"normal": up, "offset": 0.2} for up in ((0.0, 0.0, 1.0), (0.0, 0.6, 0.8)))
+    for below in ({"support": high}, {"support": tilted, "workspace": NOWHERE}):
         found = detect(**below)
         assert (found.grasps, found.counts["above_support"]) == ([], 0)
 

@@ -46,17 +46,15 @@ class RandomScene:
         return RandomScene(points, normals, approach_index, edges[:: max(1, len(edges) // 40)])
 
     def turned(self, rotation: np.ndarray, translation: np.ndarray) -> "RandomScene":
-        return replace(
-            self, points=self.points @ rotation.T + translation, normals=self.normals @ rotation.T
-        )
+        points = self.points @ rotation.T + translation
+        return replace(self, points=points, normals=self.normals @ rotation.T)
 
     def reordered(self, order: np.ndarray) -> "RandomScene":
         """The same scene with its point order[i] at row i."""
         row_of = np.argsort(order)
         edges = np.column_stack((self.edges[:, 0], row_of[self.edges[:, 1]]))
-        return RandomScene(
-            self.points[order], self.normals[order], row_of[self.approach_index], edges
-        )
+        cloud = self.points[order], self.normals[order]
+        return RandomScene(*cloud, row_of[self.approach_index], edges)
 
     def only_ball(self, ball: int) -> "RandomScene":
         edges = self.edges[self.edges[:, 0] == ball] * (0, 1)

@@ -12,9 +12,8 @@ from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_training.import_checkpoint import import_checkpoint
 
 RADIUS = 0.05  # of the reference
-scenes = pytest.mark.parametrize(
-    "scene", ["packed_00", "packed_03", "pile_04", "pile_07", "pile_09"]
-)
+NAMES = "packed_00", "packed_03", "pile_04", "pile_07", "pile_09"
+scenes = pytest.mark.parametrize("scene", NAMES)
 
 
 def golden_batch(shared_dir: Path, scene: str) -> tuple[BallBatch, np.ndarray]:

@@ -338,9 +338,7 @@ def test_a_support_is_assumed_under_a_cloud_that_was_cut_off_above_it(frame: str
 @pytest.mark.parametrize("support", ["auto", None])
 @pytest.mark.parametrize("half", [(0.03, 0.05, 0.02), (0.02, 0.03, 0.07), (0.025, 0.025, 0.04)])
 @pytest.mark.parametrize(("polar", "forward"), [(0.3, "z"), (0.7, "z"), (1.0, "z"), (1.0, "x")])
-def test_an_object_alone_in_a_cameras_frame_is_not_grasped_from_below(
-    support: str | None, half: tuple[float, float, float], polar: float, forward: str
-) -> None:
+def test_an_object_alone_in_a_camera_frame_is_not_grasped_from_below(support, half, polar, forward):
     """Neither its support nor `up` is known."""
     one, pose = box((0, 0, half[2]), half, 0.4), camera(polar, -1.5, 0.6)
     points, pose = seen_in_world([one], pose) - pose[:3, 3], pose[:3, :3]

@@ -32,9 +32,8 @@ def changed(folder, **lines):
     text = (ROBOT_FOLDER / "fr3.toml").read_text()
     kept = [line for line in text.splitlines() if line.partition(" ")[0] not in lines]
     file = folder / "mine.toml"
-    file.write_text(
-        "\n".join([*(f"{name} = {value}" for name, value in lines.items() if value), *kept])
-    )
+    new = [f"{name} = {value}" for name, value in lines.items() if value]
+    file.write_text("\n".join(new + kept))
     return file
 
 

@@ -41,9 +41,7 @@ def lookup(target: str, source: str, stamp: Any) -> np.ndarray:
     return np.linalg.inv(FRAMES[target]) @ FRAMES[source]
 
 
-def detect(
-    client: Any, scene: Scene, settings: Any = None, options: Any = None, **more: Any
-) -> Any:
+def detect(client: Any, scene: Scene, settings=None, options=None, **more: Any) -> Any:
     return bridge.detect(client, scene, settings or Settings(), options or {}, lookup, **more)
 
 
@@ -357,7 +355,6 @@ def test_a_known_arm_is_where_it_is_before_a_scene(planning, cloud) -> None:
     planning.robots.assert_not_called()
     unknown, lacking = ("other", {}), ("arm", {"a": 0.1})
     for (name, joints), said in ((unknown, "robots are arm"), (lacking, "no position of 'b'")):
+        scene = Scene(make_cloud(cloud), joints=joints)
         with pytest.raises(ValueError, match=said):
-            detect(
-                planning, Scene(make_cloud(cloud), joints=joints), options={"robot": {"name": name}}
-            )
+            detect(planning, scene, options={"robot": {"name": name}})

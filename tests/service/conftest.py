@@ -54,9 +54,7 @@ def bearer(token: str | None) -> dict[str, str]:
 class Raw:
     """A client that shows codes and errors as they are sent."""
 
-    async def detect(
-        self, points: np.ndarray, timeout: float | None = None, **options: Any
-    ) -> Reply:
+    async def detect(self, points: np.ndarray, timeout=None, **options: Any) -> Reply:
         return await self.ask("DetectGrasps", timeout, points=points, options=options)
 
     async def score(self, points: np.ndarray, timeout: float | None = None) -> Reply:
@@ -76,9 +74,7 @@ class Grpc(Raw):
         self.channel = aio.insecure_channel(server.grpc_address, options)
         self.stub = grasp_pb2_grpc.GraspServiceStub(self.channel)
 
-    async def ask(
-        self, method: str, timeout: float | None, headers: Any = (), **fields: Any
-    ) -> Reply:
+    async def ask(self, method: str, timeout: float | None, headers=(), **fields: Any) -> Reply:
         message, metadata = getattr(grasp_pb2, f"{method}Request")(), tuple(dict(headers).items())
         packed = {"points": fields["points"].tobytes()} if fields else {}
         fill(message, fields | packed, "request")
@@ -105,9 +101,7 @@ class Rest(Raw):
         limits = httpx.Limits(max_connections=None)
         self.http = httpx.AsyncClient(base_url=server.http_url, timeout=PATIENCE, limits=limits)
 
-    async def ask(
-        self, method: str, timeout: float | None, headers: Any = (), **fields: Any
-    ) -> Reply:
+    async def ask(self, method: str, timeout: float | None, headers=(), **fields: Any) -> Reply:
         headers = dict(headers) | ({} if timeout is None else {"X-Request-Timeout": str(timeout)})
         path = next(path for path, name in METHODS.items() if name == method)
         body = fields | ({"points": fields["points"].tolist()} if fields else {})
@@ -264,9 +258,7 @@ async def begin(tmp_path, monkeypatch, nursery) -> AsyncIterator[Serve]:
     monkeypatch.setattr("edgegrasp_service.server.NOTICE_SECONDS", 0.0)
     running: list[Running] = []
 
-    async def start(
-        prepare: Callable[[Stages], None] = lambda stages: None, **given: Any
-    ) -> tuple[Running, asyncio.Event]:
+    async def start(prepare=lambda stages: None, **given: Any) -> tuple[Running, asyncio.Event]:
         folder = tmp_path / f"stages-{len(running)}"
         folder.mkdir()
         stages, calls = Stages(folder), []

@@ -76,9 +76,8 @@ def test_every_way_in_gives_the_same_grasps(cloud: np.ndarray, channel, http) ->
                 }
             },
         ]
-    answers = [
-        detect(grasp_pb2.DetectGraspsRequest(options=OPTIONS, **message)) for message in messages
-    ]
+    requests = [grasp_pb2.DetectGraspsRequest(options=OPTIONS, **fields) for fields in messages]
+    answers = [detect(request) for request in requests]
     answers += [http.post("/v1/grasps", **request).json() for request in posted]
     expected = grasps_of(answers[0])
     assert len(expected) == 7
@@ -143,13 +142,8 @@ def test_reflection(channel) -> None:
 
 
 # Errors of starting up: no request ever meets them.
-START_UP = {
-    "InvalidCheckpoint",
-    "InvalidDevice",
-    "InvalidGripper",
-    "InvalidSettings",
-    "AddressInUse",
-}
+START_UP = {"InvalidCheckpoint", "InvalidDevice", "InvalidGripper", "InvalidSettings"}
+START_UP |= {"AddressInUse"}
 
 
 async def ask(running, cloud) -> tuple[httpx.Response, aio.AioRpcError]:

@@ -388,10 +388,7 @@ main()
 
 def test_without_file_descriptors_left_the_log_stays_short(start_dummy, tmp_path, cloud) -> None:
     file, program = tmp_path / "log", ("-c", OUT_OF_DESCRIPTORS)
-    with (
-        file.open("w") as log,
-        start_dummy("--workers", "1", program=program, stderr=log) as server,
-    ):
+    with file.open("w") as log, start_dummy("--workers=1", program=program, stderr=log) as server:
         with connections(server.http_url, 150):
             while "Too many open files" not in file.read_text():
                 time.sleep(0.05)

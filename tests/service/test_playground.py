@@ -82,9 +82,7 @@ def bright(page: Any) -> int:
     return int(((red > 150) & (blue > 150) & (green < 0.6 * red)).sum())
 
 
-def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(
-    real_server, open_page
-) -> None:
+def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(real_server, open_page):
     page = open_page(real_server.http_url)
     assert len(shown(page)) == 12
     assert page.inner_text("#summary").endswith("on 7 of 7 objects")

@@ -213,9 +213,7 @@ async def test_a_client_that_vanishes_mid_body_or_never_ends_it_leaves_its_place
     await running.until(lambda: running.ended == ["cancelled", "deadline-exceeded"])
 
 
-async def test_clocks_that_jump(
-    running, cloud: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_clocks_that_jump(running, cloud, monkeypatch) -> None:
     """The wall clock goes back a day, and on by thirty years, each time it is read."""
     real, jumps = time.time, itertools.cycle([-86400.0, 3600.0, 1e9, -1e9])
     monkeypatch.setattr(time, "time", lambda: real() + next(jumps))

@@ -120,10 +120,8 @@ async def test_only_probes_are_open(serve) -> None:
         assert answer.headers["www-authenticate"] == 'Bearer realm="edgegrasp"'
         assert answer.json()["type"] == "urn:edgegrasp:error:unauthenticated"
     evil = {"origin": "http://evil.example", "access-control-request-method": "POST"}
-    for answer in (
-        await http.options("/v1/grasps", headers=evil),
-        await http.get("/v1/models", headers=evil),
-    ):
+    for method, path in (("OPTIONS", "/v1/grasps"), ("GET", "/v1/models")):
+        answer = await http.request(method, path, headers=evil)
         assert not [name for name in answer.headers if name.startswith("access-control")]
     for status, header in (
         *((401, bad) for bad in ("", "Bearer", f"Basic {USER}", USER, b"Bearer \xc3\xbf\xff")),
@@ -152,9 +150,7 @@ async def test_no_tls_older_than_1_2_and_a_health_check(serve, server_tls, pem) 
     assert loaded.http.current.minimum_version == ssl.TLSVersion.TLSv1_2
 
 
-async def test_the_health_check_reads_what_the_server_reads(
-    serve, server_tls, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_health_checks_read_what_the_server_reads(serve, server_tls, tmp_path, monkeypatch):
     port = int((await serve(**server_tls)).server.http_url.rpartition(":")[2])
     config = tmp_path / "server.toml"
     config.write_text(f"http_port = {port}\nworkers = 1\ntls_key = 'key.pem'\n")

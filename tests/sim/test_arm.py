@@ -11,7 +11,7 @@ from tests.robot.arms import picks_of
 from edgegrasp_lab.benchmark import benchmark_arm
 from edgegrasp_robot import load_robot
 from edgegrasp_sim.engine import make_world
-from edgegrasp_sim.hand import ArmGripper, FailureCause, hand_of, panda, run_grasp
+from edgegrasp_sim.hand import MIN_OPENING, ArmGripper, FailureCause, hand_of, panda, run_grasp
 from edgegrasp_sim.objects import ObjectModel
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.scene import load_object
@@ -34,7 +34,8 @@ class Cell:
         (grasp,) = picks_of(robot, np.eye(4), boxes=(AHEAD,)).grasps
         self.T_world_hand = self.T_world_base @ grasp.T_cloud_hand
         planned = grasp.arm.trajectory
-        self.gripper = ArmGripper(world, panda() if hand is None else hand_of(hand), arm)
+        model = panda() if hand is None else hand_of(hand)
+        self.gripper = ArmGripper(world, model, arm, MIN_OPENING)
         self.gripper.motion = planned
         half_way = robot.hand_pose(planned.positions[planned.pregrasp_row // 2])
         self.on_the_way = (self.T_world_base @ half_way)[:3, 3]

@@ -12,7 +12,7 @@ from tests.programs import run
 from edgegrasp_sim import objects
 from edgegrasp_sim.camera import look_at, points_of
 from edgegrasp_sim.engine import Intrinsics, World, choose_engine, make_world
-from edgegrasp_sim.engine.urdf import read_obj, read_urdf
+from edgegrasp_sim.engine.urdf import parse_obj, read_urdf
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.scene import load_object
 from edgegrasp_sim.sensor import SENSORS, STRUCTURED_LIGHT
@@ -75,7 +75,7 @@ def test_shapes_are_read_as_they_are_described(tmp_path: Path) -> None:
     extents = [np.ptp(hull.points, axis=0) for hull in shape.hulls]
     np.testing.assert_allclose(extents[0], (0.02, 0.02, 0.05), atol=1e-9)
     np.testing.assert_allclose(extents[1:], [(1.0, 0.5, 0.5), (2.0, 1.0, 1.0)])
-    assert [len(part.faces) for _, part in read_obj(tmp_path / "two.obj")] == [3, 3]
+    assert [len(part.faces) for _, part in parse_obj((tmp_path / "two.obj").read_text())] == [3, 3]
     for right, wrong, message in (
         ("two.obj", "two.dae", r"two\.dae is not an OBJ file"),
         ("2 1 1", "2 1", "scale of its mesh is '2 1'; write 3 numbers"),

@@ -29,19 +29,10 @@ FAST = {"steps": 40, "views_per_step": 2, "balls_per_view": 3, "evaluate_every":
 def make_trainer(views: list[Path]) -> Callable[..., Trainer]:
     """Makes the trainer of a small network, on made-up views unless others are given."""
 
-    def make(
-        folder: Path,
-        network: str = "hands",
-        *,
-        name: str = "tiny",
-        views: list[Path] = views,
-        teacher: Teacher | None = None,
-        start: Path | None = None,
-        **options: object,
-    ) -> Trainer:
+    def make(folder, network="hands", name="tiny", views=views, teacher=None, start=None, **asked):
         metadata = CheckpointMetadata(name, NETWORKS[network], voxel_size=0.0045, gripper="panda")
         train, validation = split_by_scene(views, 0.25, seed=0)
-        chosen = TrainingOptions(learning_rate=3e-3, **FAST | options)
+        chosen = TrainingOptions(learning_rate=3e-3, **FAST | asked)
         return Trainer(metadata, train, validation, folder, chosen, teacher=teacher, start=start)
 
     return make
@@ -160,9 +151,7 @@ def test_loss_falls_with_a_teacher_who_is_named_in_card_and_checkpoint(
     assert digest in card
 
 
-def test_a_teacher_alone_labels_views_in_which_no_grasp_was_tried(
-    make_trainer, teacher: Teacher, tmp_path: Path
-) -> None:
+def test_a_teacher_alone_labels_views_in_which_no_grasp_was_tried(make_trainer, teacher, tmp_path):
     for number in range(8):
         none = dict.fromkeys(("approach_index", "contact_index", "success"), np.empty(0, np.int8))
         replace(made_up_view(number), **none).save(tmp_path / f"packed_{number}_0.npz")

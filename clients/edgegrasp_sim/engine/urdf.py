@@ -62,14 +62,9 @@ def _read_urdf(path: Path, _changed: int) -> Shape:
     return Shape(centre, [Surface(part.points - centre, part.faces) for part in visible], hulls)
 
 
-def read_obj(path: Path) -> list[tuple[str, Surface]]:
-    """The named objects of an OBJ file, with the points that their faces use."""
-    return parse_obj(path.read_text(errors="replace"))
-
-
 @lru_cache(maxsize=256)
 def parse_obj(text: str) -> list[tuple[str, Surface]]:
-    """What `read_obj` reads of a file's text."""
+    """The named objects of an OBJ file's text, with the points that their faces use."""
     points: list[list[float]] = []
     parts: list[tuple[str, list[list[int]]]] = [("", [])]  # names and triangles
     # Only points count, not the normals and texture places behind their slashes.
@@ -121,7 +116,7 @@ def _parts(element: ElementTree.Element, urdf: Path) -> list[Surface]:
         file = urdf.parent / shape.get("filename", "")
         if file.suffix.lower() != ".obj":
             raise ValueError(f"its mesh {file.name} is not an OBJ file; convert it")
-        parts = [part for _, part in read_obj(file)]
+        parts = [part for _, part in parse_obj(file.read_text(errors="replace"))]
         size = _numbers(shape, "scale", 3, "1 1 1")
     elif shape.tag == "box":
         signs = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3), axis=-1).reshape(-1, 3)

@@ -126,7 +126,7 @@ class Inbox:
         return field == "mask" if masked else field in self._sources
 
     def scene(self, mask_age: float) -> Scene:
-        """The newest cloud, or else depth image of each camera; or that of the mask, if any comes.
+        """The newest cloud or depth image of each camera; with a mask, the image it was made of.
 
         Raises:
             ValueError: The mask is too old, or the image that it was made of has not come.

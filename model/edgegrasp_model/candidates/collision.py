@@ -35,9 +35,9 @@ def collides(
 ) -> Bools:
     """Which open hands (E,) collide at the grasp, on the approach or the retreat.
 
-    With the cloud, the support plane, an obstacle or space that no camera saw, or that close on
-    background. The margin is added on every side of each box of the hand. It is negative for hands
-    that were fully checked earlier, of which only what they hit is checked.
+    They hit the cloud, the support plane, an obstacle or space that no camera saw, or close on
+    background. The margin is added on every side of each box of the hand. A negative margin means
+    that the hands were fully checked earlier: unseen space and background are left out.
     """
     boxes = gripper.open_boxes + request.margin * np.array([[-1.0], [1.0]])  # (B, 2, 3)
     behind, lift = request.approach_length, 0.0  # metres along the hand's z, and straight up
@@ -71,9 +71,8 @@ def collides(
         background = scene.cloud.points[scene.object_of_point == BACKGROUND]
         side, inner = gripper.pad_half_width, gripper.max_opening / 2
         low, high = (-side, -inner, gripper.palm_z), (side, inner, gripper.tip_z)
-        between, _, _ = points_in_hand_boxes(
-            in_hands(background, T_cloud_hand[free]), *np.array([low, high], dtype=np.float32)
-        )
+        hands = in_hands(background, T_cloud_hand[free])
+        between, *_ = points_in_hand_boxes(hands, *np.array([low, high], np.float32))
         hit[free] = np.bincount(between, minlength=len(free)) >= MIN_BACKGROUND_VOXELS
         hit[free] |= enters_unseen(scene.depths, T_cloud_hand[free], gripper)
     return hit
@@ -113,8 +112,6 @@ def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandVie
     high = boxes[:, 1].max(axis=0) + np.array([near, near, 2 * near])
     high[2] += gripper.max_tip_z - gripper.tip_z
     hands = in_hands(cloud.points, T_cloud_hand)
-    hand, row, position = points_in_hand_boxes(
-        hands, low.astype(np.float32), high.astype(np.float32)
-    )
+    hand, row, position = points_in_hand_boxes(hands, *np.array([low, high], np.float32))
     bounds = np.searchsorted(hand, np.arange(len(T_cloud_hand) + 1))
     return HandView(hand, row, position, bounds)

@@ -21,8 +21,8 @@ from edgegrasp_model.results import NoGrasp
 from edgegrasp_model.scene.cloud import UP, Cloud, pose_matrix, unit
 
 MIN_EDGE_LENGTH = 0.003  # metres between approach and contact point
-# Metres that an edge stays below half the opening, a contact inside the fingertips, and a hand
-# behind what is ahead of it.
+# Metres to spare: an edge is this much shorter than half the opening, a contact this far behind the
+# fingertips, and a hand this far from what is ahead of it.
 FIT_MARGIN = 0.002
 CLOSING_ALLOWANCE = 0.01  # metres by which an object may be narrower than it looks
 WIDE_SHARE = 0.75  # of the opening, from which an object counts as wide
@@ -260,9 +260,7 @@ def outlines(
             way = np.array([*level, np.cos(lean)])
             toward.append(np.broadcast_to(way.astype(np.float32), points.shape))
     ways = np.stack([each[rows] for each in toward])
-    cells = (
-        np.floor((points - points.min(axis=0)) / np.float32(OUTLINE_RADIUS)).astype(np.int64) + 1
-    )
+    cells = np.floor((points - points.min(axis=0)) / OUTLINE_RADIUS).astype(np.int64) + 1
     sizes = cells.max(axis=0) + 2
     key = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
     order = np.argsort(key, kind="stable")

@@ -34,8 +34,8 @@ from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
-MAX_APPROACH_POINTS = 64  # of a scene, for each of up to four views; half as many at least
-MIN_PER_OBJECT = 4  # of an object, however many there are; twice as many if there is room
+MAX_APPROACH_POINTS = 64  # per view of a scene, for up to four views; at least half of them
+MIN_PER_OBJECT = 4  # for each object, or twice as many where there are few objects
 OUTCOME_CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
 
 
@@ -50,7 +50,7 @@ class Sample:
     row: Int64  # (E,) indices of the candidates among them
     logits: Float32 = field(default_factory=lambda: np.empty(0, np.float32))  # (E,) once scored
 
-    def and_further(self, other: "Sample") -> "Sample":
+    def followed_by(self, other: "Sample") -> "Sample":
         """This sample joined with a later one."""
         return Sample(
             Candidates.concatenate([self.candidates, other.candidates]),
@@ -120,9 +120,8 @@ class Sampler:
         passed = np.flatnonzero(outcome == OUTCOME_CODE[Outcome.RETURNED])
         row = random_rows(passed, 4 * options.num_candidates, self._rng)  # of which many collide
         checked = drawn.take(row)
-        free = ~collides(
-            self.scene, checked.T_cloud_hand, checked.opening, self.gripper, options.collision
-        )
+        hands = checked.T_cloud_hand, checked.opening
+        free = ~collides(self.scene, *hands, self.gripper, options.collision)
         outcome[passed] = OUTCOME_CODE[Outcome.NOT_CHECKED]
         outcome[row] = OUTCOME_CODE[Outcome.NOT_SCORED]
         if mode != "ignore":
@@ -144,7 +143,7 @@ class Sampler:
     def all(self) -> Sample:
         """Two rounds, whatever their scores."""
         samples = self.sample(), self.sample(last_resort=True)
-        return reduce(Sample.and_further, [one for one in samples if one is not None])
+        return reduce(Sample.followed_by, [one for one in samples if one is not None])
 
     def _constrained(
         self, approach_index: Int64, *, last_resort: bool

@@ -208,7 +208,7 @@ class _Hand(NamedTuple):
 
     boxes: Float32  # (B, 2, 3) of the hand
     fingers: Float32  # (F, 2, 3) of the finger on the side of positive y
-    half: np.float32  # width of a pad
+    half: np.float32  # half the width of a pad
     inner: np.float32  # y of that finger's inner face
     palm: np.float32  # z
     tip: np.float32
@@ -375,12 +375,7 @@ def _runs_along(y: Float32, ends: Float32, runs: Float32) -> None:
 
 @compiled("contract")
 def _around_fingers(
-    view: HandView,
-    normals: Float32,
-    T_cloud_hand: Float32,
-    side: Float32,
-    box: Float32,
-    limit: int,
+    view: HandView, normals: Float32, T_cloud_hand: Float32, side: Float32, box: Float32, limit: int
 ) -> tuple[Float32, Int64]:
     """The points of hands (E, 4, 4) in a box around their fingers; x as `side` (E,) has it.
 

@@ -105,12 +105,8 @@ def packed(mlp: nn.Sequential) -> Layer:
 
 def float32_inference(values: Tensor) -> bool:
     """Whether this is float32 inference on a processor."""
-    return (
-        values.device.type == "cpu"
-        and values.dtype == torch.float32
-        and not torch.is_grad_enabled()
-        and not torch.is_autocast_enabled("cpu")
-    )
+    plain = values.device.type == "cpu" and values.dtype == torch.float32
+    return plain and not (torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"))
 
 
 class BallChunk(NamedTuple):

@@ -95,11 +95,8 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
         kept = np.flatnonzero(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
         row, points = row[kept], points.take(kept, axis=0)
     if len(points) == 0:
-        raise InvalidRequest(
-            "cloud",
-            "no points" if size == 0 else "no finite points",
-            "Send an image or points in metres.",
-        )
+        value = "no points" if size == 0 else "no finite points"
+        raise InvalidRequest("cloud", value, "Send an image or points in metres.")
     low, high = (np.array([end(axis) for axis in points.T]) for end in (np.min, np.max))
     if not np.isfinite([low, high]).all():
         raise _not_finite(points)
@@ -364,11 +361,9 @@ def _without_far_points(points: Floats) -> Int64:
     distance = np.abs(points.astype(np.float64) - np.median(points, axis=0)).max(axis=1)
     bulk = 2 * float(np.median(distance))
     if bulk > MAX_CLOUD_EXTENT:
-        raise InvalidRequest(
-            "cloud",
-            f"an extent of {bulk:.4g} m, which suggests millimetres",
-            "Send metres: divide by 1000, or send a depth image with depth_scale 0.001.",
-        )
+        value = f"an extent of {bulk:.4g} m, which suggests millimetres"
+        fix = "Send metres: divide by 1000, or send a depth image with depth_scale 0.001."
+        raise InvalidRequest("cloud", value, fix)
     return np.flatnonzero(distance <= MAX_CLOUD_EXTENT / 2)
 
 
@@ -412,12 +407,10 @@ def voxelise(points: Floats, voxel_size: float, most: float = math.inf) -> Voxel
     _, voxel, count = np.unique(keys, return_inverse=True, return_counts=True)
     if len(count) > most:
         size = " x ".join(f"{length:.2g}" for length in np.ptp(points, axis=0))
-        raise InvalidRequest(
-            "options.workspace",
-            f"{len(count)} voxels of {1000 * voxel_size:g} mm around objects, in {size} m",
-            "Send a workspace around the objects, or a support plane: at most "
-            f"{most} are accepted, fewer where the deadline is near.",
-        )
+        value = f"{len(count)} voxels of {1000 * voxel_size:g} mm around objects, in {size} m"
+        fix = "Send a workspace around the objects, or a support plane: at most "
+        fix += f"{most} are accepted, fewer where the deadline is near."
+        raise InvalidRequest("options.workspace", value, fix)
     return Voxels(voxel, count)
 
 
@@ -558,8 +551,7 @@ class CanonicalFrame:
 
     def points_in_cloud(self, points: ArrayLike) -> Float32:
         """Points (..., 3) of this frame in the cloud's."""
-        shifted = np.asarray(points, dtype=np.float64) - self.T_canonical_cloud[:3, 3]
-        return (shifted @ self.T_canonical_cloud[:3, :3]).astype(np.float32)
+        return self.directions_in_cloud(np.subtract(points, self.T_canonical_cloud[:3, 3]))
 
     def directions_in_cloud(self, directions: ArrayLike) -> Float32:
         """Directions (..., 3) of this frame in the cloud's."""

@@ -48,14 +48,12 @@ class SolidBoxes:
     def corners(self) -> Float64:
         """(M, 8, 3)."""
         signs = np.array(list(product((-1, 1), repeat=3)))
-        corners: Float64 = self.center[:, None] + signs @ self.half
-        return corners
+        return np.asarray(self.center[:, None] + signs @ self.half)
 
     @property
     def radius(self) -> Float64:
         """Distance (M,) of the corners from the middle."""
-        radius: Float64 = np.linalg.norm(self.half, axis=(1, 2))
-        return radius
+        return np.asarray(np.linalg.norm(self.half, axis=(1, 2)))
 
 
 def box_pose(box: Box | OrientedBox) -> tuple[Float64, Float64]:
@@ -101,8 +99,7 @@ def separation(ours: SolidBoxes, theirs: SolidBoxes, sweep: Float64 | None = Non
     reach = np.abs(axes @ edges.transpose(0, 2, 1)).sum(axis=2)
     reach += np.abs(axes @ theirs.half.transpose(0, 2, 1)).sum(axis=2)
     gap = np.abs(np.einsum("mad,md->ma", axes, theirs.center - center)) - reach
-    widest: Float64 = np.where(length > 1e-12, gap, -np.inf).max(axis=1)
-    return widest
+    return np.asarray(np.where(length > 1e-12, gap, -np.inf).max(axis=1))
 
 
 def signed_distance(ours: SolidBoxes, theirs: SolidBoxes) -> Float64:
@@ -131,8 +128,7 @@ def _corner_distance(corners: Float64, boxes: SolidBoxes) -> Float64:
     axes = boxes.half / extent[..., None]
     within = np.abs((corners - boxes.center[:, None]) @ axes.transpose(0, 2, 1))  # (M, 8, 3)
     outside = np.maximum(within - extent[:, None], 0.0)
-    distance: Float64 = np.linalg.norm(outside, axis=2).min(axis=1)
-    return distance
+    return np.asarray(np.linalg.norm(outside, axis=2).min(axis=1))
 
 
 def _segment_distance(p0: Float64, p1: Float64, q0: Float64, q1: Float64) -> Float64:
@@ -146,5 +142,4 @@ def _segment_distance(p0: Float64, p1: Float64, q0: Float64, q1: Float64) -> Flo
     s = np.clip(s, 0.0, 1.0)
     t = np.clip((pq * s + qr) / qq, 0.0, 1.0)
     s = np.clip((pq * t - pr) / pp, 0.0, 1.0)
-    distance: Float64 = np.linalg.norm(r + s[..., None] * p - t[..., None] * q, axis=-1)
-    return distance
+    return np.asarray(np.linalg.norm(r + s[..., None] * p - t[..., None] * q, axis=-1))

@@ -7,7 +7,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
-from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
 from edgegrasp_model.errors import InvalidRequest
@@ -43,7 +42,7 @@ from edgegrasp_model.scene.cloud import (
     voxelise,
 )
 from edgegrasp_model.scene.network import NEAREST_DEPTH
-from edgegrasp_model.scene.obstacles import SolidBoxes
+from edgegrasp_model.scene.obstacles import SolidBoxes, box_pose
 from edgegrasp_model.scene.segment import (
     BACKGROUND,
     UNDECIDED,
@@ -252,7 +251,7 @@ def build_scene(
 
 
 def _seen_from_above(points: Float32, up: Float64 | None) -> tuple[Int64, Float64]:
-    """Rows (M,) near the middle, as a room would be seen too small, and a place (1, 3) above."""
+    """Rows (M,) near the middle, since a whole room would be too small, and an eye (1, 3) above."""
     over = np.array([0.0, 0.0, 1.0]) if up is None else up
     beside = points - np.median(points, axis=0)
     beside -= (beside @ over)[:, None] * over
@@ -431,9 +430,9 @@ def _inside_shape(shape: Shape, points: Float32, voxels: Voxels, cloud: CheckedC
         case Box():
             return inside_workspace(points, shape)
         case OrientedBox():
-            turn = Rotation.from_quat(shape.quaternion).as_matrix()
-            within = np.abs((points - np.asarray(shape.center)) @ turn)
-            return np.asarray((within <= np.asarray(shape.half_extents)).all(axis=1))
+            T_cloud_box, half = box_pose(shape)
+            within = np.abs((points - T_cloud_box[:3, 3]) @ T_cloud_box[:3, :3])
+            return np.asarray((within <= half).all(axis=1))
         case Sphere():
             apart = np.linalg.norm(points - np.asarray(shape.center), axis=1)
             return np.asarray(apart <= shape.radius)

@@ -24,7 +24,7 @@ from edgegrasp_model.scene.cloud import (
 )
 from edgegrasp_model.scene.segment import Segmentation
 
-# Noise of depth cameras: metres from a plane, and as much more per squared metre of distance.
+# Noise of depth cameras: metres off a plane, and further metres per distance squared.
 PLANE_NOISE, NOISE_GROWTH = 0.004, 0.006
 
 # The margin above a plane, up to which points belong to it.
@@ -94,8 +94,7 @@ class ViewedPoints(NamedTuple):
 
 def heights_over(plane: SupportPlane, points: Floats) -> Floats:
     """Heights (N,) of points (N, 3) over a plane, metres."""
-    heights: Floats = points @ np.asarray(plane.normal) - plane.offset
-    return heights
+    return np.asarray(points @ np.asarray(plane.normal) - plane.offset)
 
 
 def find_support(
@@ -163,10 +162,7 @@ def _given_support(
 
 
 def _fit_support(
-    seen: ViewedPoints,
-    segmentation: Segmentation,
-    up: Float64 | None,
-    rng: np.random.Generator,
+    seen: ViewedPoints, segmentation: Segmentation, up: Float64 | None, rng: np.random.Generator
 ) -> Support | None:
     """The plane of the points classified as support, weighted toward those near objects."""
     on = np.flatnonzero(segmentation.support > 0.5)

@@ -296,11 +296,8 @@ async def _abort(call: Call, context: Any, problem: errors.Problem) -> NoReturn:
     if problem.field:
         violation = {"field": problem.field, "description": problem.detail}
         details.append(error_details_pb2.BadRequest(field_violations=[violation]))
-    status = status_pb2.Status(
-        code=code.value[0],
-        message=problem.detail,
-        details=[any_message.pack(detail) for detail in details],
-    )
+    packed = [any_message.pack(detail) for detail in details]
+    status = status_pb2.Status(code=code.value[0], message=problem.detail, details=packed)
     trailing = (
         (ERROR_METADATA, error_detail(problem).SerializeToString()),
         (STATUS_METADATA, status.SerializeToString()),

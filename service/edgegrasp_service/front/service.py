@@ -447,11 +447,7 @@ class Places:
 
     @asynccontextmanager
     async def hold(self, owner: str) -> AsyncIterator[Place]:
-        """Hold a place; the body of the context is cancelled on eviction.
-
-        Raises:
-            Overloaded: There is no place, or it was evicted.
-        """
+        """Hold a place; Overloaded: there is none, or it was evicted, which cancels the body."""
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(None) as eviction:

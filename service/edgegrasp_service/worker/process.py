@@ -191,8 +191,7 @@ class WorkerPool:
     async def start(self) -> None:
         """Load weights and start workers; workers of an earlier start finish their request and end.
 
-        Raises:
-            EdgeGraspError: Weights cannot be used.
+        EdgeGraspError: weights cannot be used.
         """
         nursery = self._launched or Nursery(self._settings, self.command)
         self._launched = None

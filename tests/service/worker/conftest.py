@@ -12,14 +12,7 @@ from edgegrasp_service.worker.process import Answer, Job
 SETTINGS = Settings()
 
 
-def ask(
-    transport: Any,
-    body: bytes,
-    media_type: str = "",
-    query: str = "",
-    scores: bool = False,
-    settings: Settings = SETTINGS,
-) -> Answer:
+def ask(transport, body, media_type="", query="", scores=False, settings=SETTINGS) -> Answer:
     """An answer, or an error that is the caller's and can be sent."""
     method: Any = "ScoreGrasps" if scores else "DetectGrasps"
     job = Job(method, transport, body, 60.0, media_type, query)
@@ -49,9 +42,8 @@ def problem(*asked: Any, **more: Any) -> Problem:
 
 def form(*parts: tuple[str, bytes], end: bytes = b"--b--\r\n") -> bytes:
     """A form of parts, whose boundary is b."""
-    return (
-        b"".join(b"--b\r\n%s\r\n\r\n%s\r\n" % (head.encode(), data) for head, data in parts) + end
-    )
+    packed = (b"--b\r\n%s\r\n\r\n%s\r\n" % (head.encode(), data) for head, data in parts)
+    return b"".join(packed) + end
 
 
 def part(name: str, data: bytes, more: str = "") -> tuple[str, bytes]:

@@ -22,9 +22,8 @@ class Malformed:
     """A request, as JSON has it, and what is said of it."""
 
     def __init__(
-        self, field: str, value: str, fix: str, options: dict[str, Any] | None = None,
-        kind: str = "invalid-request", scores: bool = False, **sent: Any,
-    ) -> None:  # fmt: skip
+        self, field, value, fix, options=None, kind="invalid-request", scores=False, **sent
+    ):
         self.field, self.value, self.fix, self.kind, self.scores = field, value, fix, kind, scores
         self._sent = {"options": options or {}} | sent
 
