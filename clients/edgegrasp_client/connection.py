@@ -2,6 +2,7 @@
 
 import math
 import random
+import re
 import subprocess
 import sysconfig
 from collections.abc import Iterator, Sequence
@@ -41,14 +42,20 @@ def is_rest(address: str) -> bool:
     return address.startswith(("http://", "https://", HTTP_OVER_UNIX))
 
 
+def on_this_machine(address: str) -> bool:
+    """Whether an address is of this machine, which no proxy reaches."""
+    local = r"(https?://)?(localhost|127[.\d]*|\[::1\])(:|/|$)|unix:"
+    return re.match(local, address) is not None
+
+
 def seconds_of(timeout: float) -> float:
-    """A timeout, cut to LONGEST_TIMEOUT; raises InvalidRequestError for what is no number."""
+    """A timeout, cut to LONGEST_TIMEOUT; raises InvalidRequestError unless it is above 0."""
     try:
         seconds = float(timeout)
     except (TypeError, ValueError):
         seconds = math.nan
-    if math.isnan(seconds):
-        raise invalid("timeout", repr(timeout), "Give seconds.")
+    if not seconds > 0.0:
+        raise invalid("timeout", repr(timeout), "Give seconds, more than 0.")
     return min(seconds, LONGEST_TIMEOUT)
 
 
@@ -113,7 +120,8 @@ def local_server(*flags: str, program: Sequence[str] = ()) -> Iterator[Addresses
 
 def unreachable(address: str, why: str) -> ServerUnavailableError:
     """The exception for a call whose connection was not made or broke."""
-    hint = "Check the address, whether it needs TLS, and that `edgegrasp serve` runs there."
+    hint = "Check the address, whether it needs TLS or a proxy (the variables http_proxy and "
+    hint += "no_proxy), and that `edgegrasp serve` runs there."
     return ServerUnavailableError(f"No connection to {address} ({why}). {hint}")
 
 

@@ -1,5 +1,6 @@
 """The gRPC transport: requests, answers and errors as messages."""
 
+from base64 import b64decode
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping, Sequence
 from dataclasses import astuple
 from itertools import chain
@@ -12,7 +13,13 @@ from google.protobuf.message import DecodeError, Message
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_camera.arrays import Array
-from edgegrasp_client.connection import Tls, invalid, token_metadata, unreachable
+from edgegrasp_client.connection import (
+    Tls,
+    invalid,
+    on_this_machine,
+    token_metadata,
+    unreachable,
+)
 from edgegrasp_client.errors import GraspClientError
 from edgegrasp_client.requests import Request, cloud_file
 from edgegrasp_client.results import Answer, Model, StreamAnswer, error_of_kind, field_of, read_as
@@ -41,15 +48,16 @@ class GrpcTransport:
 
     def __init__(self, address: str, token: str | None, tls: Tls | None) -> None:
         self._address = address
+        options = (*CHANNEL_OPTIONS, ("grpc.enable_http_proxy", not on_this_machine(address)))
         if tls is None:
-            self._channel = grpc.aio.insecure_channel(address, CHANNEL_OPTIONS)
+            self._channel = grpc.aio.insecure_channel(address, options)
         else:
             try:
                 ca, certificate, key = (file and Path(file).read_bytes() for file in astuple(tls))
             except OSError as error:
                 raise invalid("tls", f"{tls} ({error})", "Give PEM files.") from None
             credentials = grpc.ssl_channel_credentials(ca, key, certificate)
-            self._channel = grpc.aio.secure_channel(address, credentials, CHANNEL_OPTIONS)
+            self._channel = grpc.aio.secure_channel(address, credentials, options)
         self._metadata = token_metadata(token)
         self._service: Any = grasp_pb2_grpc.GraspServiceStub(self._channel)
         self._check = self._channel.unary_unary(HEALTH_CHECK, bytes, bytes)
@@ -74,12 +82,18 @@ class GrpcTransport:
     ) -> AsyncGenerator[StreamAnswer, None]:
         """An answer to each of the named requests with their timeouts."""
         failed: list[Exception] = []
+        refused: dict[str, GraspClientError] = {}  # by the client; they are sent empty
         sent = grasp_pb2.DetectGraspsStreamRequest
 
         async def messages() -> AsyncIterator[grasp_pb2.DetectGraspsStreamRequest]:
             try:
                 async for name, request, seconds in requests:
-                    yield sent(request_id=name, request=message_of(request), timeout=seconds)
+                    message = None
+                    try:
+                        message = message_of(request)
+                    except GraspClientError as error:
+                        refused[name] = error
+                    yield sent(request_id=name, request=message, timeout=seconds)
             except Exception as error:  # gRPC would only log it
                 failed.append(error)
 
@@ -91,6 +105,7 @@ class GrpcTransport:
                     yield StreamAnswer(answer.request_id, detection)
                 else:
                     error = _described(answer.error.message, answer.error.detail)
+                    error = refused.pop(answer.request_id, error)
                     yield StreamAnswer(answer.request_id, error=error)
         except grpc.RpcError as error:
             raise _error_of(error, self._address) from None
@@ -177,7 +192,7 @@ def fill(message: Message, value: object, path: str = "") -> None:
     message.SetInParent()
     for name, part in value.items():
         field = message.DESCRIPTOR.fields_by_name.get(name)
-        here = f"{path}.{name}".removeprefix(".")
+        here = f"{path}.{name}".removeprefix(".").replace("object_choice", "objects")
         if field is None:
             raise invalid(here, "an unknown field", f"Give {_known(message)} only.")
         if isinstance(part, np.ndarray):
@@ -188,6 +203,8 @@ def fill(message: Message, value: object, path: str = "") -> None:
                     setattr(message, name, part)
                 elif name.startswith(("T_", "surface")) and all(isinstance(r, list) for r in part):
                     getattr(message, name).extend(chain(*part))  # in JSON also row by row
+                elif name == "mask" and isinstance(part, str):  # in JSON also in base64
+                    getattr(message, name).extend(map(bool, b64decode(part, validate=True)))
                 else:
                     getattr(message, name).extend(part)
             except (TypeError, ValueError) as error:

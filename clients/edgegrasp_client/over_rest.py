@@ -12,7 +12,14 @@ import numpy as np
 
 from edgegrasp_camera.depth import ENCODINGS
 from edgegrasp_client import errors
-from edgegrasp_client.connection import HTTP_OVER_UNIX, Tls, invalid, token_metadata, unreachable
+from edgegrasp_client.connection import (
+    HTTP_OVER_UNIX,
+    Tls,
+    invalid,
+    on_this_machine,
+    token_metadata,
+    unreachable,
+)
 from edgegrasp_client.errors import GraspClientError
 from edgegrasp_client.requests import Request, cloud_file, npy_bytes
 from edgegrasp_client.results import Answer, StreamAnswer, error_of_kind, read_as
@@ -44,7 +51,10 @@ class RestTransport:
                 headers=dict(token_metadata(token)),
                 verify=_ssl_context(tls),
                 transport=transport,
+                trust_env=not on_this_machine(address),
             )
+            if (self._http.base_url.port or 0) > 65535:
+                raise httpx.InvalidURL("no such port")
         except httpx.InvalidURL as error:
             raise invalid("address", f"{address!r} ({error})", "Give http://host:port.") from None
 
@@ -70,8 +80,8 @@ class RestTransport:
     ) -> AsyncGenerator[StreamAnswer, None]:
         """An answer to each of the named requests with their timeouts, one after the other."""
         async for name, request, seconds in requests:
-            call, read = call_of(request), partial(read_as, Detection)
             try:
+                call, read = call_of(request), partial(read_as, Detection)
                 yield StreamAnswer(name, await self._call(read, call, seconds))
             except GraspClientError as error:
                 yield StreamAnswer(name, error=error)

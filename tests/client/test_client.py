@@ -5,6 +5,7 @@ import dataclasses
 import itertools
 import os
 import threading
+from base64 import b64encode
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -104,6 +105,9 @@ def test_every_option_goes_through_and_none_is_its_default(client, cloud) -> Non
     alone = {name: client.detect(cloud, **{name: value}) for name, value in ALL_OPTIONS.items()}
     assert len(alone["top_k"].grasps) == 3
     assert_same(client.detect(cloud, **dict.fromkeys(ALL_OPTIONS)), client.detect(cloud))
+    coded = {"kind": "mask", "mask": b64encode(np.arange(500) % 2 == 0).decode()}
+    same = client.detect(cloud, approach_region={"include": [coded]})
+    assert_same(same, alone["approach_region"])
 
 
 def test_models_and_readiness(client) -> None:
@@ -197,10 +201,12 @@ def test_answers_are_those_of_single_requests(client, cloud) -> None:
         assert answer.result().counts == alone.counts
 
 
-def test_what_cannot_be_sent_ends_the_stream_after_what_went_before(client, cloud) -> None:
+def test_what_cannot_be_sent_is_an_error_and_the_stream_goes_on(client, cloud) -> None:
     requests = [StreamRequest(cloud), StreamRequest("nowhere.ply"), StreamRequest(cloud)]
+    first, missing, last = client.detect_stream(requests)
+    assert_same(first.result(), last.result())
     with pytest.raises(InvalidRequestError, match="nowhere"):
-        list(client.detect_stream(requests))
+        missing.result()
     with pytest.raises(InvalidRequestError, match="Give a cloud"):
         StreamRequest()
 

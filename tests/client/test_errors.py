@@ -257,7 +257,7 @@ def test_a_deadline_ends_a_call_or_one_request_of_a_stream(start_dummy, make_cli
 
 
 def test_an_address_that_is_none_or_without_tls_is_refused() -> None:
-    for address in ("http://[::1", "http://host:port"):
+    for address in ("http://[::1", "http://host:port", "http://host:99999"):
         with pytest.raises(InvalidRequestError, match="address: got "):
             GraspClient(address)
     for address in ("http://127.0.0.1:8000", "http+unix:/run/http.sock"):
@@ -285,8 +285,15 @@ def test_a_timeout_may_be_endless_but_is_a_number(client, cloud) -> None:
     assert client.detect(cloud, timeout=endless).grasps
     assert client.ready(timeout=endless)
     for call in (client.detect, StreamRequest):
-        with pytest.raises(InvalidRequestError, match="timeout: got nan"):
-            call(cloud, timeout=float("nan"))
+        for none in (float("nan"), 0.0, -1.0):
+            with pytest.raises(InvalidRequestError, match=f"timeout: got {none}"):
+                call(cloud, timeout=none)
+
+
+def test_a_proxy_is_not_asked_for_this_machine(dummy_server, transport, monkeypatch) -> None:
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:1")
+    with GraspClient(dummy_server.address(transport)) as client:
+        assert client.models()
 
 
 @pytest.mark.parametrize("size", [4_200_000, 9_000_000])  # the latter is over what gRPC reads
