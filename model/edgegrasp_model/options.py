@@ -45,6 +45,7 @@ Number = Annotated[float, numeric]
 Finite = Annotated[float, Field(allow_inf_nan=False, ge=-FARTHEST, le=FARTHEST), numeric]
 Vector = Annotated[tuple[Finite, Finite, Finite], Field(description="x, y, z in the cloud's frame")]
 Row = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
+GraspId = Annotated[int, Field(strict=True, ge=0, lt=2**30)]
 MAX_SHAPES = 64
 MAX_ROWS = 5_000_000
 ObjectNumbers = Annotated[tuple[Row, ...], Field(max_length=4096)]
@@ -483,7 +484,7 @@ class RobotArm(Strict):
 class PreviousGrasp(Strict):
     """A grasp of an earlier answer."""
 
-    id: Row = Field(description="as in that answer")
+    id: GraspId = Field(description="as in that answer")
     T_cloud_hand: RigidPose = Field(description="as in that answer: a 4 x 4 matrix, row by row")
     object: Row | None = Field(default=None, description="number of the object that it is on")
 
@@ -507,7 +508,7 @@ class Previous(Strict):
     """
 
     gripper: Name = Field(default="", description="name of the gripper in that answer")
-    next_id: Row = Field(default=0, description="as in that answer")
+    next_id: GraspId = Field(default=0, description="as in that answer")
     grasps: tuple[PreviousGrasp, ...] = Field(default=(), max_length=MAX_PREVIOUS)
     """best first; the first is the one to keep"""
     objects: tuple[PreviousObject, ...] = Field(default=(), max_length=MAX_PREVIOUS)
@@ -518,9 +519,10 @@ class Previous(Strict):
 
     @property
     def free_id(self) -> int:
-        """Above all ids of grasps and numbers of objects in it."""
+        """Above all ids of grasps and numbers of objects in it; low again after 2**29."""
         used = [grasp.id for grasp in self.grasps] + [one.number for one in self.objects]
-        return max([self.next_id, *(1 + one for one in used)])
+        free = max([self.next_id, *(1 + one for one in used)])
+        return free if free < 2**29 else 1 + max((one for one in used if one < 2**29), default=0)
 
     @model_validator(mode="after")
     def _distinct(self) -> Self:
@@ -556,6 +558,10 @@ def _with_kind(value: object) -> object:
 GripperChoice = Annotated[
     Annotated[str, Tag("name")] | Annotated[GripperGeometry, Tag("inline")],
     Discriminator(lambda value: "name" if isinstance(value, str) else "inline"),
+]
+ObjectsOption = Annotated[
+    Annotated[Literal["auto", "off"], Tag("all")] | Annotated[ObjectChoice, Tag("some")],
+    Discriminator(lambda value: "some" if isinstance(value, Mapping | ObjectChoice) else "all"),
 ]
 Viewpoint = Annotated[
     Annotated[Vector, Tag("one")]
@@ -602,7 +608,7 @@ class DetectOptions(Strict):
     support: SupportChoice = AutoPlane()
     """plane that the objects rest on and the hand stays above; a kind alone is allowed; null:
     none"""
-    objects: Literal["auto", "off"] | ObjectChoice = "auto"
+    objects: ObjectsOption = "auto"
     """objects to grasp: those recognised (auto), some of them by number, or everything above the
     support (off); all else is an obstacle. If segment_ids are sent, those above 0 are the
     objects"""

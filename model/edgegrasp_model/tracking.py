@@ -140,7 +140,7 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
         fits = share >= WELL_SEEN_SHARE
         here = now.astype(np.float32) if fits else sampled(points[renamed == name])
         surface.setdefault(name, here)
-    next_id = max([previous.free_id, *(1 + one for one in named.values())])
+    next_id = previous.free_id
     for which in found if previous.search else ():
         if which not in named:
             named[int(which)], next_id = next_id, next_id + 1

@@ -110,6 +110,8 @@ def test_new_ids_are_above_all_that_are_sent(sent: Any) -> None:
     previous = parse_options({"previous": sent}).previous
     assert previous is not None
     assert untracked(previous).next_id == 8
+    late = previous.model_copy(update={"next_id": 2**29})  # ids stay small
+    assert untracked(late).next_id == 8
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,11 @@ CASES = {
         "contact_region", shape(kind="segments", ids=[]), ".include.0.ids", "[]", "at least 1"
     ),
     "approach direction of nothing": option("approach_direction", {}, "", "{", "cone"),
+    "object of no number": option("objects", {"include": [-1]}, ".include.0", "-1", "equal to 0"),
     # What an earlier answer found.
+    "an id that leaves no room for others": option(
+        "previous", previous(next_id=2**31 - 1), ".next_id", "2147483647", "less than"
+    ),
     "grasps of two with one id": option(
         "previous", previous(grasps=[HELD, HELD]), "", "{", "7 is the id of two of them"
     ),
