@@ -355,7 +355,9 @@ class ModelCatalogue:
         self._detectors = dict(detectors)
         preferred = [name for name in PREFERRED_MODELS if name in detectors] or sorted(detectors)
         self.default = default or preferred[0]
-        self.get(self.default)
+        if self.default not in detectors:
+            fix = f"Use one of: {', '.join(sorted(detectors))}."
+            raise InvalidCheckpoint(f"default_model: got {default!r}. {fix}")
 
     @classmethod
     def load(
@@ -374,6 +376,9 @@ class ModelCatalogue:
         files: dict[str, Path] = {}
         for source in (WEIGHTS_FOLDER, *weights):
             found = sorted(source.glob("*.safetensors")) if source.is_dir() else [source]
+            if not any(map(Path.is_file, found)):
+                fix = "Give a .safetensors file, or a folder of them."
+                raise InvalidCheckpoint(f"weights: got {source}, where there are none. {fix}")
             files |= {file.stem: file for file in found}
         detectors = {name: GraspDetector.load(file, device, own) for name, file in files.items()}
         return cls(detectors, default)

@@ -17,7 +17,7 @@ from typing import Any
 import uvicorn
 
 from edgegrasp_model.errors import EdgeGraspError
-from edgegrasp_service.errors import AddressInUse
+from edgegrasp_service.errors import AddressInUse, InvalidSettings
 from edgegrasp_service.front.grpc import GrpcServer
 from edgegrasp_service.front.http import HttpMiddleware, HttpProtocol, create_router
 from edgegrasp_service.front.service import GraspService, Places
@@ -233,6 +233,8 @@ def _listen(host: str, port: int) -> socket.socket:
     family, place = socket.AF_INET6 if ":" in host else socket.AF_INET, f"{host}:{port}"
     address: Any = (host, port)
     if host.startswith(UNIX_PREFIX):
+        if host == UNIX_PREFIX:
+            raise InvalidSettings(f"host: got {host!r}. Give unix:FOLDER.")
         family, place = socket.AF_UNIX, f"{host.removeprefix(UNIX_PREFIX)}/http.sock"
         address = place
         with socket.socket(socket.AF_UNIX) as trying:  # a stale socket goes
@@ -241,6 +243,9 @@ def _listen(host: str, port: int) -> socket.socket:
     try:
         listening = socket.create_server(address, family=family, backlog=BACKLOG)
     except OSError as error:
+        if family != socket.AF_UNIX and error.errno not in (errno.EADDRINUSE, errno.EACCES):
+            fix = "Give an address of this machine."
+            raise InvalidSettings(f"host: got {host!r} ({error.strerror}). {fix}") from None
         raise AddressInUse("HTTP", place, str(error.strerror)) from None
     if family != socket.AF_UNIX:
         # Connections inherit it; asyncio sets it only on its own sockets. Without it answers waited

@@ -292,8 +292,12 @@ def test_a_catalogue_finds_weights_by_their_file_name(tmp_path: Path) -> None:
     mine.warm_up()
     with pytest.raises(UnknownModel, match="nobody"):
         mine.get("nobody")
-    with pytest.raises(UnknownModel, match="other"):
+    with pytest.raises(InvalidCheckpoint, match="default_model: got 'other'"):
         ModelCatalogue({"mine": catalogue.get()}, default="other")
+    (tmp_path / "empty").mkdir()
+    for place in ("empty", "absent"):
+        with pytest.raises(InvalidCheckpoint, match=f"{place}, where there are none"):
+            ModelCatalogue.load([tmp_path / place])
     with pytest.raises(InvalidCheckpoint):
         ModelCatalogue({})
 

@@ -20,7 +20,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from edgegrasp_client import AsyncGraspClient, GraspClient, GraspClientError, StreamRequest
 from edgegrasp_model.errors import EdgeGraspError
-from edgegrasp_service.errors import AddressInUse
+from edgegrasp_service.errors import AddressInUse, InvalidSettings
 from edgegrasp_service.probe import is_ready
 
 from .conftest import PATIENCE, is_error
@@ -201,6 +201,9 @@ async def test_sockets_of_a_folder(serve, transport: str, cloud: np.ndarray) -> 
             await running.serving
     with pytest.raises(AddressInUse, match="choose another folder that exists: --host"):
         await serve(host=f"unix:{folder}")  # gone
+    for host in ("unix:", "192.0.2.1", "http://127.0.0.1"):
+        with pytest.raises(InvalidSettings, match=f"host: got '{host}'"):
+            await serve(host=host)
 
 
 async def test_a_name_with_several_addresses_has_all_of_them_asked(serve, cloud) -> None:
