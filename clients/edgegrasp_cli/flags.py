@@ -47,7 +47,9 @@ class Connection(BaseModel, use_attribute_docstrings=True):
         try:
             if self.token_file is not None:
                 token = self.token_file.read_text().strip()
-        except (OSError, UnicodeDecodeError) as error:
+                if len(token.split()) != 1:
+                    raise ValueError("give a file with one token and nothing else")
+        except (OSError, ValueError) as error:
             raise ValueError(f"token file {self.token_file}: {error}") from error
         return GraspClient(address, timeout=self.timeout, token=token, tls=tls)
 
