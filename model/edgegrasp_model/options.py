@@ -555,13 +555,13 @@ def _with_kind(value: object) -> object:
     return {"kind": value} if isinstance(value, str) else value
 
 
+text_or_fields = Discriminator(lambda value: "text" if isinstance(value, str) else "fields")
 GripperChoice = Annotated[
-    Annotated[str, Tag("name")] | Annotated[GripperGeometry, Tag("inline")],
-    Discriminator(lambda value: "name" if isinstance(value, str) else "inline"),
+    Annotated[str, Tag("text")] | Annotated[GripperGeometry, Tag("fields")], text_or_fields
 ]
 ObjectsOption = Annotated[
-    Annotated[Literal["auto", "off"], Tag("all")] | Annotated[ObjectChoice, Tag("some")],
-    Discriminator(lambda value: "some" if isinstance(value, Mapping | ObjectChoice) else "all"),
+    Annotated[Literal["auto", "off"], Tag("text")] | Annotated[ObjectChoice, Tag("fields")],
+    text_or_fields,
 ]
 Viewpoint = Annotated[
     Annotated[Vector, Tag("one")]
