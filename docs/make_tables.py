@@ -20,7 +20,7 @@ BOUNDS = (
     ("maximum", "to "),
     ("exclusiveMaximum", "to under "),
 )
-NAMES = {-(2**31): "-2^31", 2**31: "2^31", 2**63: "2^63", math.pi: "π"}  # of numbers
+NAMES = {-(2**31): "-2^31", 2**30: "2^30", 2**31: "2^31", 2**63: "2^63", math.pi: "π"}  # of numbers
 
 
 def pages() -> dict[Path, str]:
