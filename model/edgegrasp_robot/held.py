@@ -16,7 +16,7 @@ from edgegrasp_model.scene.obstacles import box_pose
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.support import heights_over
 from edgegrasp_results import DetectedObject, Grasp
-from edgegrasp_robot.surroundings import VOXEL_SIZE, Load, moved
+from edgegrasp_robot.surroundings import FOOT_HEIGHT, VOXEL_SIZE, Load, moved
 
 WAY_STEP = 0.005  # metres along the way
 TOUCHING = 0.01  # metres; points nearer to the held object already touch it
@@ -110,9 +110,20 @@ def places_for(
     place: Place,
     load: Load,
     voxels: Float64,  # (V, 3) base frame, what is seen around it
+    scene: Scene,
+    T_base_cloud: Float64,
 ) -> Iterator[Float64]:
-    """Poses T_base_box (4, 4) in which a load meets none of the voxels, a region's middle first."""
+    """Poses T_base_box (4, 4) in which a load meets nothing, a region's middle first.
+
+    Neither voxels nor the support, into which its foot would be pressed.
+    """
     for pose in _places(place, load):
+        T_cloud_base = np.linalg.inv(T_base_cloud) @ pose @ np.linalg.inv(load.T_base_box)
+        foot = _lowest(scene, moved(T_cloud_base, load.points)) - load.below
+        if foot < -RELEASE_HEIGHT:
+            if place.region is None or foot < -FOOT_HEIGHT:
+                continue
+            pose[2, 3] -= foot  # of a region whose bottom is a little too low
         off, half = load.above_its_foot
         around = np.abs(moved(np.linalg.inv(pose), voxels) - (0.0, 0.0, off))
         if not (around < half + VOXEL_SIZE / 2).all(axis=1).any():

@@ -4,7 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice, pairwise
+from itertools import chain, islice, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -155,6 +155,7 @@ class _Arm:
         self._robot, self._scene, self._options, self._around = robot, scene, options, around
         self._place, self._objects = asked.place, {one.number: one for one in objects}
         self._until, self._path_seconds = until, PATH_SECONDS
+        self._without_place: set[int | None] = set()  # numbers of objects
         self._start = np.array(asked.joints)
         self._start_x = robot.hand_pose(self._start)[:3, 0]
         near = np.maximum(robot.lower, self._start - np.pi)
@@ -172,7 +173,8 @@ class _Arm:
     def reach_some(self, grasps: Iterator[Grasp], wanted: int) -> list[_Pick]:
         """The next picks, as many as it takes for some to be within reach."""
         picks: list[_Pick] = []
-        while wanted > 0 and time.monotonic() < self._until and (grasp := next(grasps, None)):
+        until = (time.monotonic() + self._until) / 2  # the rest is for motions
+        while wanted > 0 and time.monotonic() < until and (grasp := next(grasps, None)):
             picks.append(self._reach_either_way(grasp))
             wanted -= picks[-1].outcome == "reachable"
         return picks
@@ -228,9 +230,9 @@ class _Arm:
     def motion(self, pick: _Pick) -> _Pick:
         """Add a collision-checked trajectory, if one is found."""
         free, straight = self._robot.scene, self._robot.straight
-        path = self._free_path(free, self._start, pick.line[0])
         back = self._retreat(pick) if pick.put is None else pick.put.back
-        if not path or not back:
+        path = self._free_path(free, self._start, pick.line[0]) if back else []
+        if not path:
             return pick
         ways = pick.line, back
         timed = [self._timed(free, path), *(self._timed(straight, way, True) for way in ways)]
@@ -260,6 +262,8 @@ class _Arm:
     def _with_place(self, pick: _Pick, place: Place) -> _Pick | None:
         """Add how the object is put down, in the first place within reach; None: in none."""
         grasp, rules = pick.grasp, self._options.collision
+        if grasp.object in self._without_place:
+            return None
         held = held_by(grasp, self._scene, self._robot.gripper)
         seen = None if grasp.object is None else self._objects.get(grasp.object)
         load = load_of(held, seen, self._scene, self._T_base_cloud)
@@ -267,11 +271,15 @@ class _Arm:
         if load is None or not back:
             return None
         around, over = self._around.without(load), max(rules.approach_length, rules.retreat_length)
-        places = places_for(place, load, moved(around.T_base_scene, around.voxels))
+        voxels = moved(around.T_base_scene, around.voxels)
+        places = places_for(place, load, voxels, self._scene, self._T_base_cloud)
+        if (first := next(places, None)) is None:
+            self._without_place |= {grasp.object} - {None}
+            return None
         T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand
         T_box_hand = np.linalg.inv(load.T_base_box) @ T_base_hand
         with carrying(self._robot, around, load, T_base_hand) as scene:
-            for T_base_box in islice(places, MAX_PLACES):
+            for T_base_box in islice(chain([first], places), MAX_PLACES):
                 T_base_place = T_base_box @ T_box_hand
                 poses = _straight(T_base_place, self._up, over, 0.0)
                 down, _ = self._reach(poses, [back[-1], *self._drawn], scene, scene)
@@ -306,7 +314,7 @@ class _Arm:
         options = RRTOptions(GROUP, 3000, rrt_connect=True, collision_check_step_size=step)
         begin = time.monotonic()
         # Nodes alone are no limit: none are added where every way is blocked. Zero is without end.
-        options.max_planning_time = max(1e-3, min(self._path_seconds, self._until - begin))
+        options.max_planning_time = max(1e-3, min(self._path_seconds / 3, self._until - begin))
         planner = RRT(scene, options)
         planner.setRngSeed(seed)
         first, last = (core.JointConfiguration(names, joints) for joints in (start, end))
@@ -388,7 +396,7 @@ def _told(
     tiers = [pick.tier for pick in picks]
     grasps = [replace(pick.grasp, arm=None if pick.tier == 2 else pick.plan) for pick in picks]
     warnings = list(detection.warnings)
-    if detection.grasps and not outcomes["reachable"]:
+    if detection.grasps and not outcomes["reachable"] and 2 not in tiers:
         warnings.append(NO_REACH)
     if asked.plan == "motion" and 1 in tiers:
         why = "no collision-free one was found in time."

@@ -120,12 +120,8 @@ def surrounded(
         known.append((f"collision.obstacles.{row}", core.Box(*(2 * half)), place))
     T_base_scene = T_base_cloud @ np.linalg.inv(scene.frame.T_canonical_cloud)
     if scene.support is not None:
-        # A slab below the support plane, its middle below the arm's base.
-        normal, base = np.array(scene.support.normal), np.linalg.inv(T_base_scene)[:3, 3]
-        upright = Rotation.align_vectors(normal[None], [[0.0, 0.0, 1.0]])[0].as_matrix()
-        middle = base - (heights_over(scene.support, base) + SUPPORT_SIZE[2] / 2) * normal
-        T_scene_slab = pose_matrix(upright, middle)
-        known.append(("the support", core.Box(*SUPPORT_SIZE), T_base_scene @ T_scene_slab))
+        slab, T_scene_slab = _slab(scene, points, np.linalg.inv(T_base_scene)[:3, 3])
+        known.append(("the support", slab, T_base_scene @ T_scene_slab))
     voxels = _voxels(robot, joints, scene, points, T_base_scene)
     if asked.avoid_unseen:
         hidden = _hidden(scene, voxels, T_base_scene)
@@ -168,6 +164,24 @@ def _standing_in(
                 planned.removeGeometry(name)
 
 
+def _slab(scene: Scene, points: object, base: Float64) -> tuple[core.Box, Float64]:
+    """The support and its pose T_scene_slab (4, 4), with the arm's base (3,) in the scene frame.
+
+    A slab below the whole plane; of a support that is higher than the base, what is seen of it.
+    """
+    assert scene.support is not None
+    normal, height = np.array(scene.support.normal), float(heights_over(scene.support, base))
+    upright = Rotation.align_vectors(normal[None], [[0.0, 0.0, 1.0]])[0].as_matrix()
+    size, middle = np.array(SUPPORT_SIZE), np.zeros(3)
+    seen = scene.frame.points(np.asarray(points).reshape(-1, 3)) if height < 0.0 else base[None]
+    seen = seen[np.abs(heights_over(scene.support, seen)) < VOXEL_SIZE]  # NaN is not
+    if height < 0.0 and len(seen):
+        low, high = np.percentile((seen - base) @ upright[:, :2], (0.5, 99.5), axis=0)
+        size, middle[:2] = np.array([*(high - low), 2 * VOXEL_SIZE]), (low + high) / 2
+    middle[2] = -height - size[2] / 2
+    return core.Box(*size), pose_matrix(upright, base + upright @ middle)
+
+
 def _own_objects(robot: Robot, joints: Float64, scene: Scene, T_base_cloud: Float64) -> set[int]:
     """Numbers of detected objects that are the arm itself."""
     of_object = scene.object_of_point >= 0
@@ -199,14 +213,17 @@ def _voxels(
 ) -> Float64:
     """Centers (V, 3) of the cloud's voxels, scene frame, without the support's and the arm's."""
     flat = np.asarray(points).reshape(-1, 3)
+    T, base = scene.frame.T_canonical_cloud, np.linalg.inv(T_base_scene)[:3, 3]
     if scene.support is None:
         kept = np.flatnonzero(np.isfinite(flat).all(axis=1))
     else:  # in single precision, since most of an image is support
         plane = np.append(scene.support.normal, -scene.support.offset)
         plane = (plane @ scene.frame.T_canonical_cloud).astype(flat.dtype)
-        kept = np.flatnonzero(flat @ plane[:3] > VOXEL_SIZE / 2 - plane[3])  # NaN is not
+        height = flat @ plane[:3] + plane[3]
+        if heights_over(scene.support, base) < 0.0:  # what is below the support is in its way too
+            height = np.abs(height)
+        kept = np.flatnonzero(height > VOXEL_SIZE / 2)  # NaN is not
     # In cells of the scene's frame, from the arm's base.
-    T, base = scene.frame.T_canonical_cloud, np.linalg.inv(T_base_scene)[:3, 3]
     cells = flat[kept] @ (T[:3, :3].T / VOXEL_SIZE).astype(flat.dtype)
     cells += ((T[:3, 3] - base) / VOXEL_SIZE).astype(flat.dtype)
     cells = cells[np.einsum("ij,ij->i", cells, cells) < (MAX_RANGE / VOXEL_SIZE) ** 2]

@@ -88,11 +88,14 @@ def picks_of(
     avoid_unseen=False,
     changed=lambda scene, detection: (scene, detection),
     until=np.inf,
+    raised=0.0,
     **given,
 ):
-    """The detection with the arm's plans."""
+    """The detection with the arm's plans, the table raised by metres over the arm's base."""
     scene, cloud, detection = scene_of(robot, T_base_cloud, **given)
     scene, detection = changed(scene, detection)
+    T_base_cloud = T_base_cloud.copy()
+    T_base_cloud[2, 3] += raised
     asked = {"name": robot.name, "T_base_cloud": T_base_cloud.tolist(), "plan": plan}
     asked |= {"place": place, "avoid_unseen": avoid_unseen}
     asked["joints"] = (robot.home if joints is None else np.asarray(joints)).tolist()

@@ -236,8 +236,8 @@ def test_no_time_gives_no_motion_and_says_so(fr3, monkeypatch):
     assert "time ran out" in found.warnings[-1]
     clock = count()
     monkeypatch.setattr("time.monotonic", lambda: next(clock))
-    # It is asked before each grasp, and before a motion.
-    found = picks_of(fr3, boxes=BOXES[:1], until=2.5)
+    # It is asked at first, before each grasp, and before a motion.
+    found = picks_of(fr3, boxes=BOXES[:1], until=3.5)
     assert found.grasps[0].arm.reachable
     assert found.grasps[0].arm.trajectory is None
     assert "1 grasps within reach have no trajectory" in found.warnings[0]
@@ -333,6 +333,26 @@ def test_an_object_is_put_in_a_pose(fr3):
     middle = (placed(grasp, plan).min(axis=0) + placed(grasp, plan).max(axis=0)) / 2
     np.testing.assert_allclose(middle, pose[:3, 3], atol=0.002)
     assert plan.trajectory is None
+
+
+@pytest.mark.parametrize(("below", "lowest"), [(0.01, 0.0), (0.1, None)])
+def test_an_object_is_not_pressed_into_the_support(fr3, below, lowest):
+    region = TRAY | {"min": [*TRAY["min"][:2], -below]}
+    found = picks_of(fr3, boxes=BOXES[:1], place={"region": region}, plan="reach")
+    points = [placed(grasp, plan)[:, 2].min() for grasp, plan in plans_of(found)]
+    assert points == ([] if lowest is None else [pytest.approx(lowest, abs=0.004)])
+    pose = np.eye(4)
+    pose[:3, 3] = 0.4, -0.35, BOXES[0][2] - below  # given to the millimetre: it stays there
+    pressed = picks_of(fr3, boxes=BOXES[:1], place={"T_base_object": pose.tolist()}, plan="reach")
+    assert pressed.counts["no_place"] == 1
+
+
+def test_an_arm_may_stand_lower_than_the_table(fr3):
+    found = picks_of(fr3, raised=0.3)
+    assert found.counts["with_trajectory"] > 0
+    for _, plan in plans_of(found):
+        places = np.array([fr3.hand_pose(row)[:3, 3] for row in plan.trajectory.positions])
+        assert places[places[:, 0] > 0.3, 2].min() > 0.3  # where the table is
 
 
 def test_what_stands_in_the_region_is_not_met(fr3):
