@@ -1,6 +1,6 @@
 """Pick and place with an arm in simulation: from the camera's depth image to objects in a tray.
 
-usage: edgegrasp serve --robots fr3; python examples/pick_and_place.py 127.0.0.1:50051
+usage: edgegrasp serve --robots fr3 & python examples/pick_and_place.py 127.0.0.1:50051
 It needs PyBullet, which has wheels up to Python 3.11: pip install pybullet
 """
 

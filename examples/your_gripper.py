@@ -1,4 +1,4 @@
-"""Grasps for a gripper of your own, which no weights were trained for.
+"""Grasps for a gripper of your own, given in the request.
 
 usage: python examples/your_gripper.py [ADDRESS]
 
@@ -24,7 +24,7 @@ SMALL: GripperGeometry = {
 }
 
 with GraspClient(*sys.argv[1:]) as client:
-    for gripper in (SMALL, "panda"):  # the latter is the one that the weights were trained for
+    for gripper in (SMALL, "panda"):  # the latter comes with EdgeGrasp
         detection = client.detect(depth_images=[IMAGE], gripper=gripper, top_k=5)
         print("panda:" if gripper == "panda" else "small:")
         for grasp in detection.grasps:

@@ -111,7 +111,7 @@ def detect(
         from edgegrasp_client import on_mask
 
         fields = dict(on_mask(pixels(asked.mask), fields))
-    waiting = Console(stderr=True).status("Looking for grasps…")
+    waiting = Console(stderr=True).status("Looking for grasps; the first run compiles loops…")
     with waiting, open_client(asked) as client:
         detection = client.detect(file, depth_images=images, colors=colors, **fields)
     if as_document:

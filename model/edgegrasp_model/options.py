@@ -604,7 +604,7 @@ class DetectOptions(Strict):
     cloud from which the least of it is hidden"""
     up: Direction | None = None
     """direction away from gravity; any length but zero; null: the support plane's normal; without
-    it estimated in a camera's frame, else +z"""
+    one, an estimate in a camera's frame, else +z"""
     support: SupportChoice = AutoPlane()
     """plane that the objects rest on and the hand stays above; a kind alone is allowed; null:
     none"""

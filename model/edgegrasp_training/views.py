@@ -4,7 +4,7 @@ import json
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import compress
+from itertools import chain, compress
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -118,12 +118,11 @@ def load_view(path: Path) -> LabelledView:
 
 
 def find_views(folders: list[Path]) -> list[Path]:
-    """All view files of some folders, sorted by name; raises FileNotFoundError without any."""
-    paths = [path for folder in folders for path in folder.glob("*.npz")]
-    if not paths:
-        names = ", ".join(str(folder) for folder in folders)
-        raise FileNotFoundError(f"data: no .npz views in {names}. Run edgegrasp generate-data.")
-    return sorted(paths, key=lambda path: path.name)
+    """All view files of some folders, sorted by name; FileNotFoundError: a folder has none."""
+    found = {folder: list(folder.glob("*.npz")) for folder in folders}
+    if empty := ", ".join(str(folder) for folder, paths in found.items() if not paths):
+        raise FileNotFoundError(f"data: no .npz views in {empty}. Run edgegrasp generate-data.")
+    return sorted(chain(*found.values()), key=lambda path: path.name)
 
 
 def scene_of(path: Path) -> str:

@@ -103,9 +103,10 @@ def test_the_python_of_the_pages_runs(start_dummy, tmp_path: Path, monkeypatch) 
     addresses = r"127\.0\.0\.1:50051|unix:/run/edgegrasp/grpc\.sock"
     ran = 0
     with start_dummy("--outcomes-file", "outcomes.jsonl") as server:
-        names = {name: given | {"server": server.http_url} for name in PAGES}
+        names = {name: dict(given) for name in PAGES}
         for name, block in blocks("python"):
             code = re.sub(addresses, server.grpc_address, block)
+            code = code.replace("http://127.0.0.1:8000", server.http_url)
             code = code.replace("(615, 615, 320, 240)", "(60, 60, 15.5, 11.5)")
             compiled = compile(code, f"{name}: {code}", "exec")
             if name in ELSEWHERE or any(text in block for text in COMPILED):

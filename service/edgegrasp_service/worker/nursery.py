@@ -79,7 +79,8 @@ def _loaded(pool: socket.socket, settings: Settings, load: Callable[[Settings], 
     try:
         return load(settings)
     except (EdgeGraspError, ModuleNotFoundError) as error:
-        send(pool, Ready(os.getpid(), [], str(error)))
+        with contextlib.suppress(OSError):  # another worker has told it
+            send(pool, Ready(os.getpid(), [], str(error)))
         sys.exit()
 
 
