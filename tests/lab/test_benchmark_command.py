@@ -192,7 +192,9 @@ LITTLE = {"num_approach_points": 8, "num_candidates": 100}
 def planned(**changes: object) -> PlannedGrasp:
     choice = PlannerFlags(planner="in-process", **changes)
     with open_planner(choice, PAPER, LITTLE) as made:
-        return made.make()(seen_under("edgegrasp"), 3)
+        grasp = made.make()(seen_under("edgegrasp"), 3)
+    assert grasp is not None
+    return grasp
 
 
 def test_a_planner_has_the_weights_and_the_time_of_its_flags(tmp_path: Path) -> None:
