@@ -217,7 +217,7 @@ def test_a_view_in_which_the_arm_touches_the_table_is_told_from_other_errors() -
     pytest.importorskip("roboplan", reason="the extra robot is not installed")
     *_, fields = benchmark_arm("fr3", load_protocol("edgegrasp").camera)
     choice, asked = PlannerFlags(planner="in-process", robot="fr3"), LITTLE | fields
-    fields["robot"]["T_base_cloud"][2][3] += 0.5  # the table, up to the hand
+    fields["robot"]["joints"] = [0.0, 1.3, 0.0, -1.0, 0.0, 2.2, 0.8]  # in the table
     with open_planner(choice, PAPER, asked) as made:
         with pytest.raises(StartCollides, match="support"):
             made.make()(seen_under("edgegrasp"), 3)
