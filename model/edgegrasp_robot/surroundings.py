@@ -26,6 +26,7 @@ MAX_RANGE = 2.0  # metres from the arm's base; farther points are left out
 SELF_DISTANCE = 0.02  # metres; points this near to the arm are the arm itself
 MAX_VOXELS_INSIDE = 10  # voxels of objects that may lie inside the arm, given camera errors
 SUPPORT_SIZE = (6.0, 6.0, 0.5)  # metres, of the support
+LOW_BASE = -0.05  # metres over the support; a lower base does not stand on it
 FOOT_HEIGHT = 0.015  # metres of what is held, at its foot, that may touch what it is put on
 NEAR_HELD = 0.02  # metres from what is held, within which voxels are its own
 GREY = np.ones(4)
@@ -167,15 +168,16 @@ def _standing_in(
 def _slab(scene: Scene, points: object, base: Float64) -> tuple[core.Box, Float64]:
     """The support and its pose T_scene_slab (4, 4), with the arm's base (3,) in the scene frame.
 
-    A slab below the whole plane; of a support that is higher than the base, what is seen of it.
+    A slab below the whole plane; of a support above the base, what is seen of it.
     """
     assert scene.support is not None
     normal, height = np.array(scene.support.normal), float(heights_over(scene.support, base))
     upright = Rotation.align_vectors(normal[None], [[0.0, 0.0, 1.0]])[0].as_matrix()
     size, middle = np.array(SUPPORT_SIZE), np.zeros(3)
-    seen = scene.frame.points(np.asarray(points).reshape(-1, 3)) if height < 0.0 else base[None]
+    low_base = height < LOW_BASE
+    seen = scene.frame.points(np.asarray(points).reshape(-1, 3)) if low_base else base[None]
     seen = seen[np.abs(heights_over(scene.support, seen)) < VOXEL_SIZE]  # NaN is not
-    if height < 0.0 and len(seen):
+    if low_base and len(seen):
         low, high = np.percentile((seen - base) @ upright[:, :2], (0.5, 99.5), axis=0)
         size, middle[:2] = np.array([*(high - low), 2 * VOXEL_SIZE]), (low + high) / 2
     middle[2] = -height - size[2] / 2
@@ -220,7 +222,7 @@ def _voxels(
         plane = np.append(scene.support.normal, -scene.support.offset)
         plane = (plane @ scene.frame.T_canonical_cloud).astype(flat.dtype)
         height = flat @ plane[:3] + plane[3]
-        if heights_over(scene.support, base) < 0.0:  # what is below the support is in its way too
+        if heights_over(scene.support, base) < LOW_BASE:  # what is below is in its way too
             height = np.abs(height)
         kept = np.flatnonzero(height > VOXEL_SIZE / 2)  # NaN is not
     # In cells of the scene's frame, from the arm's base.
