@@ -72,7 +72,6 @@ def running_server(*flags, program=EDGEGRASP[1:], seconds=0.0, **more) -> Iterat
     words = (sys.executable, *program, "serve", "--http-port", "0", "--grpc-port", "0", *flags)
     environment = os.environ | {"DUMMY_SECONDS": str(seconds)}
     with started(*words, env=environment, **more) as process:
-        assert process.stdout is not None
         line = process.stdout.readline()  # empty once the process is gone
         match = READY_LINE.fullmatch(line)
         assert match, f"the server said {line!r}"

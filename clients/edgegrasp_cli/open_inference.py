@@ -32,7 +32,8 @@ from edgegrasp_client.requests import option_of_text, plain_options
 PLATFORM = "edgegrasp"
 VERSION = "1"  # of the tensors' names and meaning
 DTYPES = {"FP32": "<f4", "FP64": "<f8", "UINT16": "<u2", "INT32": "<i4"}
-CONTENT_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents", "UINT16": "uint_contents"}
+CONTENT_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
+CONTENT_FIELDS |= {"UINT16": "uint_contents", "INT32": "int_contents"}
 INPUTS = {"points": ("FP32", [-1, 3]), "depth": ("FP32", [-1, -1]), "intrinsics": ("FP32", [4])}
 OUTPUTS = {  # fields of a Grasp
     "T_cloud_hand": ("FP32", [-1, 4, 4]),  # best first, like all outputs

@@ -42,7 +42,7 @@ def is_rest(address: str) -> bool:
     return address.startswith(("http://", "https://", HTTP_OVER_UNIX))
 
 
-def on_this_machine(address: str) -> bool:
+def is_local(address: str) -> bool:
     """Whether an address is of this machine, which no proxy reaches."""
     local = r"(https?://)?(localhost|127[.\d]*|\[::1\])(:|/|$)|unix:"
     return re.match(local, address) is not None

@@ -135,8 +135,8 @@ def moveit_grasp(
     header = {"stamp": stamp or {"sec": 0, "nanosec": 0}, "frame_id": frame_id}
     return {
         "id": name,
-        "pre_grasp_posture": _posture(joints, grasp.width, header),
-        "grasp_posture": _posture(joints, 0.0, header),
+        "pre_grasp_posture": _posture(joints, grasp.width),
+        "grasp_posture": _posture(joints, 0.0),
         "grasp_pose": {"header": header, "pose": pose_fields(T_cloud_link)},
         "grasp_quality": float(grasp.score),
         "pre_grasp_approach": _translation(approach, approach_distance, header),
@@ -292,9 +292,10 @@ def pose_fields(T: Array) -> Message:
     }
 
 
-def _posture(joints: FingerJoints, opening: float, header: Message) -> Message:
+def _posture(joints: FingerJoints, opening: float) -> Message:
+    # Without a stamp, which would be the time to begin.
     point = {"positions": list(joints.at(opening).values())}
-    return {"header": header, "joint_names": list(joints.names), "points": [point]}
+    return {"joint_names": list(joints.names), "points": [point]}
 
 
 def _translation(direction: Float64, distance: float, header: Message) -> Message:

@@ -13,13 +13,7 @@ from google.protobuf.message import DecodeError, Message
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_camera.arrays import Array
-from edgegrasp_client.connection import (
-    Tls,
-    invalid,
-    on_this_machine,
-    token_metadata,
-    unreachable,
-)
+from edgegrasp_client.connection import Tls, invalid, is_local, token_metadata, unreachable
 from edgegrasp_client.errors import GraspClientError
 from edgegrasp_client.requests import Request, cloud_file
 from edgegrasp_client.results import Answer, Model, StreamAnswer, error_of_kind, field_of, read_as
@@ -48,7 +42,7 @@ class GrpcTransport:
 
     def __init__(self, address: str, token: str | None, tls: Tls | None) -> None:
         self._address = address
-        options = (*CHANNEL_OPTIONS, ("grpc.enable_http_proxy", not on_this_machine(address)))
+        options = (*CHANNEL_OPTIONS, ("grpc.enable_http_proxy", not is_local(address)))
         if tls is None:
             self._channel = grpc.aio.insecure_channel(address, options)
         else:
@@ -181,10 +175,9 @@ def _packed(array: Array) -> bytes:
 
 
 def fill(message: Message, value: object, path: str = "") -> None:
-    """Fill a message, which is the field `path` of a request, from a value as in JSON.
+    """Fill a message, the field `path` of a request, from a value as in JSON.
 
-    Raises:
-        InvalidRequestError: The message cannot hold the value. The server checks everything else.
+    InvalidRequestError: the message cannot hold the value. The server checks everything else.
     """
     message, value = _target(message, value, path)
     if not isinstance(value, Mapping):

@@ -16,7 +16,7 @@ from edgegrasp_client.connection import (
     HTTP_OVER_UNIX,
     Tls,
     invalid,
-    on_this_machine,
+    is_local,
     token_metadata,
     unreachable,
 )
@@ -51,7 +51,7 @@ class RestTransport:
                 headers=dict(token_metadata(token)),
                 verify=_ssl_context(tls),
                 transport=transport,
-                trust_env=not on_this_machine(address),
+                trust_env=not is_local(address),
             )
             if (self._http.base_url.port or 0) > 65535:
                 raise httpx.InvalidURL("no such port")

@@ -69,11 +69,7 @@ class RequestFields(DetectOptions, total=False):
 
 
 class Request:
-    """A cloud or depth images, options, and the arrays that come with them.
-
-    Raises:
-        InvalidRequestError: No cloud or more than one; or an array or option is wrong.
-    """
+    """A cloud or depth images, with options and arrays; InvalidRequestError: a wrong one."""
 
     def __init__(
         self,

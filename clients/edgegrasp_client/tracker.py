@@ -38,6 +38,7 @@ class GraspTracker:
         self._since = 0  # images since others were looked for
         self._score = 0.0  # of the first grasp then
         self._searching = True  # in the request that is to be answered
+        self._reader: threading.Thread | None = None
 
     def follow(
         self, client: GraspClient, images: Iterable[Mapping[str, Any]]
@@ -52,7 +53,10 @@ class GraspTracker:
         """
         latest: queue.Queue[Any] = queue.Queue(1)
         stopped = threading.Event()
-        threading.Thread(target=_read, args=(images, latest, stopped), daemon=True).start()
+        if self._reader is not None:  # it may still wait for an image
+            self._reader.join()
+        self._reader = threading.Thread(target=_read, args=(images, latest, stopped), daemon=True)
+        self._reader.start()
         try:
             while (image := latest.get()) is not None:
                 if isinstance(image, Exception):

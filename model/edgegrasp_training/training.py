@@ -50,11 +50,7 @@ class Trainer:
         teacher: examples.Teacher | None = None,  # scores further candidates to learn from
         start: Path | None = None,  # weights to start from; None: random ones
     ) -> None:
-        """Set up, and resume from the folder's last state if there is one.
-
-        Raises:
-            ValueError: The options do not fit the network or the last state.
-        """
+        """Set up, or resume from the folder's last state; ValueError: the options do not fit."""
         if teacher is not None and metadata.network.architecture == "hand":
             raise ValueError(f"teacher: {metadata.name} learns from labels alone. Name none.")
         self.teacher = teacher

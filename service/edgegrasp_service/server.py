@@ -40,11 +40,7 @@ REPEAT_SECONDS = 10.0  # seconds between log lines about the same socket error
 
 
 class Server:
-    """Both transports of one service. Must be created in the running event loop.
-
-    Raises:
-        InvalidSettings: A certificate, a token or another file of the settings cannot be used.
-    """
+    """Both transports of a service, made in the running loop; InvalidSettings: a file is wrong."""
 
     def __init__(self, settings: Settings, nursery: Nursery | None = None) -> None:
         self._settings = settings

@@ -153,7 +153,6 @@ def test_a_scene_is_viewed_until_ctrl_c(tmp_path: Path, refused) -> None:
     np.save(color, np.full((4, 6, 3), 90, np.uint8))
     flags = ("--depth", depth, "--color", color, "--intrinsics", "30,30,3,2", "--no-browser")
     with started(*EDGEGRASP, "view", *flags) as viewer:
-        assert viewer.stdout is not None
         address = viewer.stdout.readline().split()[0]
         sample = httpx.get(f"{address}samples/samples.json").json()[0]
         assert sample["intrinsics"] == "30,30,3,2"

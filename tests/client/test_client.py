@@ -106,8 +106,8 @@ def test_every_option_goes_through_and_none_is_its_default(client, cloud) -> Non
     assert len(alone["top_k"].grasps) == 3
     assert_same(client.detect(cloud, **dict.fromkeys(ALL_OPTIONS)), client.detect(cloud))
     coded = {"kind": "mask", "mask": b64encode(np.arange(500) % 2 == 0).decode()}
-    same = client.detect(cloud, approach_region={"include": [coded]})
-    assert_same(same, alone["approach_region"])
+    region = {"include": [coded]}
+    assert_same(client.detect(cloud, approach_region=region), alone["approach_region"])
 
 
 def test_models_and_readiness(client) -> None:

@@ -64,7 +64,6 @@ def test_the_wheel_alone_serves(built: tuple[Path, Path], tmp_path: Path) -> Non
     command = [str(new / "bin/edgegrasp"), "serve", "--http-port=0", "--grpc-port=0", "--workers=1"]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     with started(*command, cwd=tmp_path, env=environment) as server:
-        assert server.stdout is not None
         _, _, _, url, _, address = server.stdout.readline().split()
         document = httpx.get(f"{url}/openapi.json").json()
         with GraspClient(address) as client:

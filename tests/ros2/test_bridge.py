@@ -258,15 +258,29 @@ def test_a_mask_is_of_the_image_it_was_made_of_and_grows_old() -> None:
 
 
 def test_images_of_several_cameras_are_one_cloud(asked) -> None:
-    inbox, aside = Inbox(), make_image(DEPTH)
+    aside, other = make_image(DEPTH), SIZE | {"header": HEADER | {"frame_id": "link8"}}
     aside.header.frame_id = "link8"
-    inbox.take("camera", CAMERA, 0.0)
-    for image in (aside, make_image(DEPTH)):
-        inbox.take("depth", image, 0.0)
-    detect(asked, inbox.scene(0.0))
-    poses = [image["T_cloud_camera"] for image in asked.given["depth_images"]]
-    expected = [np.eye(4), np.linalg.inv(T_base_camera) @ PANDA_LINK8]
-    np.testing.assert_allclose(poses, expected, atol=1e-12)
+    aside.header.stamp.sec = 11
+    images, inbox = [aside, make_image(DEPTH)], Inbox()
+    tf2 = Mock(side_effect=lambda target, source, _: np.linalg.inv(FRAMES[target]) @ FRAMES[source])
+    for camera in (CAMERA, sent("sensor_msgs/msg/CameraInfo", other | {"p": PROJECTION})):
+        inbox.take("camera", camera, 0.0)
+    for last in (aside, images[1]):  # the cloud's frame is the same
+        for image in (*images, last):
+            inbox.take("depth", image, 0.0)
+        bridge.detect(asked, inbox.scene(0.0), Settings(gravity_frame="base"), {}, tf2)
+        asked_for = {(*each.args[:2], each.args[2].sec) for each in tf2.call_args_list}
+        assert {("base", "camera", 12), ("base", "link8", 11)} < asked_for
+        poses = [image["T_cloud_camera"] for image in asked.given["depth_images"]]
+        expected = [np.eye(4), np.linalg.inv(T_base_camera) @ PANDA_LINK8]
+        np.testing.assert_allclose(poses, expected, atol=1e-12)
+
+
+def test_an_image_may_be_a_part_of_the_sensor_s_binned() -> None:
+    part = {"binning_x": 2, "binning_y": 2, "roi": {"x_offset": 4, "y_offset": 2}}
+    info = sent("sensor_msgs/msg/CameraInfo", SIZE | part | {"p": PROJECTION})
+    expected = [[30, 0, 5.75], [0, 30, 4.75], [0, 0, 1]]
+    np.testing.assert_allclose(bridge.camera_matrix(info), expected)
 
 
 def test_every_option_is_a_parameter(client, cloud) -> None:

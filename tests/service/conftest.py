@@ -246,7 +246,6 @@ def nursery(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, ...
     environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
     environment["PYTHONPATH"] = os.pathsep.join(sys.path)
     with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == b"ready\n"
         yield (sys.executable, "-ISc", ASK, path)
         process.kill()

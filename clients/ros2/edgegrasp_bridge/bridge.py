@@ -15,7 +15,7 @@ import numpy as np
 
 from edgegrasp_camera.arrays import Array, Float64
 from edgegrasp_camera.clouds import read_point_cloud2
-from edgegrasp_camera.depth import intrinsics_of, metres, unproject
+from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
 from edgegrasp_camera.picture import fork
 from edgegrasp_client import GraspClient, GraspClientError, GraspTracker, Robot, conversions
 from edgegrasp_client.conversions import Message, pose_fields, xyz_fields
@@ -145,17 +145,20 @@ class Inbox:
             same = [each for each in sources if each.header.stamp == its]
             if not same:
                 raise ValueError("No image has the stamp of the mask. Copy the image's header.")
-            source = same[-1]
+            source = max(same, key=lambda each: each.header.frame_id == mask.header.frame_id)
         if clouds:
             return Scene(cloud=source, mask=mask, joints=self._joints)
-        latest = {each.header.frame_id: each for each in sources} if mask is None else {}
-        latest.pop(source.header.frame_id, None)
-        others = tuple((each, self._camera_of(each)) for each in latest.values())
+        latest = {each.header.frame_id: each for each in (sources if mask is None else [source])}
+        # The first one's frame is the answer's, which must not change from image to image.
+        source, *more = (latest[frame] for frame in sorted(latest))
+        others = tuple((each, self._camera_of(each)) for each in more)
         return Scene(None, source, self._camera_of(source), mask, others, self._joints)
 
     def _camera_of(self, depth: Any) -> Any:
-        """The CameraInfo of an image: that of its frame, or the only one."""
-        only = next(iter(self._cameras.values())) if len(self._cameras) == 1 else None
+        """The CameraInfo of an image: that of its frame, or the only one of the only camera."""
+        frames = {each.header.frame_id for each in list(self._sources["depth"])}
+        alone = len(self._cameras) == len(frames) == 1
+        only = next(iter(self._cameras.values())) if alone else None
         return self._cameras.get(depth.header.frame_id, only)
 
 
@@ -203,12 +206,13 @@ def detect(
         asked["robot"] = _robot(client, asked["robot"], scene, lookup)
     cloud = scene.cloud
     if object_cloud is not None:
-        T = lookup(frame_id, object_cloud.header.frame_id, stamp)
-        wanted = _points(Scene(cloud=object_cloud)) @ T[:3, :3].T + T[:3, 3]
-        cloud, asked["segment_ids"] = object_in_scene(wanted, _points(scene))
+        T = _pose_at(object_cloud.header, scene, settings, lookup)
+        of_object = _points(Scene(cloud=object_cloud), settings, lookup)
+        wanted = of_object @ T[:3, :3].T + T[:3, 3]
+        cloud, asked["segment_ids"] = object_in_scene(wanted, _points(scene, settings, lookup))
         asked.setdefault("viewpoint", [0.0, 0.0, 0.0])
     elif cloud is None:
-        asked["depth_images"] = _depth_images(scene, lookup)
+        asked["depth_images"] = _depth_images(scene, settings, lookup)
     try:
         found = client.detect(cloud, **asked)
     except GraspClientError:  # perhaps its robots are others now
@@ -328,10 +332,9 @@ def image_array(image: Any, known: Collection[str] = ENCODINGS) -> Array:
 
 
 def camera_matrix(camera: Any) -> Float64:
-    """The (3, 3) matrix of a rectified image: that of `p`, or `k` where there is no `p`.
+    """The (3, 3) matrix of a rectified image, cut out and binned, by `p`, or `k` if `p` is 0.
 
-    Raises:
-        ValueError: No CameraInfo has come, or one of a camera that is not calibrated.
+    ValueError: no CameraInfo has come, or one of a camera that is not calibrated.
     """
     if camera is None:
         raise ValueError("The depth image has no CameraInfo yet.")
@@ -339,7 +342,8 @@ def camera_matrix(camera: Any) -> Float64:
     matrix = projection if projection[0, 0] else np.asarray(camera.k, np.float64).reshape(3, 3)
     if not matrix[0, 0]:
         raise ValueError("camera_info: p and k are 0. Calibrate the camera.")
-    return matrix
+    cut = matrix - [[0, 0, camera.roi.x_offset], [0, 0, camera.roi.y_offset], [0, 0, 0]]
+    return np.asarray(cut / [[max(camera.binning_x, 1)], [max(camera.binning_y, 1)], [1]])
 
 
 def matrix_of(transform: Any) -> Float64:
@@ -374,13 +378,20 @@ def _robot(
     return {"joints": joints, "T_base_cloud": T_base_cloud.ravel().tolist(), **given}
 
 
-def _depth_images(scene: Scene, lookup: Lookup) -> list[dict[str, Any]]:
+def _pose_at(header: Any, scene: Scene, settings: Settings, lookup: Lookup) -> Float64:
+    """T_scene_frame (4, 4) of a header's frame, each where it was when its message was made."""
+    level = "" if settings.gravity_frame == "none" else settings.gravity_frame
+    still = settings.target_frame or level or scene.header.frame_id
+    T_still_scene = lookup(still, scene.header.frame_id, scene.header.stamp)
+    return np.linalg.inv(T_still_scene) @ lookup(still, header.frame_id, header.stamp)
+
+
+def _depth_images(scene: Scene, settings: Settings, lookup: Lookup) -> list[dict[str, Any]]:
     """The images of a scene with their cameras, whose poses are in the frame of its header."""
     images: list[dict[str, Any]] = []
     for depth, camera in ((scene.depth, scene.camera), *scene.others):
         image = {"depth": image_array(depth, DEPTH_ENCODINGS), "intrinsics": camera_matrix(camera)}
-        pose = lookup(scene.header.frame_id, depth.header.frame_id, depth.header.stamp)
-        images.append(image | {"T_cloud_camera": pose})
+        images.append(image | {"T_cloud_camera": _pose_at(depth.header, scene, settings, lookup)})
     return images
 
 
@@ -397,9 +408,10 @@ def _from_frames(scene: Scene, settings: Settings, lookup: Lookup) -> dict[str, 
     return asked
 
 
-def _points(scene: Scene) -> Any:
-    """Points (N, 3) or (H, W, 3) of the scene's cloud, or else of its depth image; own frame."""
+def _points(scene: Scene, settings: Settings, lookup: Lookup) -> Any:
+    """Points (N, 3) or (H, W, 3) of the scene's cloud, or of its depth images; own frame."""
     if scene.cloud is not None:
         return read_point_cloud2(scene.cloud).points
-    camera = intrinsics_of(camera_matrix(scene.camera))
-    return unproject(metres(image_array(scene.depth, DEPTH_ENCODINGS)), camera)
+    images = _depth_images(scene, settings, lookup)
+    views = [DepthView(intrinsics_of(one["intrinsics"]), one["T_cloud_camera"]) for one in images]
+    return fuse_depth_images([one["depth"] for one in images], views).points

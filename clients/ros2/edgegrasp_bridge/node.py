@@ -2,7 +2,7 @@
 """The node: rclpy around `bridge`, and nothing that could be tested without it."""
 
 import importlib
-from contextlib import suppress
+from contextlib import closing, suppress
 from functools import partial
 from typing import Any
 
@@ -45,7 +45,7 @@ class EdgeGraspNode(Node):
         for name, default in bridge.parameters().items():
             self.declare_parameter(name, default, dynamic)
         settings, _ = self._read()
-        self._client = GraspClient(settings.server, timeout=settings.timeout)
+        self.client = GraspClient(settings.server, timeout=settings.timeout)
         self._inbox = bridge.Inbox()
         self._followed, self._tracker = {}, GraspTracker()  # options, and the tracker made of them
         self._buffer = Buffer()
@@ -101,7 +101,7 @@ class EdgeGraspNode(Node):
         tracker = self._tracker if follow else None
         scene = self._inbox.scene(0.0 if object_cloud is not None else settings.mask_age)
         found = bridge.detect(
-            self._client, scene, settings, options, self._lookup, object_cloud, tracker
+            self.client, scene, settings, options, self._lookup, object_cloud, tracker
         )
         for warning in found.warnings:
             self.get_logger().warning(warning)
@@ -148,8 +148,8 @@ def main() -> None:
     """Run the node."""
     rclpy.init()
     executor = MultiThreadedExecutor()
-    executor.add_node(EdgeGraspNode())
-    with suppress(KeyboardInterrupt, ExternalShutdownException):
+    executor.add_node(node := EdgeGraspNode())
+    with suppress(KeyboardInterrupt, ExternalShutdownException), closing(node.client):
         executor.spin()
 
 
