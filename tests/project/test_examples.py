@@ -26,7 +26,7 @@ def test_demo_prints_ranked_grasps_of_both_transports_and_writes_a_picture(tmp_p
     assert ranked.findall(grpc_table) == ranked.findall(rest_table)
     assert "the same grasps" in shown
     assert re.search(
-        r"Executed the best one in the simulator: it (held|did not hold)\\.", rest_table
+        r"Executed the best one in the simulator: it (held|did not hold)\.", rest_table
     )
     assert (tmp_path / "grasps.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "scene.ply").read_bytes().startswith(b"ply\n")
