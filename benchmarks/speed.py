@@ -135,7 +135,7 @@ def simulator() -> list[dict[str, Any]]:
             simulation.reset(kind, np.random.default_rng(seed))
             camera, noise, choice = (np.random.default_rng([seed, k]) for k in range(3))
             observation = simulation.observe_from(EVALUATION_VIEWS.sample(camera), noise)
-            query = observation, request(observation), "ideal"
+            query = observation, request(observation)
             view, _ = label(simulation, query, options, choice, None)
             labelled = time.process_time()
             RoundDriver(simulation, kind, protocol, seed=seed, index=0).run(plan)

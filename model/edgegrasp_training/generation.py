@@ -75,8 +75,7 @@ MAX_NOISE = 0.004  # metres
 FREE_SHARE = 0.75  # of the grasps chosen at random, those that are collision-free
 LIKELY, LIKELY_SHARE = 1 / 3, 0.7  # best part of an object's grasps, most of which are tried there
 
-# A view of a scene, a request for grasps in it, and the kind of depth camera.
-Query = tuple[Observation, DetectOptions, str]
+Query = tuple[Observation, DetectOptions]  # a view of a scene, and a request for grasps in it
 detector = lru_cache(maxsize=2)(GraspDetector.load)  # loads weights once in a process
 USUAL = WEIGHTS_FOLDER / "edgegrasp-plus.safetensors"  # prepares views without a guide
 
@@ -205,12 +204,13 @@ def _views(
             failures = 0
         models = [model.origin or model for model in simulation.object_models]
         cameras, guided = seen_from.sample(camera), guide is not None
-        query = ask(simulation, kind, cameras, noise, choice, guided=guided)
+        query, sensor = ask(simulation, kind, cameras, noise, choice, guided=guided)
         view, best = label(simulation, query, options, choice, guide)
         yield replace(
             view,
             gripper="" if hand is None else json.dumps(hand),
             engine=simulation.world.name,
+            sensor=sensor,
             objects=tuple(model.name for model in models),
             object_digests=tuple(model.digest for model in models),
         )
@@ -227,7 +227,7 @@ def ask(
     choice: np.random.Generator,  # of the rest of the request
     *,
     guided: bool,  # whether a network clears the scene, and has to be asked as a robot asks it
-) -> Query:
+) -> tuple[Query, str]:
     """Observe the scene and make a request like a benchmark's, unless guided for a few balls only.
 
     In bins, on tables and in some other views the cloud holds all that the camera sees, and the
@@ -257,7 +257,7 @@ def ask(
         "collision": {"mode": "avoid" if guided else "penalise"},
         "gripper": simulation.gripper,
     }
-    return observation, DetectOptions.model_validate(request), sensor
+    return (observation, DetectOptions.model_validate(request)), sensor
 
 
 def _plane(rng: np.random.Generator) -> SupportPlane:
@@ -293,7 +293,7 @@ def label(
     guide: GraspDetector | None,  # guides the choice
 ) -> tuple[LabelledView, Float32 | None]:
     """Sample candidates as the detector does and try some; also the guide's best hand (4, 4)."""
-    observation, _, sensor = query
+    observation, _ = query
     found = choose_grasps(query, options, rng, guide)
     if found is None:
         nothing, rows = np.empty((0, 3), dtype=np.float32), np.empty(0, dtype=np.int64)
@@ -324,7 +324,6 @@ def label(
         at_side=scene.at_side[kept],
         object_of_point=scene.object_of_point[kept].astype(np.int16),
         targets=np.array(targets, np.str_),
-        sensor=sensor,
     )
     return view, None if best is None else T_world_hand[best]
 
@@ -336,7 +335,7 @@ def choose_grasps(
 
     The last is the row of the guide's best among them.
     """
-    observation, request, _ = query
+    observation, request = query
     if len(observation.cloud) < (request.num_approach_points or 1):
         return None
     prepared = (guide or detector(USUAL)).prepare(observation.cloud, request)
