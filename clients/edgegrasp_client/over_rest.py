@@ -39,19 +39,20 @@ class RestTransport:
     """Posts over connections that are kept open; raises GraspClientErrors."""
 
     def __init__(self, address: str, token: str | None, tls: Tls | None) -> None:
-        self._address, transport = address, None
+        self._address, socket, transport = address, None, None
         if tls is not None and not address.startswith("https:"):
             raise invalid("tls", f"a Tls for {address}", "Give an https:// address.")
         if address.startswith(HTTP_OVER_UNIX):
-            transport = httpx.AsyncHTTPTransport(uds=address.removeprefix(HTTP_OVER_UNIX))
-            address = "http://localhost"
+            socket, address = address.removeprefix(HTTP_OVER_UNIX), "http://localhost"
+        context = _ssl_context(tls)
+        if is_local(address):  # a transport of its own asks no proxy
+            transport = httpx.AsyncHTTPTransport(verify=context, uds=socket)
         try:
             self._http = httpx.AsyncClient(
                 base_url=address,
                 headers=dict(token_metadata(token)),
-                verify=_ssl_context(tls),
+                verify=context,
                 transport=transport,
-                trust_env=not is_local(address),
             )
             if (self._http.base_url.port or 0) > 65535:
                 raise httpx.InvalidURL("no such port")

@@ -38,7 +38,8 @@ class GraspTracker:
         self._since = 0  # images since others were looked for
         self._score = 0.0  # of the first grasp then
         self._searching = True  # in the request that is to be answered
-        self._reader: threading.Thread | None = None
+        self._reader: threading.Thread | None = None  # of `_images`
+        self._images: object = None
 
     def follow(
         self, client: GraspClient, images: Iterable[Mapping[str, Any]]
@@ -53,8 +54,9 @@ class GraspTracker:
         """
         latest: queue.Queue[Any] = queue.Queue(1)
         stopped = threading.Event()
-        if self._reader is not None:  # it may still wait for an image
+        if self._reader is not None and images is self._images:  # it may still wait for one
             self._reader.join()
+        self._images = images
         self._reader = threading.Thread(target=_read, args=(images, latest, stopped), daemon=True)
         self._reader.start()
         try:
