@@ -117,9 +117,10 @@ def places_for(
 
     Neither voxels nor the support, into which its foot would be pressed.
     """
+    T_cloud_base = np.linalg.inv(T_base_cloud)
+    in_box = moved(np.linalg.inv(load.T_base_box), load.points)
     for pose in _places(place, load):
-        T_cloud_base = np.linalg.inv(T_base_cloud) @ pose @ np.linalg.inv(load.T_base_box)
-        foot = _lowest(scene, moved(T_cloud_base, load.points)) - load.below
+        foot = _lowest(scene, moved(T_cloud_base @ pose, in_box)) - load.below
         if foot < -RELEASE_HEIGHT:
             if place.region is None or foot < -FOOT_HEIGHT:
                 continue

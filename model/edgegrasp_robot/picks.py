@@ -96,7 +96,8 @@ def plan_picks(
         moves, waiting = asked.plan == "motion", iter(grasps)
         missing = options.top_k
         while missing > 0 and time.monotonic() < until:
-            tried = arm.reach_some(waiting, missing + (EXTRA_GRASPS if moves else 0))
+            half = (time.monotonic() + until) / 2 if moves else until  # the rest for motions
+            tried = arm.reach_some(waiting, missing + (EXTRA_GRASPS if moves else 0), half)
             if not tried:
                 break
             failures.update(pick.outcome for pick in tried)
@@ -155,7 +156,7 @@ class _Arm:
         self._robot, self._scene, self._options, self._around = robot, scene, options, around
         self._place, self._objects = asked.place, {one.number: one for one in objects}
         self._until, self._path_seconds = until, PATH_SECONDS
-        self._without_place: set[int | None] = set()  # numbers of objects
+        self._without_place: set[int] = set()  # numbers of objects
         self._start = np.array(asked.joints)
         self._start_x = robot.hand_pose(self._start)[:3, 0]
         near = np.maximum(robot.lower, self._start - np.pi)
@@ -170,10 +171,9 @@ class _Arm:
             value = f"a region where up is {self._up.round(2).tolist()} in the base frame"
             raise InvalidRequest("options.robot.place.region", value, fix)
 
-    def reach_some(self, grasps: Iterator[Grasp], wanted: int) -> list[_Pick]:
-        """The next picks, as many as it takes for some to be within reach."""
+    def reach_some(self, grasps: Iterator[Grasp], wanted: int, until: float) -> list[_Pick]:
+        """The next picks, as many as it takes for some to be within reach, or time allows."""
         picks: list[_Pick] = []
-        until = (time.monotonic() + self._until) / 2  # the rest is for motions
         while wanted > 0 and time.monotonic() < until and (grasp := next(grasps, None)):
             picks.append(self._reach_either_way(grasp))
             wanted -= picks[-1].outcome == "reachable"
@@ -274,7 +274,8 @@ class _Arm:
         voxels = moved(around.T_base_scene, around.voxels)
         places = places_for(place, load, voxels, self._scene, self._T_base_cloud)
         if (first := next(places, None)) is None:
-            self._without_place |= {grasp.object} - {None}
+            if grasp.object is not None:
+                self._without_place.add(grasp.object)
             return None
         T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand
         T_box_hand = np.linalg.inv(load.T_base_box) @ T_base_hand

@@ -174,12 +174,12 @@ def _slab(scene: Scene, points: object, base: Float64) -> tuple[core.Box, Float6
     normal, height = np.array(scene.support.normal), float(heights_over(scene.support, base))
     upright = Rotation.align_vectors(normal[None], [[0.0, 0.0, 1.0]])[0].as_matrix()
     size, middle = np.array(SUPPORT_SIZE), np.zeros(3)
-    low_base = height < LOW_BASE
-    seen = scene.frame.points(np.asarray(points).reshape(-1, 3)) if low_base else base[None]
-    seen = seen[np.abs(heights_over(scene.support, seen)) < VOXEL_SIZE]  # NaN is not
-    if low_base and len(seen):
-        low, high = np.percentile((seen - base) @ upright[:, :2], (0.5, 99.5), axis=0)
-        size, middle[:2] = np.array([*(high - low), 2 * VOXEL_SIZE]), (low + high) / 2
+    if height < LOW_BASE:
+        seen = scene.frame.points(np.asarray(points).reshape(-1, 3))
+        seen = seen[np.abs(heights_over(scene.support, seen)) < VOXEL_SIZE]  # NaN is not
+        if len(seen):
+            low, high = np.percentile((seen - base) @ upright[:, :2], (0.5, 99.5), axis=0)
+            size, middle[:2] = np.array([*(high - low), 2 * VOXEL_SIZE]), (low + high) / 2
     middle[2] = -height - size[2] / 2
     return core.Box(*size), pose_matrix(upright, base + upright @ middle)
 
