@@ -114,16 +114,16 @@ def detect(
     waiting = Console(stderr=True).status("Looking for grasps; the first run compiles loops…")
     with waiting, open_client(asked) as client:
         detection = client.detect(file, depth_images=images, colors=colors, **fields)
-    if as_document:
-        text = json.dumps(detection, default=plain)
-        print(json.dumps(json.loads(text, parse_constant=lambda _: None)))  # NaN is null
-    else:
-        _print_detection(detection)
     if asked.picture is not None:
         sent, _ = decoded(file, {"depth_images": images})
         draw_detection(asked.picture, detection, sent, fields, colors)
     if asked.trajectory is not None:
         _write_trajectory(asked.trajectory, detection)
+    if as_document:
+        text = json.dumps(detection, default=plain)
+        print(json.dumps(json.loads(text, parse_constant=lambda _: None)))  # NaN is null
+    else:
+        _print_detection(detection)
 
 
 @takes_flags()
