@@ -38,14 +38,7 @@ from benchmarks import serve_dummy
 from benchmarks.measuring import RESULTS, memory, write_results
 
 from edgegrasp_camera.arrays import Float32
-from edgegrasp_client import (
-    AsyncGraspClient,
-    Detection,
-    GraspClient,
-    GraspClientError,
-    InvalidRequestError,
-    StreamRequest,
-)
+from edgegrasp_client import AsyncGraspClient, Detection, GraspClient, StreamRequest, errors
 from edgegrasp_client.connection import Addresses, local_server
 
 ANSWERED = "answered"
@@ -78,8 +71,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     os.environ["DUMMY_SECONDS"] = "0.002"
-    dummy = [sys.executable, "-P", serve_dummy.__file__]
-    with local_server(*FLAGS, program=dummy) as server:
+    with local_server(*FLAGS, program=[sys.executable, "-P", serve_dummy.__file__]) as server:
         results = run(server, given.clients, given.minutes * 60, given.seed)
         process = psutil.Process(server.pid)
         process.terminate()
@@ -180,9 +172,9 @@ async def outcome(client: AsyncGraspClient, way: str, plan: Plan) -> str:
         return ANSWERED if mine else "another cloud's answer"
     except TimeoutError:
         return CANCELLED
-    except InvalidRequestError:
+    except errors.InvalidRequestError:
         return REFUSED
-    except GraspClientError as error:
+    except errors.GraspClientError as error:
         return type(error).__name__
 
 

@@ -110,23 +110,15 @@ class View:
 
 
 class Picture:
-    """A picture of a cloud; later drawings cover earlier ones.
-
-    Args:
-        view: The camera.
-        points: (N, 3) metres, cloud frame; NaN where there is no reading.
-        colors: (N, 3) uint8, or None.
-        image: (H, W, 3) uint8 of the camera; None: the cloud itself is drawn.
-        title: A line below the picture.
-    """
+    """A picture of a cloud; later drawings cover earlier ones."""
 
     def __init__(
         self,
-        view: View,
-        points: ArrayLike,
-        colors: NDArray[np.uint8] | None = None,
-        image: NDArray[np.uint8] | None = None,
-        title: str = "",
+        view: View,  # the camera
+        points: ArrayLike,  # (N, 3) metres, cloud frame; NaN where there is no reading
+        colors: NDArray[np.uint8] | None = None,  # (N, 3)
+        image: NDArray[np.uint8] | None = None,  # (H, W, 3) of the camera; None: draw the cloud
+        title: str = "",  # a line below the picture
     ) -> None:
         from matplotlib.figure import Figure
 

@@ -24,7 +24,6 @@ from typing_extensions import Unpack
 from edgegrasp_camera.arrays import Array
 from edgegrasp_client import errors
 from edgegrasp_client.connection import RETRIES, Tls, invalid, is_rest, retry_delay, seconds_of
-from edgegrasp_client.errors import GraspClientError
 from edgegrasp_client.over_grpc import GrpcTransport
 from edgegrasp_client.over_rest import RestTransport
 from edgegrasp_client.requests import Cloud, Request, RequestFields, StreamRequest
@@ -179,7 +178,7 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
     def _seconds(self, timeout: float | None) -> float:
         """The timeout of a call; raises GraspClientError if it cannot be made any more."""
         if self._closed:
-            raise GraspClientError(CLOSED)
+            raise errors.GraspClientError(CLOSED)
         return self._timeout if timeout is None else seconds_of(timeout)
 
     async def _retried(
@@ -299,7 +298,7 @@ def _run(work: Coroutine[Any, Any, Answer]) -> Answer:
     try:
         return running.result()
     except CancelledError:  # by close() in another thread
-        raise GraspClientError(CLOSED) from None
+        raise errors.GraspClientError(CLOSED) from None
     except BaseException:
         running.cancel()
         raise

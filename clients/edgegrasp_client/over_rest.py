@@ -20,7 +20,6 @@ from edgegrasp_client.connection import (
     token_metadata,
     unreachable,
 )
-from edgegrasp_client.errors import GraspClientError
 from edgegrasp_client.requests import Request, cloud_file, npy_bytes
 from edgegrasp_client.results import Answer, StreamAnswer, error_of_kind, read_as
 from edgegrasp_results import Detection
@@ -82,9 +81,8 @@ class RestTransport:
         """An answer to each of the named requests with their timeouts, one after the other."""
         async for name, request, seconds in requests:
             try:
-                call, read = call_of(request), partial(read_as, Detection)
-                yield StreamAnswer(name, await self._call(read, call, seconds))
-            except GraspClientError as error:
+                yield StreamAnswer(name, await self.ask(Detection, request, seconds))
+            except errors.GraspClientError as error:
                 yield StreamAnswer(name, error=error)
 
     async def ready(self, timeout: float) -> bool:
@@ -174,14 +172,14 @@ def _base64(value: object) -> str:
     raise TypeError(f"a {type(value).__name__} is not a JSON value")
 
 
-def _described(problem: Mapping[str, Any]) -> GraspClientError:
+def _described(problem: Mapping[str, Any]) -> errors.GraspClientError:
     """The exception for a server's problem document; raises KeyError for another one's."""
     said = (problem[name] for name in ("detail", "field", "value", "fix"))
     kind = problem["type"].removeprefix(KIND_PREFIX)
     return error_of_kind(kind, *said, retry_after=problem["retry_after"])
 
 
-def _foreign(response: httpx.Response) -> GraspClientError:
+def _foreign(response: httpx.Response) -> errors.GraspClientError:
     """The exception for an answer from something else, such as a proxy."""
     status, retry_after = response.status_code, response.headers.get("retry-after", "")
     seconds = float(retry_after) if retry_after.isdecimal() else None  # it may also be a date

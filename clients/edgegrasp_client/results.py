@@ -10,7 +10,6 @@ import numpy as np
 
 from edgegrasp_camera.arrays import Float64
 from edgegrasp_client import errors
-from edgegrasp_client.errors import GraspClientError
 from edgegrasp_results import ArmTrajectory, Detection
 
 
@@ -56,7 +55,7 @@ class StreamAnswer:
 
     request_id: str
     detection: Detection | None = None
-    error: GraspClientError | None = None
+    error: errors.GraspClientError | None = None
 
     def result(self) -> Detection:
         """The detection; raises the error where there is none."""
@@ -130,7 +129,7 @@ def _value(hint: Any) -> Callable[[Any], Any]:
 
 
 # Kinds of errors that a server reports; the last of some are gRPC's codes, as a proxy sends them.
-_KINDS: dict[type[GraspClientError], tuple[str, ...]] = {
+_KINDS: dict[type[errors.GraspClientError], tuple[str, ...]] = {
     errors.InvalidRequestError: (
         *("invalid-request", "unsupported-media-type", "headers-too-large", "harmful-request"),
         "invalid-argument",
@@ -149,7 +148,7 @@ _KINDS: dict[type[GraspClientError], tuple[str, ...]] = {
 
 def error_of_kind(
     kind: str, message: str, *where: str, retry_after: float | None = None
-) -> GraspClientError:
+) -> errors.GraspClientError:
     """The exception for an error reported by the server; `where`: field, value and fix."""
     error = next((one for one, kinds in _KINDS.items() if kind in kinds), errors.ProtocolError)
     if issubclass(error, errors.OverloadedError) and retry_after is not None:

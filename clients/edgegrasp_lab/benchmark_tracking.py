@@ -199,7 +199,10 @@ def benchmark_tracking(
     output.mkdir(parents=True, exist_ok=True)
     (output / "results.json").write_text(json.dumps(rows, indent=1) + "\n")
     _plot(output / "jitter.svg", done)
-    _print(rows)
+    table = Table("", *next(iter(rows.values()), {}), box=None)
+    for label, row in rows.items():
+        table.add_row(label, *("-" if value is None else f"{value:.4g}" for value in row.values()))
+    Console(width=130, markup=False, emoji=False).print(table)
 
 
 def follow(client: Any, scene: Scene, seconds: float, clock: Callable[[], float]) -> Followed:
@@ -256,14 +259,13 @@ def summary(done: list[Followed]) -> dict[str, Any]:
     """Figures over some scenes: medians and 95 %, and how many grasps held an object."""
     off = np.array([each for one in done for each in one.off]).reshape(-1, 3)
     latency = 1000 * np.array([each for one in done for each in one.latency])
-    measured = {"mm": off[:, 1], "degrees": off[:, 2], "ms": latency}
     return {
         "scenes": len(done),
         "images": len(latency),
         "switches": sum(one.switches for one in done),
         **{
             f"{name}_{share}": float(np.percentile(values, share)) if len(values) else None
-            for name, values in measured.items()
+            for name, values in {"mm": off[:, 1], "degrees": off[:, 2], "ms": latency}.items()
             for share in (50, 95)
         },
         **{name: sum(one.success[name] for one in done) for name in done[0].success},
@@ -280,14 +282,6 @@ def simulated(objects: Path | None, motion: Motion, rounds: int) -> Iterator[Sim
             rng = np.random.default_rng(number)
             if simulation.reset(kind, rng, num_objects=OBJECTS):
                 yield SimulatedScene(simulation, motion, rng)
-
-
-def _print(rows: dict[str, dict[str, Any]]) -> None:
-    """A row of figures for each motion or recorded scene."""
-    table = Table("", *next(iter(rows.values()), {}), box=None)
-    for label, row in rows.items():
-        table.add_row(label, *("-" if value is None else f"{value:.4g}" for value in row.values()))
-    Console(width=130, markup=False, emoji=False).print(table)
 
 
 def _plot(path: Path, done: dict[str, list[Followed]]) -> None:

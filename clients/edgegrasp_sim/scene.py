@@ -10,21 +10,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float64
+from edgegrasp_sim import surroundings as fixed
 from edgegrasp_sim.engine import TIME_STEP, Body, Vector, World
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import about_z
-from edgegrasp_sim.surroundings import (
-    DEEP_BIN_INSIDE,
-    MIDDLE,
-    SIZE,
-    SMALL_BIN_INSIDE,
-    TABLE_HEIGHT,
-    Box,
-    Surroundings,
-    random_bin,
-    random_shelf,
-    random_table,
-)
+from edgegrasp_sim.surroundings import MIDDLE, SIZE, TABLE_HEIGHT, Box, Surroundings
 
 # The usual range of the factor on the objects' sizes, by the kind whose objects they are.
 SCALES = {SceneKind.PACKED: (0.7, 0.8), SceneKind.PILE: (0.8, 1.0)}
@@ -229,9 +219,9 @@ def _put_down(
 STANDING_IN: dict[SceneKind, tuple[MakeSurroundings | None, MakeObjects]] = {
     SceneKind.PACKED: (None, make_packed),
     SceneKind.PILE: (None, make_pile),
-    SceneKind.BIN: (random_bin, make_bin),
-    SceneKind.FULL_BIN: (partial(random_bin, extents=SMALL_BIN_INSIDE), make_full_bin),
-    SceneKind.DEEP_BIN: (partial(random_bin, extents=DEEP_BIN_INSIDE), make_bin),
-    SceneKind.TABLE: (random_table, make_table),
-    SceneKind.SHELF: (random_shelf, make_table),
+    SceneKind.BIN: (fixed.random_bin, make_bin),
+    SceneKind.FULL_BIN: (partial(fixed.random_bin, extents=fixed.SMALL_BIN_INSIDE), make_full_bin),
+    SceneKind.DEEP_BIN: (partial(fixed.random_bin, extents=fixed.DEEP_BIN_INSIDE), make_bin),
+    SceneKind.TABLE: (fixed.random_table, make_table),
+    SceneKind.SHELF: (fixed.random_shelf, make_table),
 }

@@ -200,7 +200,7 @@ class GraspDetector:
             elif scene is not None and sample is not None:
                 logits = sample.logits
                 if self.sees_hands:
-                    logits = ranking.average_similar_hands(logits, sample, scene, gripper)
+                    logits = ranking.average_similar_hands(sample, scene, gripper)
                 contact = sample.candidates.contact_index
                 rating, score = self._scores(scene, contact, expit(logits))
                 rows, outcome = ranking.select(

@@ -39,18 +39,13 @@ SIMILAR_DISTANCE, SIMILAR_ANGLE, OWN_WEIGHT, SHARPENING = 0.03, math.radians(30)
 OUTCOMES = list(Outcome)
 
 
-def average_similar_hands(
-    logits: Float32,  # (E,) of the scored candidates
-    sample: Sample,
-    scene: Scene,
-    gripper: Gripper,
-) -> Float32:
-    """The logits (E,), averaged over hands that are alike.
+def average_similar_hands(sample: Sample, scene: Scene, gripper: Gripper) -> Float32:
+    """The logits (E,) of a sample, averaged over hands that are alike.
 
     The best of many logits is too high by chance, and a robot's pose is never exact: where hands
     like it slip, a hand slips too.
     """
-    candidates = sample.candidates
+    candidates, logits = sample.candidates, sample.logits
     number = scene.object_of_point[candidates.contact_index]
     T_cloud_tcp = candidates.T_cloud_hand @ gripper.T_hand_tcp
     others = mean_over_similar(logits, T_cloud_tcp, number, SIMILAR_DISTANCE, SIMILAR_ANGLE)

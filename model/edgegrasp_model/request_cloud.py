@@ -8,6 +8,7 @@ import base64
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
@@ -136,11 +137,9 @@ def _numbers(field: str, values: list[Any], holes: bool) -> Array:
         fix = "Send [x, y, z] rows." if field == "points" else "Send rows of one length."
         raise InvalidRequest(field, "rows of different lengths", fix) from None
     allowed = {int, float} | ({type(None)} if holes and array.ndim == 3 else set())
-    try:
+    with suppress(OverflowError):
         if kinds <= allowed:
             return array.astype(np.int64 if kinds == {int} else np.float64)
-    except OverflowError:
-        pass
     bad = next(
         place
         for place, number in enumerate(numbers)
@@ -296,15 +295,11 @@ def value_of_text(name: str, text: str) -> object:
         return text  # a model may be named 7 or null
     if name == "gripper" and not text.startswith(("{", "[")) and text != "null":
         return text  # as may grippers
-    try:
+    with suppress(ValueError, RecursionError):
         return json.loads(text, object_pairs_hook=partial(unique_keys, f"options.{name}"))
-    except (ValueError, RecursionError):
-        pass
     if "," in text:
-        try:
+        with suppress(ValueError):
             return [float(part) for part in text.split(",")]
-        except ValueError:
-            pass
     return text
 
 

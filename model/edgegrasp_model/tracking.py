@@ -194,7 +194,7 @@ def merged(
         kept = [replace(e.grasp, id=one.id, object=now) for one, now, e in there if e.grasp]
     if kept:
         ways = scene.frame.directions([one.approach_direction for one in kept])
-        fit = allowed_directions(ways, options.approach_direction, scene.frame.directions)
+        fit = allowed_directions(ways, options.approach_direction, scene.frame)
         fit &= np.array([one.score >= options.min_score for one in kept])
         fit &= np.array([one.collision_free or options.collision.mode != "avoid" for one in kept])
         kept = [kept[row] for row in np.flatnonzero(fit)]

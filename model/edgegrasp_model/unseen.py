@@ -204,14 +204,13 @@ def visible_extents(
         # Length and width of a box whose surface spreads as the points do, and their height.
         sizes[row, :2] = np.sqrt(12.0 * np.maximum(spread[:0:-1], 0.0))
         sizes[row, 2] = np.ptp(height)
-    extents = np.zeros((len(T_cloud_hand), NUM_EXTENTS), dtype=np.float32)
     if len(labels) == 0:
-        return extents
+        return np.zeros((len(T_cloud_hand), NUM_EXTENTS), dtype=np.float32)
     bounds = np.cumsum([0, *map(len, parts)])
     inner, half = gripper.max_opening / 2, 3 * gripper.pad_half_width
     limits = np.array([inner, half, gripper.seen_palm_z, gripper.tip_z], dtype=np.float32)
     group = groups.reshape(-1).astype(np.int64)
-    _extents(np.concatenate(parts), bounds, group, T_cloud_hand, side, limits, extents)
+    extents = _extents(np.concatenate(parts), bounds, group, T_cloud_hand, side, limits)
     extents[:, -3:] = sizes[group]
     return np.clip(extents, -MAX_EXTENT, MAX_EXTENT, out=extents)
 
@@ -224,10 +223,10 @@ def _extents(
     T_cloud_hand: Float32,
     side: Float32,
     limits: Float32,
-    extents: Float32,
-) -> None:
-    """Fill in all columns but the last three; the points of an object lie between its bounds."""
+) -> Float32:
+    """All columns but the last three, 0 so far; the points of an object lie between its bounds."""
     inner, half, palm, tip = limits
+    extents = np.zeros((len(group), NUM_EXTENTS), np.float32)
     for e in range(len(group)):
         T = T_cloud_hand[e]
         low_x = low_y = low_z = np.float32(np.inf)
@@ -247,6 +246,7 @@ def _extents(
         extents[e, 2], extents[e, 3] = high - inner, -low - inner
         extents[e, 4], extents[e, 5] = high_x, -low_x
         extents[e, 6], extents[e, 7] = high_z - tip, palm - low_z
+    return extents
 
 
 class DepthMap(NamedTuple):

@@ -349,7 +349,7 @@ def choose_grasps(
     if guide is None:
         rows, best = _any(sample, options.grasps_per_view, rng), None
     else:
-        rating = average_similar_hands(sample.logits, sample, scene, prepared.gripper)
+        rating = average_similar_hands(sample, scene, prepared.gripper)
         number = scene.object_of_point[sample.candidates.contact_index]
         rows = _likely(number, sample.logits, rating, options.grasps_per_view, rng)
         best = int(np.searchsorted(rows, rating.argmax()))

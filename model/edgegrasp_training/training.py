@@ -161,7 +161,6 @@ class Trainer:
         return evaluation
 
     def _train_step(self) -> float:
-        self.network.train()
         packed = self._training_batch(np.random.default_rng([self.options.seed, self.step]))
         kind, mixed = torch.device(self.device).type, self.options.mixed_precision
         with torch.autocast(kind, torch.bfloat16, enabled=mixed):

@@ -2,12 +2,11 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import reduce
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from edgegrasp_camera.arrays import Bools, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import collides
@@ -30,7 +29,7 @@ from edgegrasp_model.options import (
     DetectOptions,
 )
 from edgegrasp_model.results import Outcome
-from edgegrasp_model.scene.cloud import UP
+from edgegrasp_model.scene.cloud import UP, CanonicalFrame
 from edgegrasp_model.scene.scene import Scene
 
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
@@ -169,20 +168,16 @@ class Sampler:
         if self.sees_hands or last_resort:
             contacts = np.flatnonzero(np.bincount(contact))
             leaning = self.sees_hands and last_resort
-            across = [
-                outline_grasps(
-                    points, crop, approach_index, pair, each, scene.support, gripper, margin
-                )
-                for each in outlines(points, scene.viewpoints, contacts, leaning=leaning)
-            ]
+            seen = outlines(points, scene.viewpoints, contacts, leaning=leaning)
+            balls, hand = (crop, approach_index, pair), (scene.support, gripper, margin)
+            across = [outline_grasps(points, *balls, outline, *hand) for outline in seen]
             candidates = Candidates.concatenate([candidates, *across])
         self.counts["candidates"] += len(candidates)
         outcome = np.full(len(candidates), OUTCOME_CODE[Outcome.RETURNED])
         if scene.support is not None:
             candidates, clear = retract(candidates, scene.support, gripper, margin)
             outcome[~clear] = OUTCOME_CODE[Outcome.SUPPORT]
-        asked, in_frame = options.approach_direction, scene.frame.directions
-        allowed = allowed_directions(-candidates.approach, asked, in_frame)
+        allowed = allowed_directions(-candidates.approach, options.approach_direction, scene.frame)
         outcome[~allowed] = OUTCOME_CODE[Outcome.DIRECTION]
         self.counts["in_direction"] += int(allowed.sum())
         self.counts["clear_of_support"] += int((outcome == OUTCOME_CODE[Outcome.RETURNED]).sum())
@@ -226,17 +221,17 @@ def random_rows(rows: Int64, limit: int, rng: np.random.Generator) -> Int64:
 
 
 def allowed_directions(
-    direction: Floats,  # (E, 3) unit, the hands' +z, canonical frame
+    direction: Floats,  # (E, 3) unit, the hands' +z, in the frame
     constraint: ApproachDirection | None,
-    in_frame: Callable[[ArrayLike], Floats],  # turns the cones' directions into that frame
+    frame: CanonicalFrame,
 ) -> Bools:
-    """Which directions (E,) the hand may move in."""
+    """Which directions (E,) a hand may move in."""
     rise = direction @ UP
     if constraint is None:
         return np.asarray(rise < 0.1)  # not from far below the horizontal
     allowed, preset = np.zeros(len(direction), dtype=bool), math.radians(30)
     for cone in constraint.cones:
-        axis = in_frame(cone.direction)
+        axis = frame.directions(cone.direction)
         allowed |= direction @ (axis / np.linalg.norm(axis)) >= math.cos(cone.max_angle)
     if constraint.preset == "top-down":
         allowed |= -rise >= math.cos(preset)

@@ -88,19 +88,13 @@ def check_reference_logits(network: nn.Module, metadata: CheckpointMetadata) -> 
 def reference_logits(network: nn.Module) -> list[float]:
     """The logits of a network for a fixed synthetic batch, whatever its architecture."""
     config: NetworkConfig = network.config  # type: ignore[assignment]
-    parameter = next(network.parameters())
-    was_training = network.training
-    network.eval()
+    device = next(network.parameters()).device
     kind: type[HandBatch | BallBatch] = HandBatch if config.architecture == "hand" else BallBatch
     with torch.inference_mode():
-        logits: list[float] = network(kind.made_up(config).to(parameter.device)).float().tolist()
-    network.train(was_training)
+        logits: list[float] = network(kind.made_up(config).to(device)).float().tolist()
     return logits
 
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(tensors):
-        digest.update(name.encode())
-        digest.update(tensors[name].numpy().tobytes())
-    return digest.hexdigest()
+    parts = (name.encode() + tensors[name].numpy().tobytes() for name in sorted(tensors))
+    return hashlib.sha256(b"".join(parts)).hexdigest()

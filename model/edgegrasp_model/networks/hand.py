@@ -66,14 +66,13 @@ class HandBatch:
         """The view of each candidate's hand, with at most `num_points` points."""
         hands = candidates.T_cloud_hand
         view = hand_views(around.cloud, hands, gripper)
-        eye, side = None, np.ones(len(hands), dtype=np.float32)
+        side = np.ones(len(hands), dtype=np.float32)
         if len(around.viewpoints) == 1:
             # If a hand approaches straight from the camera, up decides instead of rounding errors.
-            eye = around.viewpoints[0]
-            toward = eye + ABOVE_CAMERA * UP - hands[:, :3, 3]
+            toward = around.viewpoints[0] + ABOVE_CAMERA * UP - hands[:, :3, 3]
             along_x = np.einsum("ed,ed->e", toward, hands[:, :3, 0])
             side = np.where(along_x < 0.0, -1.0, 1.0).astype(np.float32)
-        description = describe_hands(around, candidates, gripper, view, eye, side, description_size)
+        description = describe_hands(around, candidates, gripper, view, side, description_size)
         x, y = gripper.pad_half_width + BESIDE_PADS, gripper.max_opening / 2 + OUTSIDE_FINGERS
         low, high = (-x, -y, gripper.seen_palm_z - BEHIND_PALM), (x, y, gripper.tip_z + BEYOND_TIPS)
         box = np.array([low, high, (0.0, 0.0, gripper.tip_z)], dtype=np.float32)
@@ -160,7 +159,6 @@ def describe_hands(
     candidates: Candidates,  # E candidates
     gripper: Gripper,  # fingers open to its maximum
     view: HandView,  # of the same candidates
-    eye: Float32 | None,  # (3,) the camera, where there is exactly one
     side: Float32,  # (E,) 1 or -1, the factor on a hand's x that puts it on the positive side
     size: int,  # numbers that the network reads; the extents, which come last, may be skipped
 ) -> Float32:
@@ -177,8 +175,8 @@ def describe_hands(
     seen, first_met, runs = _look_from_each(*looked)
     unseen = unseen_space(around.depths, hands, first_met, gripper)
     toward = np.zeros((len(mirrored), 3), dtype=np.float32)
-    if eye is not None:
-        toward = unit(eye - hands[:, :3, 3])
+    if len(around.viewpoints) == 1:
+        toward = unit(around.viewpoints[0] - hands[:, :3, 3])
     ups = np.broadcast_to(up / np.linalg.norm(up), toward.shape)
     length, swing = gripper.tip_z - gripper.palm_z, gripper.max_tip_z - gripper.tip_z
     thick = gripper.finger_thickness

@@ -66,9 +66,7 @@ class SceneNet(nn.Module):
             x = layer(x)
         x = self.context(x)
         for across, layer, beside in zip(self.across, self.up, kept[::-1], strict=True):
-            x = functional.interpolate(
-                across(x), size=beside.shape[2:], mode="bilinear", align_corners=False
-            )
+            x = functional.interpolate(across(x), size=beside.shape[2:], mode="bilinear")
             x = layer(x + beside)
         out = self.head(x)
         return SceneOutput(out[:, :3], VOTE_UNIT * out[:, 3:6], out[:, 6:8], out[:, 8:])

@@ -24,7 +24,6 @@ from edgegrasp_model.scene.network import NEAREST_DEPTH, SceneNet, range_image, 
 
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 
-
 # In place of an object's number. An undecided point may be part of an object.
 BACKGROUND, UNDECIDED = -1, -2
 
@@ -187,7 +186,7 @@ def group_pixels(pixels: Pixels) -> tuple[Int64, Float64]:
     order = np.argsort(-np.concatenate(strength), kind="stable")
     component = np.arange(held.size)
     centre = np.nan_to_num(points + votes).reshape(-1, 3).astype(np.float64)
-    _join_pixels(np.concatenate(pairs)[order], component, centre, MIN_PIXELS, MAX_DEPTH_STEP)
+    _join_pixels(np.concatenate(pairs)[order], component, centre)
     rows = np.flatnonzero(held)
     _, part, count = np.unique(component[rows], return_inverse=True, return_counts=True)
     area = np.bincount(part, (points[..., 2].reshape(-1)[rows] * footprint) ** 2)
@@ -202,8 +201,6 @@ def _join_pixels(
     pairs: Int64,  # (P, 2) the most probable first
     component: Int64,  # (N,) overwritten with the part of each pixel
     centre: Float64,  # (N, 3) metres, the vote of each pixel; overwritten by sums
-    large: int,  # pixels of a large part
-    apart: float,  # metres between centres
 ) -> None:
     """Join pairs of pixels in order, but not two large parts with different centres.
 
@@ -220,11 +217,11 @@ def _join_pixels(
             b = component[b]
         if a == b:
             continue
-        if count[a] >= large and count[b] >= large:
+        if count[a] >= MIN_PIXELS and count[b] >= MIN_PIXELS:
             away = 0.0
             for d in range(3):
                 away += (centre[a, d] / count[a] - centre[b, d] / count[b]) ** 2
-            if away > apart * apart:
+            if away > MAX_DEPTH_STEP * MAX_DEPTH_STEP:
                 continue
         if count[a] < count[b]:
             a, b = b, a

@@ -152,9 +152,7 @@ def _given_support(
             f"the given support plane lies {below:.3g} m below everything that is seen: check "
             "its frame, normal, and offset in metres."
         )
-    on = np.empty(0, np.int64)
-    if segmentation is not None:
-        on = np.flatnonzero(segmentation.support > 0.5)
+    on = np.flatnonzero([] if segmentation is None else segmentation.support > 0.5)
     # Where a support was cut off, only flat tops may be classified as support.
     whole = len(on) > MIN_SUPPORT_SHARE * len(seen.points)
     whole = whole and _wider_than_object(seen.points[subsample(on)], plane)
