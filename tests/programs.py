@@ -3,7 +3,8 @@
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
@@ -30,6 +31,15 @@ def started(*words: object, **more: Any) -> Iterator[subprocess.Popen[str]]:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(30)
             process.kill()  # one that does not heed it
+
+
+def until(condition: Callable[[], Any]) -> Any:
+    """What a condition gives when it holds."""
+    end = time.monotonic() + 240.0  # seconds, of a busy machine
+    while not (found := condition()):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    return found
 
 
 def free_ports(count: int) -> list[int]:

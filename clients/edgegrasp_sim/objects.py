@@ -309,7 +309,11 @@ def _read(mesh: Path) -> Any:
         raise ValueError(f"{mesh} cannot be read as a mesh: {error}") from error
     if len(surface.faces) == 0 or surface.extents is None:
         raise ValueError(f"{mesh} contains no triangles; export the object as a triangle mesh")
-    if not np.isfinite(surface.vertices).all() or min(surface.extents) <= 1e-9:
+    flat = not np.isfinite(surface.vertices).all() or min(surface.extents) <= 1e-9
+    if not flat:  # along the axes; it may still be a tilted sheet
+        sides = surface.bounding_box_oriented.primitive.extents
+        flat = min(sides) <= 1e-6 * max(sides)
+    if flat:
         raise ValueError(f"{mesh} is not a solid object: its extents are {surface.extents}")
     return surface
 

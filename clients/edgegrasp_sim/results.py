@@ -70,7 +70,11 @@ class ResultFolder:
         file = self.path / "manifest.json"
         if not file.is_file():
             raise FileNotFoundError(f"{self.path} contains no benchmark: manifest.json is missing")
-        table: dict[str, Any] = json.loads(file.read_text())
+        try:
+            table: dict[str, Any] = json.loads(file.read_text())
+            table["run"], table["seeds"], table["rounds"]
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{file} is no manifest ({error}); choose another folder") from None
         return table
 
     def finish(self) -> dict[str, Any]:

@@ -188,9 +188,9 @@ def extents_between(hands: InHands, first: Int64, last: Int64, pads: Float32) ->
 
 @compiled("contract")
 def non_max_suppression(
-    T_cloud_tcp: Float32, order: Int64, near: float, angle: float, most: int
+    T_cloud_tcp: Float32, order: Int64, near: float, angle: float
 ) -> tuple[Int64, Int64]:
-    """Keep the first of each group of near duplicates in `order` (M,), `most` at most.
+    """Keep the first of each group of near duplicates in `order` (M,).
 
     Those are within `near` metres of each other, T_cloud_tcp (E, 4, 4), and `angle` radians; a turn
     by 180 degrees about the approach is ignored. Returns the rows kept, in order, and the
@@ -209,7 +209,7 @@ def non_max_suppression(
             if close and _likeness(T_cloud_tcp[row], T_cloud_tcp[rows[k]]) > least:
                 dropped[m] = True
                 break
-        if found < most and not dropped[m]:
+        if not dropped[m]:
             kept[m] = True
             xs[found], ys[found], zs[found], rows[found] = px, py, pz, row
             found += 1

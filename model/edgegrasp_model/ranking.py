@@ -87,7 +87,7 @@ def select(
         order = objects_first(order, liked, rating, scene.object_of_point[contact])
     if (rule := options.suppression) is not None:
         near = rule.translation, rule.rotation
-        order, dropped = non_max_suppression(T_cloud_tcp, order, *near, options.top_k)
+        order, dropped = non_max_suppression(T_cloud_tcp, order, *near)
         if options.order == "score":  # of an object whose first one was near another object's
             order = objects_first(order, order, rating, scene.object_of_point[contact])
     order = order[: options.top_k]

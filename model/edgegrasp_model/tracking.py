@@ -121,12 +121,21 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
     taken = np.zeros(len(number), dtype=bool)
     places = [np.reshape(one.surface, (-1, 3)).astype(np.float64) for one in previous.objects]
     matches = [(*registered(before, cloud), row) for row, before in enumerate(places)]
+    matches = [match for match in matches if match[1] >= FOUND_SHARE]
+    placed = {row: places[row] @ T[:3, :3].T + T[:3, 3] for T, _, row in matches}
+    nearest = np.zeros(len(number), dtype=np.int64)  # row of the object that a point is nearest to
+    if placed and not previous.search:
+        rows = np.repeat([*placed], [len(now) for now in placed.values()])
+        tree = cKDTree(np.concatenate([*placed.values()]))
+        nearest[seen] = rows[tree.query(cloud.points)[1]]
     # Of two objects that match the same points, the better match is there.
     for T, share, row in sorted(matches, key=lambda match: -match[1]):
-        now = places[row] @ T[:3, :3].T + T[:3, 3]
-        if share < FOUND_SHARE or np.median(number[near := seen[cloud.near(now)]]) < 0:
+        now = placed[row]
+        if np.median(number[near := seen[cloud.near(now)]]) < 0:
             continue
-        near = near[number[near] >= 0]
+        near = near[(number[near] >= 0) & (previous.search | (nearest[near] == row))]
+        if len(near) == 0:
+            continue
         there, count = np.unique(number[near], return_counts=True)
         which, name = int(there[count.argmax()]), previous.objects[row].number
         mine = number == which if previous.search else near
@@ -235,7 +244,7 @@ def _order(
         like_kept = mean_over_similar(of_kept, T_cloud_tcp, np.zeros_like(rows), *near) > 0.0
         rows = rows[(rows < kept) | ~like_kept]
     else:
-        rows, _ = non_max_suppression(T_cloud_tcp, rows, *near, len(rows))
+        rows, _ = non_max_suppression(T_cloud_tcp, rows, *near)
     some = [grasps[row] for row in rows]
     score = np.array([one.score for one in some])
     free = np.array([one.collision_free for one in some])

@@ -31,6 +31,7 @@ ROBOT_FOLDER = Path(__file__).parent / "robots"
 GROUP, HAND = "arm", "edgegrasp_hand"  # names in the planner's model
 DEFAULT_ACCELERATION = 2.0  # per second squared: acceleration limit if none is given
 MOVING = ("revolute", "continuous", "prismatic")
+MAX_TURN = 20 * np.pi  # radians, limit of a joint either way; larger numbers are degrees
 IK = SimpleIkOptions(
     GROUP, max_iters=20, max_time=10.0, max_restarts=0, step_size=1.0,
     max_linear_error_norm=5e-4, max_angular_error_norm=1e-3, check_collisions=False,
@@ -339,9 +340,11 @@ def _check_joint(joint: Element) -> None:
     if kind in ("revolute", "prismatic"):
         ends = ["none" if limit is None else limit.get(end, "none") for end in ("lower", "upper")]
         with suppress(ValueError):
-            if -np.inf < float(ends[0]) <= float(ends[1]) < np.inf:
+            low, high = map(float, ends)
+            most = np.inf if kind == "prismatic" else MAX_TURN
+            if -most < low <= high < most:
                 return
-        fix = "Give its <limit> both, lower below upper."
+        fix = "Give its <limit> both, lower below upper, in radians or metres."
         raise InvalidRobot(f"urdf: {said}: got limits {' and '.join(ends)}. {fix}")
 
 

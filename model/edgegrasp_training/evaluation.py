@@ -72,12 +72,14 @@ def auroc(logit: Floats, label: Floats) -> float:
 
 
 def fit_temperature(logit: Floats, label: Floats) -> float:
-    """The t for which sigmoid(logit / t) has the least cross entropy."""
+    """The t for which sigmoid(logit / t) has the least cross entropy; near 1 for few labels."""
     logit, label = logit.astype(np.float64), label.astype(np.float64)
-    best = minimize_scalar(
-        lambda log_t: cross_entropy(logit / np.exp(log_t), label), bounds=(-2.0, 2.0)
-    )
-    return float(np.exp(best.x))
+
+    def cost(log_t: float) -> float:
+        prior = (log_t / PRIOR_SCALE) ** 2 / 2
+        return cross_entropy(logit / np.exp(log_t), label) + prior / len(label)
+
+    return float(np.exp(minimize_scalar(cost, bounds=(-2.0, 2.0)).x))
 
 
 class Range(NamedTuple):
@@ -144,12 +146,15 @@ def read_outcomes(path: Path, digest: str) -> tuple[Float64, Float64]:
         ValueError: The file has none, or a line that is no outcome.
     """
     scores, held = [], []
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
         try:
             outcome = json.loads(line)
+            score, success = float(outcome["score"]), float(outcome["held"])
+            if not 0.0 <= score <= 1.0 or success not in (0.0, 1.0):
+                raise ValueError(f"score {score}, held {success}")
             if outcome["digest"] == digest:
-                scores.append(float(outcome["score"]))
-                held.append(float(outcome["held"]))
+                scores.append(score)
+                held.append(success)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path}, line {number}: {error!r}. It is not an outcome.") from None
     if not scores:

@@ -91,8 +91,8 @@ def generate(
     folder.mkdir(parents=True, exist_ok=True)
     # Other machines find files at whole paths too.
     weights, objects = (path and path.resolve() for path in (options.weights, objects))
-    if weights is not None and not weights.is_file():  # not only once a scene is cleared by them
-        raise ValueError(f"weights: got {weights}, which is no file. Name a .safetensors file")
+    if weights is not None:
+        detector(weights)  # refuses wrong ones now, not only once a scene is cleared by them
     changes = {"engine": choose_engine(options.engine), "weights": weights}
     options = options.model_copy(update=changes)
     # One view of each kind and seed: the other scenes of a seed are made by the same engine.
@@ -103,7 +103,10 @@ def generate(
             "choose another folder"
         )
     made = folder / f"seed_{options.seed}.json"
-    given = options.model_dump(mode="json", exclude={"scenes", "views_per_scene"})
+    decisive = {*GenerationOptions.model_fields} - {"scenes", "views_per_scene"}
+    given = options.model_dump(mode="json", include=decisive) | {
+        "objects": objects and str(objects)
+    }
     begun = made.is_file() and any(folder.glob(f"*_{options.seed}-*.npz"))
     before = json.loads(made.read_text()) if begun else given
     if changed := [name for name, value in given.items() if before.get(name) != value]:

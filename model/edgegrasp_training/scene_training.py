@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from scipy.optimize import minimize
 from torch import Tensor
 from torch.nn import functional
@@ -262,7 +262,7 @@ def train(
             weights = {name: value.contiguous() for name, value in averaged.state_dict().items()}
             partial = run / "scene.partial"
             confidence = json.dumps(fit_confidence(averaged, held))
-            save_file(weights, partial, {"confidence": confidence})
+            partial.write_bytes(save(weights, {"confidence": confidence}))
             partial.replace(run / "scene.safetensors")
             with (run / "log.txt").open("a") as log:
                 log.write(f"{step} {now - begin:.0f}s images {len(images)} {losses}\n")

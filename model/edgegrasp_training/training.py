@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import replace
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
@@ -82,7 +84,7 @@ class Trainer:
         }
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).is_file():
-            self._resume(torch.load(folder / STATE_FILE, weights_only=True, map_location=device))
+            self._resume(folder / STATE_FILE)
         elif self.start is None and isinstance(self.network, HandNet):
             self._standardise(self.network)
 
@@ -209,6 +211,8 @@ class Trainer:
                 turn = examples.random_turn(rng, upright=upright)
                 packed = packed._replace(batch=examples.turned(packed.batch, turn))
             parts.append(packed)
+        if not parts:
+            raise ValueError("data: no grasp was tried in the views of this step. Make others")
         batches, labels, weights = zip(*parts, strict=True)
         return examples.Packed(examples.joined(batches), torch.cat(labels), torch.cat(weights))
 
@@ -261,8 +265,12 @@ class Trainer:
                 writer.writeheader()
             writer.writerow(row)
 
-    def _resume(self, state: dict[str, Any]) -> None:
-        """Continue from a saved state; ValueError: it is of another model or recipe."""
+    def _resume(self, file: Path) -> None:
+        """Continue from a saved state; ValueError: it is damaged, or of another model or recipe."""
+        try:
+            state = torch.load(file, weights_only=True, map_location=self.device)
+        except (EOFError, RuntimeError, UnpicklingError) as error:
+            raise ValueError(f"run: {file} is damaged: {error}. Remove it") from None
         try:
             for name in STATEFUL:
                 getattr(self, name).load_state_dict(state[name])
@@ -281,5 +289,6 @@ class Trainer:
         state = {name: getattr(self, name) for name in (*COUNTERS, "recipe")}
         state |= {name: getattr(self, name).state_dict() for name in STATEFUL}
         partial = self.folder / (STATE_FILE + ".partial")
-        torch.save(state, partial)
+        torch.save(state, saved := BytesIO())
+        partial.write_bytes(saved.getvalue())
         partial.replace(self.folder / STATE_FILE)

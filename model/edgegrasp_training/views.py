@@ -113,7 +113,7 @@ def load_view(path: Path) -> LabelledView:
             stored = {name: arrays[name] for name in arrays if name in fields}
         typed = {name: TYPES.get(name, np.asarray)(value) for name, value in stored.items()}
         return LabelledView(**typed)
-    except (TypeError, EOFError, BadZipFile) as error:
+    except (TypeError, ValueError, EOFError, BadZipFile) as error:
         raise ValueError(f"data: {path} is not a view ({error}). Remove it") from None
 
 

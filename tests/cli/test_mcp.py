@@ -5,7 +5,6 @@ import json
 import os
 import socket
 import sys
-import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -15,7 +14,7 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
-from tests.programs import EDGEGRASP, free_ports, run, started
+from tests.programs import EDGEGRASP, free_ports, run, started, until
 
 from edgegrasp_cli.mcp import grasp_tools
 from edgegrasp_client import Detection, GraspClient
@@ -210,8 +209,7 @@ async def test_the_tools_over_http(dummy_server, folder: Path) -> None:
     (port,) = free_ports(1)
     with started(sys.executable, *PROGRAM, *flags, "--http", f"127.0.0.1:{port}") as process:
         with socket.socket() as probe:
-            while process.poll() is None and probe.connect_ex(("127.0.0.1", port)):
-                time.sleep(0.1)
+            until(lambda: process.poll() is not None or not probe.connect_ex(("127.0.0.1", port)))
         async with mcp.Client(f"http://127.0.0.1:{port}/mcp") as client:
             found = await client.call_tool(CLOUD, {"point_cloud_file": "cloud.npy"})
             assert len(answer(found)["grasps"]) == 5

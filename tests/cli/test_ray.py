@@ -4,8 +4,7 @@ import os
 import signal
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -16,7 +15,7 @@ import psutil
 import pytest
 from benchmarks.load import OPTIONS
 from benchmarks.load import cloud as table
-from tests.programs import EDGEGRASP, free_ports, started
+from tests.programs import EDGEGRASP, free_ports, started, until
 
 from edgegrasp_client import GraspClient, GraspClientError, InvalidRequestError, UnknownModelError
 from edgegrasp_model.options import DetectOptions
@@ -100,15 +99,6 @@ def at_work(task: str) -> list[psutil.Process]:
         with suppress(psutil.NoSuchProcess):
             if f"ray::{task}" in " ".join(process.cmdline()):
                 found.append(process)
-    return found
-
-
-def until(condition: Callable[[], Any]) -> Any:
-    """What a condition gives when it holds."""
-    end = time.monotonic() + PATIENCE
-    while not (found := condition()):
-        assert time.monotonic() < end
-        time.sleep(0.05)
     return found
 
 

@@ -7,7 +7,6 @@ import csv
 import json
 import re
 import threading
-import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.cli.conftest import invoke
+from tests.programs import until
 
 from edgegrasp_lab.benchmark import benchmark_arm
 from edgegrasp_lab.flags import PlannerFlags
@@ -150,8 +150,7 @@ def test_a_server_killed_and_restarted_changes_nothing(start_dummy, dummy_server
         same = ("--http-port", ports[0], "--grpc-port", ports[1])
 
         def restart() -> None:
-            while not list(shaken.glob("rounds/*.json")):
-                time.sleep(0.01)
+            until(lambda: list(shaken.glob("rounds/*.json")))
             first.process.kill()
             first.process.wait()
             stack.enter_context(start_dummy(*same))

@@ -47,7 +47,7 @@ def test_training_pauses_goes_on_and_is_recalibrated(data, run, tmp_path) -> Non
         (("train", "DATA", "--model", "huge"), "edgegrasp-plus"),
         (("train", "DATA", "--device", "gpu"), "Use auto, cpu, cuda"),
         (("train", "DATA", "--keep", "0.5"), "--keep: got no weights"),
-        (("generate-data", "FOLDER", "--weights", "gone.safetensors"), "weights: got"),
+        (("generate-data", "FOLDER", "--weights", "gone.safetensors"), "checkpoint: got"),
         (("train", "DATA", "--validation-share", "1"), "Make more"),
         (("import-checkpoint", "FOLDER"), "local_emd_model"),
         (("benchmark", "--scene", "attic"), "attic"),

@@ -122,7 +122,6 @@ def test_normals_that_contradict_each_other_are_estimated() -> None:
     normals = np.repeat([(1.0, 0.0, 0.0), (-1.0, 1e-3, 0.0)], 3000, axis=0)
     asked = {"support": None, "objects": "off", "debug": True}
     found = detect(CloudInput(np.concatenate([sheet, sheet]), normals), **asked)
-    assert found.debug is not None
     assert (found.debug.normals[:, 2] > 0.99).all()
 
 
@@ -132,7 +131,6 @@ def test_each_camera_orients_the_normals_of_what_it_saw() -> None:
     cameras = [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
     asked = {"viewpoint": cameras, "support": None, "objects": "off", "debug": True}
     found = detect(CloudInput(sheets, view_ids=np.repeat([0, 1], 3000)), **asked)
-    assert found.debug is not None
     upper = found.debug.points[:, 2] > 0.25
     assert (found.debug.normals[upper, 2] > 0.99).all()
     assert (found.debug.normals[~upper, 2] < -0.99).all()
@@ -174,7 +172,6 @@ def test_one_of_the_objects_by_number_by_pixel_or_by_place(catalogue) -> None:
     numbers = {each.number for each in every.objects}
     assert not any(each.reason for each in every.objects if (each.best_score or 0.0) > 0.5)
     one = every.grasps[0].object
-    assert one is not None
     assert objects(objects={"include": [one]}) == {one}
     assert objects(objects={"exclude": [one]}) == numbers - {one}
     assert objects(objects={"include": [99]}) == set()
@@ -208,7 +205,6 @@ def test_no_grasp_is_an_answer_that_says_why() -> None:
 
     far = {"kind": "sphere", "center": [1, 1, 1], "radius": 0.1}
     nowhere = detect(debug=True, approach_region={"include": [far]})
-    assert nowhere.debug is not None
     assert nowhere.debug.outcome == []
     assert nowhere.counts["in_approach_region"] == 0
     assert any("approach region" in warning for warning in nowhere.warnings)
@@ -229,7 +225,6 @@ def test_where_every_hand_collides_further_points_are_tried_and_hands_are_marked
     assert not any(grasp.collision_free for grasp in found.grasps)
     assert all(grasp.clearance < 0 for grasp in found.grasps)
     assert found.counts["approach_points"] == (4 if mode == "ignore" else 12)  # three attempts
-    assert found.debug is not None
     assert len(found.debug.outcome) == found.counts["candidates"]
     if mode == "avoid":
         assert Counter(found.debug.outcome)[Outcome.COLLISION] == found.counts["checked"]
@@ -246,7 +241,6 @@ def test_an_unknown_viewpoint_gets_a_warning_and_too_many_voxels_are_refused() -
 def test_debug_returns_the_cloud_and_every_candidate_with_what_became_of_it() -> None:
     found = detect(debug=True, min_score=0.3, top_k=5, num_candidates=200)
     debug, counts = found.debug, found.counts
-    assert debug is not None
     assert len(debug.points) == len(debug.normals) == counts["kept"]
     np.testing.assert_allclose(np.linalg.norm(debug.normals, axis=1), 1.0, atol=1e-5)
     assert len(debug.outcome) == len(debug.score) == len(debug.T_cloud_hand)

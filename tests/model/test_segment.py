@@ -12,8 +12,9 @@ from tests.checks import bounded_memory, refusal
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.results import SUPPORT
 from edgegrasp_model.scene.cloud import CloudInput, check_cloud, likely_viewpoint, unit, voxelise
+from edgegrasp_model.scene.network import range_image
 from edgegrasp_model.scene.scene import build_scene, select_points
-from edgegrasp_model.scene.segment import BACKGROUND, Segmentation
+from edgegrasp_model.scene.segment import BACKGROUND, Segmentation, merge_views
 from edgegrasp_model.scene.support import ViewedPoints, find_support, heights_over
 from edgegrasp_results import Detection
 
@@ -100,7 +101,6 @@ def test_background_around_them_makes_no_other_objects(seed: int, around: set[st
     kept = standing(crowded, boxes, T_world_camera)
     assert len(kept) >= len(boxes) - 1
     assert kept <= standing(plain, boxes, T_world_camera)
-    assert crowded.support is not None
     up = T_world_camera[:3, :3] @ crowded.support.normal
     assert up[2] > np.cos(np.radians(5))
     height = crowded.support.offset - crowded.support.normal @ (
@@ -178,7 +178,6 @@ def test_a_table_that_lies_over_the_plane_is_not_cut_off(given: bool) -> None:
     asked = {"support": {"normal": (0, 0, 1), "offset": -0.003}} if given else {}
     found = detect(points, T_world_camera, **asked)
     assert len(found.objects) == 1
-    assert found.support is not None
     assert found.support.share > 0.4
 
 
@@ -187,7 +186,6 @@ def test_a_workspace_is_where_grasps_are_and_what_is_beyond_stays() -> None:
     left = {"min": (-0.2, -0.2, -0.05), "max": (0.05, 0.2, 0.3)}
     found = detect(seen_in_world([table(), *boxes], ABOVE), ABOVE, workspace=left, debug=True)
     assert found.grasps
-    assert found.debug is not None
     assert all(grasp.contact_point[0] < 0.051 for grasp in found.grasps)
     assert found.debug.points[:, 0].max() > 0.1  # the other box is still an obstacle
     assert len(found.objects) == 1
@@ -205,7 +203,6 @@ def test_segments_are_the_objects_where_they_are_sent() -> None:
         found = detect(CloudInput(ON_TABLE, segment_ids=segment), previous={}, debug=True)
     assert {grasp.object for grasp in found.grasps} == {number}
     assert [each.number for each in found.objects] == [number]
-    assert found.debug is not None
     assert found.debug.labels.max() == number
 
 
@@ -238,13 +235,11 @@ def test_followed_objects_have_the_numbers_of_the_segments_they_are_in(search: b
     previous = continued(detect(CloudInput(ON_TABLE, segment_ids=segment), previous={}))
     cloud = CloudInput(ON_TABLE, segment_ids=np.array([0, 4, 3, 2, 1])[segment])
     now = detect(cloud, previous=previous | {"search": search})
-    assert now.tracking is not None
     assert now.tracking.first == "kept"
     for number, there in [
         *((one.number, one.surface) for one in now.objects),
         *((one.object, one.contact_point[None]) for one in now.grasps),
     ]:
-        assert number is not None
         assert FOUR[4 - number].distance(to_world(ABOVE, there)).max() < 0.01
 
 
@@ -273,6 +268,32 @@ def test_a_segment_for_every_pixel_takes_no_more_approach_points() -> None:
     assert len(found.objects) > 256
     assert found.counts["approach_points"] <= 128
     assert found.grasps
+
+
+def test_objects_that_one_of_three_views_shows_as_one_stay_apart() -> None:
+    grid = np.stack(np.meshgrid(*[np.arange(0.0, 0.04, 0.002)] * 2), axis=-1).reshape(-1, 2)
+    left = np.pad(grid, ((0, 0), (0, 1)))
+    seen = np.tile(np.concatenate([left, left + np.array([0.048, 0, 0])]), (3, 1)).astype(
+        np.float32
+    )
+    number = np.repeat([0, 0, 1, 2, 3, 4], len(left))
+    confidence, view = np.array([0.9, 0.8, 0.7, 0.6, 0.5]), np.array([0, 1, 1, 2, 2])
+    joined, best = merge_views(seen, number, confidence, view)
+    shown = joined.reshape(3, 2, len(left))
+    assert len(best) == 2
+    for one, other in ((0, 1), (1, 0)):
+        assert (shown[:, one] == shown[1, one, 0]).all()
+        assert shown[1, one, 0] != shown[1, other, 0]
+
+
+@pytest.mark.parametrize(("height", "width"), [(600, 800), (600, 960), (1000, 1200)])
+def test_an_image_without_holes_is_looked_at_up_to_its_edges(height: int, width: int) -> None:
+    y, x = np.indices((height, width), dtype=np.float32) / width
+    points = 0.7 * np.stack([x - 0.5, y - 0.5 * height / width, np.ones_like(x)], axis=-1)
+    image = range_image(points.reshape(-1, 3), np.zeros(3), None, np.array([0.0, 1.0, 0.0]))
+    end = image.corner + image.footprint * np.array(image.points.shape[1::-1])
+    assert image.corner[0] <= -0.49
+    assert end[0] >= 0.49
 
 
 def test_a_speck_before_an_object_is_no_part_of_it() -> None:
@@ -327,7 +348,6 @@ def test_a_support_is_assumed_under_a_cloud_that_was_cut_off_above_it(frame: str
         points, up = (points - pose[:3, 3]) @ pose[:3, :3], pose[2, :3]
     found = detect(points.astype(np.float32), pose if frame == "world" else None)
     assert any("one is assumed under the lowest points" in each for each in found.warnings)
-    assert found.support is not None
     assert found.support.normal @ up > np.cos(np.radians(2))
     heights = points @ found.support.normal - found.support.offset
     assert 0.0 < np.percentile(heights, 1) < 0.006
@@ -451,7 +471,6 @@ def test_a_camera_turned_about_its_axis_sees_the_same_objects(roll: float) -> No
         found = detect(render(scene, T_world_camera))
         centers = np.array([one.center for one in found.objects])
         places.append(to_world(T_world_camera, centers))
-        assert found.support is not None
         planes.append(T_world_camera[:3, :3] @ found.support.normal)
     assert len(places[0]) == len(places[1]) == 4
     apart = np.linalg.norm(places[0][:, None] - places[1], axis=2).min(axis=1)
@@ -492,7 +511,6 @@ def test_segments_stand_on_what_lies_below_them_not_on_the_top_of_a_carton() -> 
     boxes, pose = [small, carton, table(0.8, 0.7)], camera(0.9, -np.pi / 2, 0.9)
     segments = (seen_box(boxes, pose) == 0).astype(np.int32)
     found = detect(CloudInput(render(boxes, pose), segment_ids=segments))
-    assert found.support is not None
     assert found.grasps
     height = (small.center - pose[:3, 3]) @ pose[:3, :3] @ found.support.normal
     assert height - found.support.offset == pytest.approx(small.half[2], abs=0.005)
@@ -504,7 +522,6 @@ def test_every_row_is_labelled_with_an_object_the_support_or_neither(times: int)
     boxes = [table(), *objects]
     image = render(boxes, pose)
     found = detect(image.repeat(times, axis=0).repeat(times, axis=1), debug=True)
-    assert found.debug is not None
     labels, number = found.debug.labels, seen_box(boxes, pose)
     labels = labels.reshape(times * len(image), -1)[times - 1 :: times, times - 1 :: times].ravel()
     assert set(labels[labels >= 0].tolist()) == {one.number for one in found.objects}
@@ -546,7 +563,6 @@ def test_the_floor_of_a_bin_counts_and_not_the_table_beside_it(seed: int) -> Non
     table = rng.uniform((0.22, -0.3, 0.0), (0.6, 0.3, 0.0), (4000, 3))
     held = rng.uniform((-0.04, -0.04, 0.02), (0.04, 0.04, 0.06), (500, 3))
     found, _ = chosen_support(np.concatenate([floor, table]), held, (0.0, -0.5, 0.8))
-    assert found is not None
     assert np.abs(heights_over(found.plane, floor[np.abs(floor[:, 0]) < 0.1])).max() < 0.001
     assert found.share == pytest.approx(8000 / 8500, abs=0.01)  # of all points
 
@@ -576,7 +592,6 @@ def built(points: np.ndarray, **support: object) -> tuple[np.ndarray, list[str]]
     options = parse_options({"support": PLANE | support} | where)
     selected = select_points(check_cloud(points.astype(np.float32)), options, {}, warnings)
     found = build_scene(selected, options, 0.004, {})
-    assert found is not None
     if found.corrected is not None:  # whole, whatever the workspace
         assert len(found.corrected) == len(points)
         assert found.corrected[:, 2].min() > 0.04 or "taken as" in warnings[0]

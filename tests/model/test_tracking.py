@@ -108,7 +108,6 @@ def test_new_ids_are_above_all_that_are_sent(sent: Any) -> None:
     sent |= {"grasps": [{"id": 7, "T_cloud_hand": pose}]}
     sent |= {"objects": [{"number": 4, "surface": surface}]}
     previous = parse_options({"previous": sent}).previous
-    assert previous is not None
     assert untracked(previous).next_id == 8
     late = previous.model_copy(update={"next_id": 2**29})  # ids stay small
     assert untracked(late).next_id == 8
@@ -134,5 +133,4 @@ def test_objects_are_followed_in_the_workspace_only(begin: float, low: float) ->
     previous = {"objects": [{"number": 0, "surface": [0, 0, 0]}], "search": False}
     asked = parse_options({"previous": previous, "workspace": workspace})
     box = narrowed(asked, "panda", np.zeros((9, 3), np.float32)).workspace
-    assert box is not None
     assert box.min[0] == low

@@ -85,6 +85,7 @@ def test_meshes_lie_beside_their_urdf_and_one_that_is_wrong_says_how(tmp_path, m
         ('<parent link="tip"/>', "", "joint end has no parent"),
         ('velocity="1"', 'velocity="0"', r"max_velocity: got \[0\.0\]"),
         ('lower="-1" upper="1"', "", "joint turn: got limits none and none"),
+        ('lower="-1" upper="1"', 'lower="-180" upper="180"', "got limits -180 and 180.*radians"),
         ("<axis", '<mimic joint="other"/><axis', "joint turn follows another one"),
         ('xyz="0 0 1"', 'xyz="0 0 0"', "joint turn: got axis 0 0 0"),
         ('"revolute"', '"planar"', "joint turn is planar"),

@@ -18,6 +18,7 @@ from edgegrasp_client import GraspClient, GraspTracker, InvalidRequestError, Rob
 from edgegrasp_client.conversions import PANDA_LINK8, matrix_from_quaternion
 from edgegrasp_client.options import DetectOptions
 from edgegrasp_results import ArmPlan, ArmTrajectory
+from edgegrasp_sim.poses import translation
 
 from .conftest import Types
 
@@ -93,7 +94,7 @@ def test_a_cloud_and_its_grasps_in_every_message(client, cloud) -> None:
     in_hand = (fingers - hands[0][:3, 3]) @ hands[0][:3, :3]
     assert np.ptp(in_hand[:, 1]) == pytest.approx(expected[0].width, abs=1e-5)
     before = sent("geometry_msgs/msg/PoseArray", bridge.pose_array(found, 0.07)).poses[0]
-    np.testing.assert_allclose(matrix(before), hands[0] @ shifted(-0.07), atol=1e-5)
+    np.testing.assert_allclose(matrix(before), hands[0] @ translation(0, 0, -0.07), atol=1e-5)
 
     planned = bridge.moveit_grasps(found, settings, lookup)
     result = sent("grasping_msgs/msg/GraspPlanning_Result", planned)
@@ -113,12 +114,8 @@ def test_a_cloud_and_its_grasps_in_every_message(client, cloud) -> None:
     assert 0 <= each.candidates[1].confidence <= each.candidates[0].confidence <= 1
     np.testing.assert_allclose(matrix(each.candidates[0].pose.pose), hands[0], atol=1e-5)
     first = each.candidates[0]
-    np.testing.assert_allclose(matrix(first.pregrasp), hands[0] @ shifted(-0.05), atol=1e-5)
-    np.testing.assert_allclose(matrix(first.retreat), hands[0] @ shifted(-0.1), atol=1e-5)
-
-
-def shifted(z: float) -> np.ndarray:
-    return np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, z], [0, 0, 0, 1]])
+    for pose, z in ((first.pregrasp, -0.05), (first.retreat, -0.1)):
+        np.testing.assert_allclose(matrix(pose), hands[0] @ translation(0, 0, z), atol=1e-5)
 
 
 def test_the_first_pose_follows_its_object_from_message_to_message(real_server):

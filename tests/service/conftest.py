@@ -311,6 +311,12 @@ async def running(serve: Serve) -> Running:
     return await serve()
 
 
+@pytest.fixture
+def http(dummy_server) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=dummy_server.http_url, timeout=PATIENCE) as http:
+        yield http
+
+
 def is_error(answer: Reply, kind: str) -> bool:
     """Whether an answer is the error of a kind, on whichever transport."""
     code, status = next(STATUS[error] for error in STATUS if kind_of(error) == kind)

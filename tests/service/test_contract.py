@@ -51,12 +51,6 @@ def channel(dummy_server) -> Iterator[grpc.Channel]:
         yield channel
 
 
-@pytest.fixture
-def http(dummy_server) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=dummy_server.http_url, timeout=20) as http:
-        yield http
-
-
 def test_every_way_in_gives_the_same_grasps(cloud: np.ndarray, channel, http) -> None:
     detect = grasp_pb2_grpc.GraspServiceStub(channel).DetectGrasps
     text = json.dumps(OPTIONS)

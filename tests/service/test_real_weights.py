@@ -40,7 +40,6 @@ def as_lists(detection: Any) -> list[list[Any]]:
 def test_many_options_give_the_same_grasps_everywhere(catalogue, real_server, tmp_path):
     expected = catalogue.get().detect(CloudInput(POINTS, **BESIDE), parse_options(MANY))
     assert expected.grasps
-    assert expected.debug is not None
 
     file, options = tmp_path / "scene.npz", tmp_path / "options.json"
     np.savez_compressed(file, points=POINTS, **BESIDE)
@@ -69,7 +68,6 @@ def test_many_options_give_the_same_grasps_everywhere(catalogue, real_server, tm
         assert list(detection.counts.items()) == list(expected.counts.items())  # in their order
         assert list(detection.seconds) == list(expected.seconds)
         assert detection.warnings == expected.warnings
-        assert detection.debug is not None
         for name, value in vars(expected.debug).items():
             np.testing.assert_array_equal(getattr(detection.debug, name), value)
 
@@ -108,7 +106,6 @@ def test_clouds_that_take_too_long_are_refused(catalogue, monkeypatch, pace, kin
     whole = "objects=off&support=null"
     job = Job("DetectGrasps", "http", npy(room), 60.0, "application/x-npy", whole)
     error = answer(job, catalogue, Settings(max_voxels=20_000)).error
-    assert error is not None
     assert error.kind == kind
     assert named in error.detail
 

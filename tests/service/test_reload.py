@@ -4,7 +4,6 @@ import asyncio
 import re
 import signal
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from tests.programs import until
 
 from edgegrasp_client import AsyncGraspClient, GraspClient
 from edgegrasp_model.detector import WEIGHTS_FOLDER
@@ -156,11 +156,7 @@ def test_sighup_swaps_real_weights_and_survives_truncated_ones(real_server, clou
         new.replace(file)
         before = reloads(real_server)
         real_server.process.send_signal(signal.SIGHUP)
-        end = time.monotonic() + 120
-        while (now := reloads(real_server)) == before:
-            assert time.monotonic() < end
-            time.sleep(0.1)
-        ((outcome, _),) = set(now) - set(before)
+        ((outcome, _),) = until(lambda: set(reloads(real_server)) - set(before))
         with GraspClient(real_server.http_url) as client:
             digest = next(model.digest for model in client.models() if model.name == "mine")
         return outcome, digest

@@ -277,6 +277,7 @@ def test_prepared_meshes_are_cached_by_content(meshes: Path, cache: Path, tmp_pa
     [
         ("v 0 0 0\n", "contains no triangles"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not a solid object"),
+        ("v 0 0 0\nv 1 0 1\nv 0 1 1\nf 1 2 3\n", "not a solid object"),
         ("v 0 0 zero\nf 1 2 3\n", "cannot be read"),
     ],
 )

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from benchmarks import ur5_objects
 
+from edgegrasp_lab.train import DataFlags
 from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_sim.engine import ENGINES, choose_engine, installed, make_world
 from edgegrasp_sim.engine.urdf import parse_obj
@@ -39,7 +40,6 @@ def test_views_hold_tried_grasps_of_every_kind_of_scene(data: Path) -> None:
     for path in paths:
         view = load_view(path)
         assert 0 < len(view.tried()) <= 8
-        assert view.T_world_hand is not None
         assert (view.T_world_hand[:, 2, 3] > 0.05).all()
         assert view.support is not None
         assert view.object_of_point.max() >= 0
@@ -89,7 +89,9 @@ def test_scenes_of_a_seed_are_all_made_with_the_same_options(tmp_path: Path) -> 
     list(generate(tmp_path, None, small(scenes=1, **asked)))
     with pytest.raises(ValueError, match=r"grasps_per_view: .*holds scenes of seed 5"):
         list(generate(tmp_path, None, small(scenes=2, **asked | {"grasps_per_view": 5})))
-    assert len(list(generate(tmp_path, None, small(scenes=2, **asked)))) == 1
+    # As the command does; the number of workers changes no scene.
+    again = DataFlags(**small(scenes=2, **asked).model_dump(), workers=2)
+    assert len(list(generate(tmp_path, None, again))) == 1
 
 
 def test_random_hands_differ_between_scenes_and_are_what_the_network_is_told(tmp_path) -> None:

@@ -192,6 +192,10 @@ def test_the_new_weights_answer_the_fitted_probability(name, tmp_path):
     network, metadata = load_checkpoint(old)
     file = write_outcomes(tmp_path, metadata.digest, [number % 3 == 0 for number in range(60)])
     write_outcomes(tmp_path, "of other weights", [True])
+    for wrong in ('{"held": 3, "score": 0.9}', '{"held": true, "score": NaN}', '{"held": true}'):
+        (tmp_path / "wrong.jsonl").write_text(f'{wrong[:-1]}, "digest": "a"}}\n')
+        with pytest.raises(ValueError, match=r"wrong\.jsonl, line 1"):
+            read_outcomes(tmp_path / "wrong.jsonl", "a")
     assert recalibrate(old, file, tmp_path).startswith("60 outcomes, 0.33 held")
     new = tmp_path / "old-robot.safetensors"
     assert load_checkpoint(new)[1].training["recalibrated_from_digest"] == metadata.digest

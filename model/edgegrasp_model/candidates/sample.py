@@ -211,7 +211,7 @@ def distinct_hands(
     turned = 0.0 if rule is None else min(math.radians(10), rule.rotation)
     kept, T_cloud_tcp = np.zeros(len(first), dtype=bool), T_cloud_hand @ gripper.T_hand_tcp
     order = np.argsort(~first, kind="stable")
-    kept[non_max_suppression(T_cloud_tcp, order, near, turned, len(order))[0]] = True
+    kept[non_max_suppression(T_cloud_tcp, order, near, turned)[0]] = True
     return kept
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from edgegrasp_model.errors import InvalidCheckpoint
@@ -43,7 +43,7 @@ def save_checkpoint(path: Path, network: nn.Module, metadata: CheckpointMetadata
     del values["digest"]
     text = json.dumps(values, sort_keys=True)
     partial = path.with_name(path.name + ".partial")
-    save_file(tensors, partial, metadata={_METADATA_KEY: text})
+    partial.write_bytes(save(tensors, metadata={_METADATA_KEY: text}))  # readable as other files
     partial.replace(path)
 
 

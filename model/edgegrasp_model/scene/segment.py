@@ -13,7 +13,6 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from scipy import ndimage
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch.nn import functional
 
@@ -88,6 +87,7 @@ def segment_cloud(
     """Segment a cloud view by view; an object seen in several views gets one number."""
     points = cloud.points
     number, confidence, seen_up = np.full(len(points), UNDECIDED), np.empty(0), np.zeros(3)
+    sizes = list[int]()  # how many objects each view shows
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
     down: Float64 | None = None
     rows_of_view: list[Int64 | slice] = [near]
@@ -108,9 +108,11 @@ def segment_cloud(
         number[rows] = np.where(own.number >= 0, own.number + len(confidence), own.number)
         objects[rows], support[rows] = own.object, own.support
         confidence = np.concatenate([confidence, own.confidence])
+        sizes.append(len(own.confidence))
         seen_up += own.up * len(own.number)
     if len(views) > 1:
-        number, confidence = merge_views(points, number, confidence)
+        view = np.repeat(np.arange(len(views)), sizes)
+        number, confidence = merge_views(points, number, confidence, view)
     return Segmentation(number, objects, support, confidence, unit(seen_up))
 
 
@@ -236,8 +238,17 @@ def _join_pixels(
         component[n] = root
 
 
-def merge_views(points: Float32, number: Int64, confidence: Float64) -> tuple[Int64, Float64]:
-    """The numbers (N,) and confidences of objects (O,), those in the same place joined."""
+def merge_views(
+    points: Float32,  # (N, 3) metres, of all views
+    number: Int64,  # (N,) of the objects that the views show
+    confidence: Float64,  # (O,)
+    view: Int64,  # (O,) that shows each of them
+) -> tuple[Int64, Float64]:
+    """The numbers (N,) and confidences of objects, those of several views in one place joined.
+
+    Those that overlap most come first; two of one view stay apart. Points of one that overlaps both
+    belong to what most views show in their place, then to the smaller object.
+    """
     held = np.flatnonzero(number >= 0)
     if len(held) == 0:
         return number, confidence
@@ -246,15 +257,29 @@ def merge_views(points: Float32, number: Int64, confidence: Float64) -> tuple[In
     lies = coo_array((np.ones(len(held), dtype=np.int32), (number[held], cell)), shape).tocsr()
     lies.data[:] = 1
     shared = (lies @ lies.T).toarray()
-    cells = np.diag(shared)
-    same = shared >= MIN_VIEW_OVERLAP * np.maximum(np.minimum.outer(cells, cells), 1)
-    same &= shared > 0
-    count, merged = connected_components(same, directed=False)
-    number = number.copy()
-    number[held] = merged[number[held]]
-    best = np.zeros(count)
+    cells = np.maximum(np.diag(shared), 1)
+    pairs = np.argwhere(np.triu(shared >= MIN_VIEW_OVERLAP * np.minimum.outer(cells, cells), 1))
+    overlap = shared[tuple(pairs.T)] / cells[pairs].sum(axis=1)
+    merged, spans_two = np.arange(len(confidence)), np.zeros(len(confidence), dtype=bool)
+    for pair in pairs[np.argsort(-overlap, kind="stable")]:
+        mine, theirs = (merged == merged[which] for which in pair)
+        if (mine == theirs).all():
+            continue
+        if np.isin(view[mine], view[theirs]).any():
+            spans_two[pair[cells[pair].argmax()]] = True
+        else:
+            merged[theirs] = merged[pair[0]]
+    ones = np.ones(len(merged), dtype=np.int32)
+    votes = (coo_array((ones, (merged, np.arange(len(merged))))).tocsr() @ lies).tocoo()
+    order = np.lexsort((np.bincount(merged, cells)[votes.row], -votes.data, votes.col))
+    first = order[np.unique(votes.col[order], return_index=True)[1]]
+    shown = np.where(spans_two[number[held]], votes.row[first][cell], merged[number[held]])
+    left, joined = np.unique(shown, return_inverse=True)
+    best = np.zeros(len(confidence))
     np.maximum.at(best, merged, confidence)
-    return number, best
+    number = number.copy()
+    number[held] = joined
+    return number, best[left]
 
 
 def objects_above(

@@ -33,7 +33,6 @@ def check_problem(problem: Problem, traceback: str = "") -> None:
 def problem(*asked: Any, **more: Any) -> Problem:
     """The error of what `ask` is given, which names field, value and fix."""
     error = ask(*asked, **more).error
-    assert error is not None
     for part in (error.field, error.value, error.fix):
         assert part
         assert part in error.detail
