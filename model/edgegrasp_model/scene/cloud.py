@@ -138,11 +138,8 @@ def _pixel_spacing(image: Floats) -> float:
 
 
 def subsample(rows: NDArray[Scalar], most: int = SUBSAMPLE_SIZE) -> NDArray[Scalar]:
-    """Rows spread evenly over all of an array, about `most` of them; fewer than twice as many."""
-    if (step := len(rows) // most) < 2:
-        return rows
-    # A step that divides an image's width would give the same few columns of every line.
-    return rows[np.arange(0.0, len(rows), 0.9983 * step).astype(np.int64)]
+    """Rows spread evenly over all of an array, `most` of them or a few more."""
+    return rows[:: max(len(rows) // most, 1)]
 
 
 def grid_cells(points: Floats, side: float) -> tuple[Int64, Int64]:

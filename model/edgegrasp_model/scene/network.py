@@ -21,6 +21,7 @@ from edgegrasp_model.scene.cloud import (
     LARGE_IMAGE,
     MAX_VIEW_TANGENT,
     OUTLIER_PERCENT,
+    SUBSAMPLE_SIZE,
     subsample,
     unit,
     usual_up,
@@ -133,7 +134,9 @@ def range_image(
 ) -> RangeImage:
     """Render points as seen from a viewpoint."""
     downward = [*([] if up is None else [-up]), *([] if down is None else [unit(down)])]
-    apart = subsample(points).astype(np.float64) - viewpoint
+    # A whole step that divides an image's width would leave out its last columns.
+    step = max(0.9983 * (len(points) // SUBSAMPLE_SIZE), 1.0)
+    apart = points[np.arange(0.0, len(points), step).astype(np.int64)] - viewpoint
     sight = unit(apart)
     # Rounded, so that the image is independent of the order of the points.
     turn = _camera_axes(sight.mean(axis=0).round(9), downward)
