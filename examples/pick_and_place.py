@@ -17,7 +17,7 @@ from edgegrasp_sim.camera import look_at
 OBJECTS = ("duck_vhacd.urdf", "lego/lego.urdf", "cube_small.urdf")
 PLACES = (0.45, -0.1, 0.08), (0.6, -0.1, 0.08), (0.6, 0.1, 0.08)
 HOME, TRAY = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785), (0.05, -0.5, 0.0)
-IN_TRAY = {"min": (-0.08, -0.63, 0.01), "max": (0.18, -0.37, 0.3)}  # metres, base frame
+IN_TRAY = {"min": (-0.11, -0.66, 0.015), "max": (0.21, -0.34, 0.3)}  # metres, base frame
 AXES, FORCES = [*range(7), 9, 10], [240.0] * 7 + [70.0] * 2  # of the arm and its fingers
 EYE, MIDDLE, NEAR, FAR = np.array([1.0, 0.1, 0.65]), np.array([0.5, 0.0, 0.02]), 0.1, 2.0
 CAMERA: Any = {"intrinsics": (539, 539, 319.5, 239.5), "T_cloud_camera": look_at(EYE, MIDDLE)}
@@ -39,7 +39,7 @@ p.connect(p.DIRECT)
 p.setAdditionalSearchPath(pybullet_data.getDataPath())
 p.setGravity(0.0, 0.0, -9.81)
 _, arm = p.loadURDF("plane.urdf"), p.loadURDF("franka_panda/panda.urdf", useFixedBase=True)
-p.loadURDF("tray/traybox.urdf", TRAY, globalScaling=0.6)
+p.loadURDF("tray/traybox.urdf", TRAY, globalScaling=0.8)
 objects = [p.loadURDF(*each) for each in zip(OBJECTS, PLACES, strict=True)]
 drive([HOME, HOME], [0.0, 3.0], 0.08)
 view = p.computeViewMatrix(EYE, MIDDLE, (0, 0, 1))
@@ -58,5 +58,5 @@ for _ in objects:
         start = end
     drive([motion.positions[last], HOME], [0.0, 2.0], 0.08)
 ends = np.array([p.getBasePositionAndOrientation(one)[0] for one in objects])
-inside = (np.abs(ends - TRAY)[:, :2] < 0.2).all(axis=1).sum()
+inside = (np.abs(ends - TRAY)[:, :2] < 0.24).all(axis=1).sum()
 print(f"{inside} of {len(objects)} objects in the tray")

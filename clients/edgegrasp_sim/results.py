@@ -72,7 +72,7 @@ class ResultFolder:
             raise FileNotFoundError(f"{self.path} contains no benchmark: manifest.json is missing")
         try:
             table: dict[str, Any] = json.loads(file.read_text())
-            table["run"], table["seeds"], table["rounds"]
+            table["run"]
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{file} is no manifest ({error}); choose another folder") from None
         return table
