@@ -124,7 +124,7 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
     matches = [match for match in matches if match[1] >= FOUND_SHARE]
     placed = {row: places[row] @ T[:3, :3].T + T[:3, 3] for T, _, row in matches}
     nearest = np.zeros(len(number), dtype=np.int64)  # row of the object that a point is nearest to
-    if placed and not previous.search:
+    if several := len(placed) > 1 and not previous.search:
         rows = np.repeat([*placed], [len(now) for now in placed.values()])
         tree = cKDTree(np.concatenate([*placed.values()]))
         nearest[seen] = rows[tree.query(cloud.points)[1]]
@@ -133,7 +133,7 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
         now = placed[row]
         if np.median(number[near := seen[cloud.near(now)]]) < 0:
             continue
-        near = near[(number[near] >= 0) & (previous.search | (nearest[near] == row))]
+        near = near[(number[near] >= 0) & ((nearest[near] == row) | (not several))]
         if len(near) == 0:
             continue
         there, count = np.unique(number[near], return_counts=True)
