@@ -178,8 +178,13 @@ def tensor(name: str, datatype: str, shape: Any, data: Any) -> Array:
     """A tensor of bytes, little-endian, or of nested or flat lists; raises InvalidRequestError."""
     try:
         dtype = DTYPES[datatype]
-        read = np.frombuffer if isinstance(data, bytes) else np.asarray
-        return read(data, dtype).reshape([int(size) for size in shape])
+        if isinstance(data, bytes):
+            array = np.frombuffer(data, dtype)
+        else:
+            array = np.asarray(data, dtype)
+            if "INT" in datatype and (array != np.asarray(data)).any():
+                raise ValueError(f"values that {datatype} does not hold")
+        return array.reshape([int(size) for size in shape])
     except (KeyError, OverflowError, TypeError, ValueError) as error:
         why = f"a datatype {datatype}" if isinstance(error, KeyError) else str(error)
         fix = f"Give {', '.join(DTYPES)}, as many values as the shape has."
@@ -243,8 +248,9 @@ def _grpc_infer(models: Models, request: Any, call: Any) -> dict[str, Any]:
     kinds = {key: one.WhichOneof("parameter_choice") for key, one in request.parameters.items()}
     given = {key: kind and getattr(request.parameters[key], kind) for key, kind in kinds.items()}
     wanted = [each.name for each in request.outputs]
-    model, seconds = (request.model_name, request.model_version), call.time_remaining()
-    answer = models.infer(*model, tensors, given, wanted, math.inf if seconds is None else seconds)
+    model, left = (request.model_name, request.model_version), call.time_remaining()
+    seconds = math.inf if left is None else max(left, 1e-6)  # the client refuses 0
+    answer = models.infer(*model, tensors, given, wanted, seconds)
     said = {key: {"string_param": text} for key, text in answer["parameters"].items()}
     contents = [output.pop("data").tobytes() for output in answer["outputs"]]
     return {**answer, "id": request.id, "parameters": said, "raw_output_contents": contents}
@@ -306,7 +312,8 @@ def _http_infer(
         if lists > head // 7 + MAX_SHORT_LISTS:  # each takes 20 times its size in memory
             raise ValueError(f"{lists} lists in {head} bytes")
         request = json.loads(body[:head])
-        str(request.get("id", "")).encode()  # otherwise it could not be sent back
+        # Otherwise it could not be sent back.
+        json.dumps(request.get("id", ""), allow_nan=False, ensure_ascii=False).encode()
         tensors: Tensors = {}
         binary, start = bytes(body[head:]), 0  # tensors without `data`, one behind the other
         for each in request["inputs"]:
@@ -320,7 +327,9 @@ def _http_infer(
         parameters = dict((request.get("parameters") or {}).items())
         wanted = [str(each["name"]) for each in request.get("outputs") or ()]
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
-        raise invalid("body", repr(error), "Give the JSON of an inference request.") from None
+        fix = "Give the JSON of an inference request"
+        fix += ", and its length in Inference-Header-Content-Length if tensors follow it."
+        raise invalid("body", f"{type(error).__name__}: {error}", fix) from None
     answer = models.infer(name, version, tensors, parameters, wanted)
     for output in answer["outputs"]:
         output["data"] = output["data"].ravel().tolist()

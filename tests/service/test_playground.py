@@ -260,6 +260,9 @@ def test_files_of_every_kind_are_shown_and_sent(dummy_server, open_page, tmp_pat
             continue
         if files[0].name == "depth.png":
             page.get_by_text("give the camera's fx, fy, cx, cy").wait_for()
+            page.locator("#intrinsics").fill("30,30,15,")
+            page.get_by_text("Find grasps").click()
+            page.get_by_text("give the camera's fx, fy, cx, cy").wait_for()
             page.locator("#intrinsics").fill("30,30,15,10")
             page.get_by_text("Find grasps").click()
         if files[0].name == "camera.npz":
@@ -278,7 +281,22 @@ def test_files_of_every_kind_are_shown_and_sent(dummy_server, open_page, tmp_pat
     page.set_input_files("#files", [tmp_path / "color.png"])
     page.get_by_text("add the depth image").wait_for()
     assert page.inner_text("#summary") == "No grasps yet"
-    page.locator("#stage canvas").click()  # the hands that are still drawn mean nothing
+    page.set_input_files("#files", [tmp_path / "cloud.npy"])
+    page.locator("#approach").select_option("cone")
+    for angle, told in (("22.5", '"max_angle":0.3927'), ("60", '"max_angle":1.0472')):
+        page.locator("#cone_angle").fill(angle)
+        page.locator("#cone_angle").press("Tab")
+        page.locator("#approach").select_option("")
+        page.locator("#approach").select_option("cone")
+        page.get_by_text("Find grasps").click()
+        page.locator("#curl").get_by_text(told).wait_for(state="attached")
+    page.set_input_files("#files", [tmp_path / "cloud.npy", tmp_path / "camera.npz"])
+    page.get_by_text("Open one cloud").wait_for()
+    (tmp_path / "cut.npy").write_bytes((tmp_path / "cloud.npy").read_bytes()[:301])
+    page.set_input_files("#files", [tmp_path / "cut.npy"])
+    page.get_by_text("cut.npy: the file is damaged").wait_for()
+    assert not page.locator("#curl").text_content()
+    page.locator("#stage canvas").click()  # nothing is drawn any more
 
 
 @pytest.mark.parametrize("name", ["mustard_bottle", "milk_clorox"])  # an image; a cloud

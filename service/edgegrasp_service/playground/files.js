@@ -16,6 +16,7 @@ const FORMATS = ["npy", "npz", "ply", "pcd", "xyz"];
 export async function readScene(files, camera) {
   const images = files.filter((file) => ["png", "npy"].includes(ending(file)));
   if (images.length > 1 || images.some((file) => ending(file) === "png")) return readImages(images, camera);
+  if (files.length > 1) throw new Error("Open one cloud, or one depth image and its colours.");
   const file = files[0];
   const format = ending(file);
   if (!FORMATS.includes(format)) {
@@ -42,7 +43,7 @@ function ending(file) {
 
 /** (N, 3) of an array (N, 3) or (H, W, 3). */
 function points(array) {
-  if (array.shape.at(-1) !== 3) throw new Error(`a cloud is (N, 3), this is (${array.shape})`);
+  if (array.shape.at(-1) !== 3) throw new Error(`a cloud is (N, 3), this is (${array.shape}); a depth image needs its intrinsics beside it`);
   return Float32Array.from(array.values);
 }
 
@@ -66,6 +67,7 @@ async function readImages(images, camera) {
     if (ending(file) === "png" ? head[24] === 16 && head[25] === 0 : readArray(bytes).shape[2] !== 3) depth = file;
     else color = file;
   }
+  if (images.length > (depth && color ? 2 : 1)) throw new Error("Open one depth image and its colours.");
   if (!depth) throw new Error(`${color.name}: add the depth image, a .png of 16 bits or an .npy.`);
   const read = ending(depth) === "png" ? readDepthPng : async (bytes) => readArray(bytes);
   const array = await read(await depth.arrayBuffer());
@@ -78,9 +80,9 @@ async function readImages(images, camera) {
 
 /** The fields of a Scene that a depth image (H, W) has. */
 function fromDepth(array, file, colors, { intrinsics, depth_scale }) {
-  const given = intrinsics.replace(/[[\]\s]/g, "").split(",").map(Number);
+  const given = intrinsics.replace(/[[\]\s]/g, "").split(",").map((part) => (part ? Number(part) : NaN));
   const [fx, fy, cx, cy] = given.length === 9 ? [0, 4, 2, 5].map((place) => given[place]) : given; // of a matrix
-  if (![fx, fy, cx, cy].every(Number.isFinite) || !fx || !fy) {
+  if (![4, 9].includes(given.length) || !given.every(Number.isFinite) || !fx || !fy) {
     throw new NeedsCamera(`${file.name}: give the camera's fx, fy, cx, cy in pixels.`);
   }
   const [height, width] = array.shape;
@@ -197,7 +199,7 @@ async function unzip(buffer) {
   const view = new DataView(buffer);
   let end = buffer.byteLength - 22;
   while (end >= 0 && view.getUint32(end, true) !== 0x06054b50) end--;
-  if (end < 0) throw new Error("no .npz file");
+  if (end < 0) throw new RangeError("no .npz file");
   const members = {};
   let at = view.getUint32(end + 16, true);
   for (let left = view.getUint16(end + 10, true); left > 0; left--) {

@@ -54,8 +54,9 @@ async function openSample() {
   if (!sample) return say("Open a point cloud or a depth image.");
   for (const field of ["intrinsics", "depth_scale", "viewpoint"]) $(field).value = sample[field] ?? "";
   const files = await Promise.all(sample.files.map(async (name) => {
-    const blob = await (await fetch(`samples/${encodeURIComponent(name)}`)).blob();
-    return new File([blob], name);
+    const answer = await reach(`samples/${encodeURIComponent(name)}`);
+    if (!answer.ok) throw new Error(`${name}: the server answers ${answer.status}.`);
+    return new File([await answer.blob()], name);
   }));
   if (await open(files)) await ask();
 }
@@ -77,7 +78,10 @@ async function open(files) {
     if (scene.image) Object.entries(scene.image).forEach(([name, value]) => name === "depth" || ($(name).value = value));
   } catch (error) {
     if (error instanceof NeedsCamera) $("camera").hidden = false;
-    say(error.message, true);
+    view.clear();
+    $("curl").textContent = $("python").textContent = "";
+    const damaged = error instanceof TypeError || error instanceof RangeError; // of a reader that ran out of bytes
+    say(damaged ? `${files[0].name}: the file is damaged, or of another format than its name says.` : error.message, true);
     return false;
   } finally {
     busy(null);
@@ -115,6 +119,7 @@ function options() {
   if ($("debug").checked) found.debug = true;
   if ($("follow").checked) found.previous = state.followed ?? {};
   const more = $("more").value.trim();
+  if (more && !/^{/.test(more)) throw new Error("More options: give a JSON object.");
   return more ? { ...found, ...JSON.parse(more) } : found;
 }
 
@@ -196,15 +201,21 @@ function gripperOf(asked, model) {
 async function call(path, { headers = {}, ...rest } = {}) {
   const token = $("token").value.trim();
   if (token) headers = { ...headers, authorization: `Bearer ${token}` };
-  const answer = await fetch(API + path, { headers, ...rest });
+  const answer = await reach(API + path, { headers, ...rest });
   if (answer.status === 401) {
     $("token_row").hidden = false;
     $("token").focus();
     throw new Error(token ? "The server does not know this token." : "This server needs a token.");
   }
-  const body = await answer.json();
+  const body = await answer.json().catch(() => ({})); // a proxy's error is no JSON
   if (!answer.ok) throw Object.assign(new Error(body.detail ?? `${answer.status}`), { kind: body.type });
   return body;
+}
+
+function reach(...request) {
+  return fetch(...request).catch((error) => {
+    throw error instanceof TypeError ? new Error("The server cannot be reached.") : error;
+  });
 }
 
 /** Fill the list of models; whether the server answers. */
@@ -332,12 +343,13 @@ function showCode(asked) {
   const token = $("token").value.trim();
   const file = (cloud ?? image.depth).name;
   const quoted = (text) => (/^[\w=,.@:/-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
-  const sent = parts(asked).map(([name, value]) => `-F ${quoted(`${name}=${value instanceof File ? `@${value.name}` : value}`)}`);
+  const part = (value) => (value instanceof File ? `@${/[,;"\\]/.test(value.name) ? JSON.stringify(value.name) : value.name}` : value);
+  const sent = parts(asked).map(([name, value]) => `-F ${quoted(`${name}=${part(value)}`)}`);
   if (token) sent.unshift('-H "Authorization: Bearer $EDGEGRASP_CLIENT_TOKEN"');
   $("curl").textContent = (note ? `# ${note}\n` : "") + [`curl -sS ${API}/v1/grasps`, ...sent].join(" \\\n  ");
   const { intrinsics, depth_scale: scale } = image ?? {};
   const camera = { intrinsics: JSON.parse(`[${intrinsics ?? ""}]`), ...(scale && { depth_scale: Number(scale) }) };
-  const what = cloud ? `"${file}"` : `depth_images=[${inPython({ depth: file, ...camera })}]`;
+  const what = cloud ? inPython(file) : `depth_images=[${inPython({ depth: file, ...camera })}]`;
   const given = Object.entries(asked).map(([name, value]) => `,\n        ${name}=${inPython(value)}`).join("");
   $("python").textContent = `${note ? `# ${note}\n` : ""}${token ? "import os\n\n" : ""}from edgegrasp_client import GraspClient
 
@@ -474,8 +486,8 @@ $("ask").addEventListener("submit", (event) => {
   ask();
 });
 $("files").addEventListener("change", ({ target }) => take([...target.files]));
-$("sample").addEventListener("change", openSample);
-$("token").addEventListener("change", async () => (await listModels()) && !state.scene && openSample());
+$("sample").addEventListener("change", () => openSample().catch((error) => say(error.message, true)));
+$("token").addEventListener("change", async () => (await listModels()) && (state.scene ? ask() : openSample()));
 for (const name of ["intrinsics", "depth_scale", "viewpoint"]) {
   $(name).addEventListener("change", () => state.files.length && open(state.files));
 }
@@ -501,7 +513,7 @@ $("follow").addEventListener("change", () => {
 $("keep").addEventListener("click", () => ($("debug").checked = true) && ask());
 $("approach").addEventListener("change", ({ target }) => {
   const down = state.answer ? state.answer.up.map((value) => -value) : [0, 0, -1];
-  setShape("cone", target.value === "cone" && state.scene ? { direction: down, max_angle: Math.PI / 6 } : null);
+  setShape("cone", target.value === "cone" && state.scene ? { direction: down, max_angle: (Number($("cone_angle").value) * Math.PI) / 180 } : null);
 });
 for (const name of ["region", "workspace", "cone"]) {
   $(`${name}_row`).addEventListener("change", ({ target }) => target.tagName === "INPUT" && typeShape(name));
@@ -557,8 +569,8 @@ function typed(id, count) {
 }
 
 function numbers(text, count) {
-  const values = text.replace(/[[\]]/g, "").split(",").map(Number);
-  return text.trim() && values.length === count && values.every(Number.isFinite) ? values : null;
+  const values = text.replace(/[[\]]/g, "").split(",").map((part) => (part.trim() ? Number(part) : NaN));
+  return values.length === count && values.every(Number.isFinite) ? values : null;
 }
 
 function element(tag, text) {

@@ -103,10 +103,7 @@ export class View {
 
   /** Show another scene, from where its camera stood. */
   showScene(scene) {
-    this.groups.cloud.children[0]?.geometry.dispose();
-    for (const group of Object.values(this.groups)) group.clear();
-    [this.hands, this.target] = [[], null];
-    this._showObjects([]);
+    this.clear();
     const count = scene.points.length / 3;
     const step = Math.ceil(count / MOST_POINTS);
     const [places, shades] = [[], []];
@@ -137,6 +134,14 @@ export class View {
     this.camera.updateProjectionMatrix();
     this._showFrame(scene);
     this.look("camera");
+  }
+
+  /** Show nothing. */
+  clear() {
+    this.groups.cloud.children[0]?.geometry.dispose();
+    for (const group of Object.values(this.groups)) group.clear();
+    [this.hands, this.target] = [[], null];
+    this._showObjects([]);
   }
 
   /** Draw points so large, pixels. */
