@@ -75,20 +75,20 @@ class GraspTracker:
         """The options of the next request."""
         last, options = self._last, dict(self._options)
         self._searching = last is None or self._since >= self._every
+        object_ = last and last.grasps[0].object
         previous: dict[str, Any] = {"next_id": self._next_id, "search": self._searching}
+        previous["objects"] = [
+            {"number": one.number, "surface": one.surface, "confidence": one.confidence}
+            for one in sorted(self._objects.values(), key=lambda one: one.number != object_)
+            if self._searching or one.number == object_
+        ][:MAX_OBJECTS]
         if last is not None:
-            object_ = last.grasps[0].object
             grasps = [grasp for grasp in last.grasps if grasp.object == object_][:GRASPS_PER_OBJECT]
             previous["gripper"] = last.gripper.name
             previous["grasps"] = [
                 {"id": one.id, "T_cloud_hand": one.T_cloud_hand.ravel(), "object": one.object}
                 for one in grasps
             ]
-            previous["objects"] = [
-                {"number": one.number, "surface": one.surface, "confidence": one.confidence}
-                for one in sorted(self._objects.values(), key=lambda one: one.number != object_)
-                if self._searching or one.number == object_
-            ][:MAX_OBJECTS]
             if not self._searching:
                 seen = last.support
                 plane = seen and {"normal": seen.normal.tolist(), "offset": seen.offset}

@@ -2,23 +2,15 @@
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float64
 
 
 def quaternion_xyzw(T: Float64) -> list[float]:
     """The rotation part of a 4 x 4 rigid transform as a unit quaternion `xyzw`."""
-    (a, b, c), (d, e, f), (g, h, i) = T[:3, :3].tolist()
-    # Four times the products of the quaternion with itself; its largest column is the sharpest.
-    products = (
-        (1.0 + a - e - i, b + d, c + g, h - f),
-        (b + d, 1.0 - a + e - i, f + h, c - g),
-        (c + g, f + h, 1.0 - a - e + i, d - b),
-        (h - f, c - g, d - b, 1.0 + a + e + i),
-    )
-    column = products[max(range(4), key=lambda k: products[k][k])]
-    length = sum(value * value for value in column) ** 0.5
-    return [value / length for value in column]
+    turn = Rotation.from_matrix(T[:3, :3], assume_valid=True)
+    return [float(part) for part in turn.as_quat()]
 
 
 def about_z(angle: float) -> tuple[float, float, float, float]:

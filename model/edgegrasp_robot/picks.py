@@ -33,7 +33,7 @@ MAX_OFF_LINE = 0.002  # most metres between the hand and its straight line
 LIMIT_SHARE = 0.99  # share of the limits that is used, as splines overshoot a little
 STEP_SECONDS = 0.01  # seconds between the rows of a trajectory
 TRAJECTORY_CHECK_STEP = 0.005  # radians between the joints that are checked along a trajectory
-PATH_CHECK_STEP = 0.03  # radians between the joints that are checked along a path
+PATH_CHECK_STEP = 0.03  # along a path; finer where its trajectory touches something after all
 PATH_SECONDS = 1.0  # of a request, for searches that find no path; others take milliseconds
 IK_RESTARTS = 2  # of the inverse kinematics, from joints at random
 TRAVEL_COST = 0.02  # cost, as a share of a score, per radian of the joint that turns most
@@ -231,17 +231,16 @@ class _Arm:
         """Add a collision-checked trajectory, if one is found."""
         free, straight = self._robot.scene, self._robot.straight
         back = self._retreat(pick) if pick.put is None else pick.put.back
-        path = self._free_path(free, self._start, pick.line[0]) if back else []
-        if not path:
+        first = self._free_motion(free, self._start, pick.line[0]) if back else None
+        if first is None:
             return pick
-        ways = pick.line, back
-        timed = [self._timed(free, path), *(self._timed(straight, way, True) for way in ways)]
+        timed = [first, *(self._timed(straight, way, True) for way in (pick.line, back))]
         if (put := pick.put) is not None:
             # From the end of the retreat over the place, down, and back with an empty hand.
             T_base_hand = self._T_base_cloud @ pick.grasp.T_cloud_hand
             with carrying(self._robot, put.around, put.load, T_base_hand) as scene:
-                over = self._free_path(scene, put.back[-1], put.down[0])
-                timed += [self._timed(scene, over), self._timed(scene, put.down, True)]
+                over = self._free_motion(scene, put.back[-1], put.down[0])
+                timed += [over, self._timed(scene, put.down, True)]
                 scene.removeGeometry(HELD_NAME)
                 timed.append(self._timed(scene, put.away, True))
         parts = [part for part in timed if part is not None]
@@ -308,10 +307,22 @@ class _Arm:
         held = held or held_by(pick.grasp, self._scene, self._robot.gripper)
         return line if line and can_leave(held, self._scene, way, rules) else []
 
-    def _free_path(self, scene: core.Scene, start: Float64, end: Float64) -> list[Float64]:
+    def _free_motion(
+        self, scene: core.Scene, start: Float64, end: Float64
+    ) -> core.JointTrajectory | None:
+        """A collision-free motion from rest to rest."""
+        for step in (PATH_CHECK_STEP, TRAJECTORY_CHECK_STEP):
+            path = self._free_path(scene, start, end, step)
+            timed = self._timed(scene, path) if path else None
+            if timed is not None or not path:
+                return timed
+        return None
+
+    def _free_path(
+        self, scene: core.Scene, start: Float64, end: Float64, step: float
+    ) -> list[Float64]:
         """Joints between which linear joint motions are collision-free; none: there are none."""
         names, seed = self._robot.joint_names, self._options.seed % 2**31
-        step = PATH_CHECK_STEP
         options = RRTOptions(GROUP, 3000, rrt_connect=True, collision_check_step_size=step)
         begin = time.monotonic()
         # Nodes alone are no limit: none are added where every way is blocked. Zero is without end.
@@ -324,7 +335,7 @@ class _Arm:
         except RuntimeError:  # no path within these limits
             self._path_seconds -= time.monotonic() - begin
             return []
-        rules = core.PathShortcuttingOptions(GROUP, PATH_CHECK_STEP, seed=seed)
+        rules = core.PathShortcuttingOptions(GROUP, step, seed=seed)
         return list(map(np.array, core.PathShortcutter(scene, rules).shortcut(path).positions))
 
     def _timed(

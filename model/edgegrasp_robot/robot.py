@@ -387,7 +387,7 @@ def _add_hand(root: Element, file: RobotFile, gripper: Gripper) -> None:
     joint = ElementTree.SubElement(root, "joint", name=f"{HAND}_joint", type="fixed")
     ElementTree.SubElement(joint, "parent", link=file.flange_frame)
     ElementTree.SubElement(joint, "child", link=HAND)
-    turn = Rotation.from_quat(file.T_flange_hand.quaternion).as_euler("xyz")
+    turn = Rotation.from_quat(file.T_flange_hand.quaternion).as_euler("xyz", suppress_warnings=True)
     place = _numbers(file.T_flange_hand.position)
     ElementTree.SubElement(joint, "origin", xyz=place, rpy=_numbers(turn))
 

@@ -267,7 +267,9 @@ def previous(tracker: GraspTracker) -> dict[str, Any]:
 
 def test_it_searches_first_then_follows_and_searches_again_after_some_images() -> None:
     tracker = GraspTracker(search_every=3, at=(3, 4))
-    assert previous(tracker) == {"next_id": 0, "search": True}
+    assert previous(tracker) == {"next_id": 0, "search": True, "objects": []}
+    tracker.take(answer(grasps=0))
+    assert [one["number"] for one in previous(tracker)["objects"]] == [0, 1]
     searched = []
     for _ in range(6):
         tracker.take(answer())

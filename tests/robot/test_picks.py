@@ -201,7 +201,9 @@ def test_what_no_camera_saw_is_avoided_where_asked(fr3, eyes, reachable):
 TOUCHING = [{"kind": "box", "min": (x, 0.5, -0.1), "max": (x + 0.2, 0.9, 0.3)} for x in (0.4, 0.5)]
 
 
-@pytest.mark.parametrize("collision", [{"approach_length": 0.0}, {"obstacles": TOUCHING}])
+@pytest.mark.parametrize(
+    "collision", [{"approach_length": 0.0}, {"approach_length": 0.01}, {"obstacles": TOUCHING}]
+)
 def test_a_motion_may_have_no_straight_approach_and_obstacles_may_touch(fr3, collision):
     detection = picks_of(fr3, np.eye(4), options={"collision": collision})
     assert detection.counts["with_trajectory"] == len(BOXES)
