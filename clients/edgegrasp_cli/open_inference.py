@@ -178,12 +178,10 @@ def tensor(name: str, datatype: str, shape: Any, data: Any) -> Array:
     """A tensor of bytes, little-endian, or of nested or flat lists; raises InvalidRequestError."""
     try:
         dtype = DTYPES[datatype]
-        if isinstance(data, bytes):
-            array = np.frombuffer(data, dtype)
-        else:
-            array = np.asarray(data, dtype)
-            if "INT" in datatype and (array != np.asarray(data)).any():
-                raise ValueError(f"values that {datatype} does not hold")
+        raw = isinstance(data, bytes)
+        array = np.frombuffer(data, dtype) if raw else np.asarray(data, dtype)
+        if not raw and "INT" in datatype and (array != np.asarray(data)).any():
+            raise ValueError(f"values that {datatype} does not hold")
         return array.reshape([int(size) for size in shape])
     except (KeyError, OverflowError, TypeError, ValueError) as error:
         why = f"a datatype {datatype}" if isinstance(error, KeyError) else str(error)
