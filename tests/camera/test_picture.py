@@ -32,9 +32,8 @@ def test_what_the_cloud_hides_of_a_hand_is_faint(behind: bool) -> None:
     side = np.linspace(-0.3, 0.3, 200)
     x, z = (grid.ravel() for grid in np.meshgrid(side, side))
     wall = np.stack([x, np.zeros_like(x), z], axis=1)
-    T = np.eye(4)
-    T[:3, :3] = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
-    T[:3, 3] = (0.0, 0.2 if behind else -0.2, 0.1)
+    y = 0.2 if behind else -0.2
+    T = np.array([[0, 1, 0, 0], [1, 0, 0, y], [0, 0, -1, 0.1], [0, 0, 0, 1]])
     stream, grasp = io.BytesIO(), SimpleNamespace(T_cloud_hand=T, score=1.0, width=0.08)
     picture = Picture(View.of(wall, (0.0, -1.0, 0.0)), wall)
     picture.grasps([grasp])

@@ -99,9 +99,7 @@ async def test_an_agent_gets_grasps_and_sees_them(dummy_server, folder: Path) ->
 
 
 async def test_a_camera_pose_puts_answers_into_the_base_frame(dummy_server, folder: Path) -> None:
-    T_base_camera = np.eye(4)
-    T_base_camera[:3, :3] = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
-    T_base_camera[:3, 3] = 0.4, 0.1, 0.9
+    T_base_camera = np.array([[0, -1, 0, 0.4], [-1, 0, 0, 0.1], [0, 0, -1, 0.9], [0, 0, 0, 1]])
     asked = IMAGE | {"T_base_camera": T_base_camera.tolist()}
     depth = np.asarray(image.open(folder / "depth.png"))
     view = {"depth": depth, "intrinsics": CAMERA, "T_cloud_camera": T_base_camera}

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from edgegrasp_client import Grasp
 from edgegrasp_client.conversions import (
@@ -29,15 +29,10 @@ DOWN = np.array([[0, 1, 0, 0.5], [1, 0, 0, -0.1], [0, 0, -1, 0.3], [0, 0, 0, 1.0
 UP = np.array([[1, 0, 0, 0.25], [0, 1, 0, -0.5], [0, 0, 1, 1.0], [0, 0, 0, 1]])  # no turn at all
 
 finite = st.floats(-2.0, 2.0)
+places = st.tuples(finite, finite, finite)
 quaternions = st.tuples(finite, finite, finite, finite).filter(lambda q: np.linalg.norm(q) > 1e-3)
-
-
-@st.composite
-def poses(draw: st.DrawFn) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(draw(quaternions)).as_matrix()
-    pose[:3, 3] = draw(st.tuples(finite, finite, finite))
-    return pose
+motions = st.builds(RigidTransform.from_components, places, quaternions.map(Rotation.from_quat))
+poses = motions.map(RigidTransform.as_matrix)
 
 
 def grasp(pose: np.ndarray, score: float = 0.9, width: float = 0.06) -> Grasp:
@@ -79,15 +74,14 @@ def test_axes_that_make_no_frame_are_refused(axes: tuple[str, str]) -> None:
 
 def test_the_pandas_parent_link_is_turned_by_45_degrees_at_the_same_place() -> None:
     """franka_description mounts panda_hand on panda_link8 with rpy="0 0 -pi/4"."""
-    T_link_hand = np.eye(4)
-    T_link_hand[:3, :3] = Rotation.from_euler("z", -np.pi / 4).as_matrix()
+    T_link_hand = RigidTransform.from_rotation(Rotation.from_euler("z", -np.pi / 4)).as_matrix()
     np.testing.assert_allclose(PANDA_LINK8 @ T_link_hand, np.eye(4), atol=1e-12)
 
 
 @given(
-    cases=st.lists(st.tuples(poses(), st.floats(0, 1), st.floats(0, 0.1)), max_size=3),
-    T_object_cloud=poses(),
-    T_hand_gripper=poses(),
+    cases=st.lists(st.tuples(poses, st.floats(0, 1), st.floats(0, 0.1)), max_size=3),
+    T_object_cloud=poses,
+    T_hand_gripper=poses,
 )
 def test_isaac_grasps_round_trip(cases, T_object_cloud, T_hand_gripper) -> None:
     grasps = [grasp(*case) for case in cases]

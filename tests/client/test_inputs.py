@@ -132,11 +132,10 @@ def test_options_may_be_sequences_of_any_kind(client, cloud) -> None:
 
 
 SOME = np.zeros((40, 3), np.float32)
-NEGATIVE = {"contact_region": {"include": [{"kind": "indices", "indices": [0, -1]}]}}
 
 
-def mask(values: Any) -> dict[str, Any]:
-    return {"contact_region": {"include": [{"kind": "mask", "mask": values}]}}
+def region(**shape: Any) -> dict[str, Any]:
+    return {"contact_region": {"include": [shape]}}
 
 
 def image(**changes: Any) -> dict[str, Any]:
@@ -157,9 +156,9 @@ OPTIONS: list[tuple[dict[str, Any], str]] = [
     ({"approach_region": {"include": ["box"]}}, "approach_region.include.0"),
     ({"approach_region": {"include": [{"kind": "cube"}]}}, "approach_region.include.0"),
     ({"approach_region": [{"kind": "mask", "mask": [True]}]}, "approach_region"),
-    (mask(np.ones((3, 4), np.float32)), "contact_region.include.0.mask"),
-    (mask([[True], [False, True]]), "contact_region.include.0.mask"),
-    (NEGATIVE, "contact_region.include.0.indices.1"),
+    (region(kind="mask", mask=np.ones((3, 4), np.float32)), "contact_region.include.0.mask"),
+    (region(kind="mask", mask=[[True], [False, True]]), "contact_region.include.0.mask"),
+    (region(kind="indices", indices=[0, -1]), "contact_region.include.0.indices.1"),
     ({"gripper": [7]}, "gripper"),
     ({"robot": {"name": "fr3", "T_base_cloud": 3, "joints": [0.0]}}, "robot.T_base_cloud"),
 ]

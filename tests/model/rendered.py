@@ -3,6 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from edgegrasp_sim.camera import look_at
+
 WIDTH, HEIGHT, FOCAL_LENGTH = 320, 240, 270.0
 NOISE = 0.0015  # metres at one metre; grows with the square of the distance
 
@@ -43,13 +45,8 @@ def boxes_on_table(seed: int, count: int = 4) -> list[SolidBox]:
 
 def camera(polar: float, azimuth: float, distance: float) -> np.ndarray:
     """T_world_camera (4, 4), looking at the origin; x right, y down, z forward."""
-    level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    out = np.sin(polar) * level + (0.0, 0.0, np.cos(polar))
-    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    T_world_camera = np.eye(4)
-    T_world_camera[:3, :3] = np.stack([right, np.cross(-out, right), -out], axis=1)
-    T_world_camera[:3, 3] = distance * out
-    return T_world_camera
+    level = np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth)
+    return look_at(distance * np.array([*level, np.cos(polar)]), np.zeros(3))
 
 
 def to_world(T_world_camera: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
-from edgegrasp_model.scene.cloud import UP, CanonicalFrame, Cloud
+from edgegrasp_model.scene.cloud import UP, CanonicalFrame, Cloud, pose_matrix
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_training.recipes import build_network
 
@@ -65,7 +65,5 @@ def scene_of(points: np.ndarray, **fields: object) -> Scene:
 def random_hands(count: int, seed: int, reach: float = 0.2) -> np.ndarray:
     """Poses (count, 4, 4) turned at random, not further than `reach` along each axis."""
     rng = np.random.default_rng(seed)
-    poses = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1))
-    poses[:, :3, :3] = Rotation.random(count, rng=rng).as_matrix()
-    poses[:, :3, 3] = rng.uniform(-reach, reach, (count, 3))
-    return poses
+    turns = Rotation.random(count, rng=rng).as_matrix()
+    return pose_matrix(turns, rng.uniform(-reach, reach, (count, 3))).astype(np.float32)

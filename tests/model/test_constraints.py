@@ -10,7 +10,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from edgegrasp_model.gripper import Gripper, load_gripper
 from edgegrasp_model.options import DetectOptions
@@ -226,14 +226,13 @@ def holds(shape: dict, sent: CloudInput, point: np.ndarray, at_least_partly: boo
 
 
 def check_direction(fields: dict, grasp: Grasp) -> None:
-    up = np.array(fields["up"]) / np.linalg.norm(fields["up"])
     way = grasp.T_cloud_hand[:3, 2].astype(np.float64)
     np.testing.assert_array_equal(grasp.approach_direction, grasp.T_cloud_hand[:3, 2])
     asked = fields["approach_direction"]
     if asked is None:
-        assert way @ up < 0.1 + 1e-5
+        assert way @ fields["up"] < 0.1 + 1e-5
         return
-    down = angle(way, -up)
+    down = angle(way, np.negative(fields["up"]))
     cones = asked["cones"]
     allowed = [angle(way, cone["direction"]) <= cone["max_angle"] + 1e-3 for cone in cones]
     allowed.append(asked["preset"] == "top-down" and down <= math.radians(30) + 1e-3)
@@ -262,9 +261,8 @@ def check_pose(fields: dict, grasp: Grasp, gripper: Gripper) -> None:
 def ways(fields: dict, grasp: Grasp) -> np.ndarray:
     """Offsets (W, 3) of the hand from the grasp along the way in and out."""
     request, steps = fields["collision"], np.linspace(0, 1, STEPS)[:, None]
-    up = np.array(fields["up"]) / np.linalg.norm(fields["up"])
     back = -grasp.T_cloud_hand[:3, 2].astype(np.float64)
-    out = up if request["retreat_direction"] == "up" else back
+    out = np.array(fields["up"]) if request["retreat_direction"] == "up" else back
     approach, retreat = request["approach_length"] * back, request["retreat_length"] * out
     return np.concatenate([steps * approach, steps * retreat])
 
@@ -318,7 +316,6 @@ def lattice(box: dict) -> np.ndarray:
 
 
 def check_order(fields: dict, grasps: list[Grasp]) -> None:
-    up = np.array(fields["up"]) / np.linalg.norm(fields["up"])
     free = [grasp.collision_free or fields["collision"]["mode"] == "ignore" for grasp in grasps]
     if fields["order"] == "clearance":
         keys = [(is_free, g.clearance) for g, is_free in zip(grasps, free, strict=True)]
@@ -332,7 +329,7 @@ def check_order(fields: dict, grasps: list[Grasp]) -> None:
         assert len({grasp.object for grasp in grasps[:firsts]}) == firsts
         worth = worth[firsts:]
     sure = sum(value >= 0.9 for value in worth) if fields["order"] == "highest" else 0
-    heights = [float(grasp.T_cloud_tcp[:3, 3] @ up) for grasp in grasps[:sure]]
+    heights = [float(grasp.T_cloud_tcp[:3, 3] @ fields["up"]) for grasp in grasps[:sure]]
     assert all(a >= b - 1e-5 for a, b in itertools.pairwise(heights))
     assert all(value >= 0.9 for value in worth[:sure])
     apart = CLOSE if fields["order"] == "score" else 1e-6
@@ -360,50 +357,36 @@ def beyond_sides(points: np.ndarray, T_cloud_hand: np.ndarray, boxes: np.ndarray
     return np.maximum(boxes[:, 0] - position, position - boxes[:, 1])
 
 
-VIEW = np.array([0.4, 0.15, 0.45])
+VIEW = [0.4, 0.15, 0.45]
 
 
-class Turned:
-    """A rigid motion of a scene and of everything a request says about it."""
-
-    def __init__(self, seed: int) -> None:
-        rng = np.random.default_rng(seed)
-        self.turn = Rotation.random(rng=rng)
-        self.shift = rng.uniform(-0.4, 0.4, 3)
-
-    def points(self, points: np.ndarray) -> np.ndarray:
-        return self.turn.apply(np.asarray(points, np.float64)) + self.shift
-
-    def point(self, *xyz: float) -> list[float]:
-        return self.points(np.array([xyz]))[0].tolist()
-
-    def direction(self, *xyz: float) -> list[float]:
-        return self.turn.apply(np.array(xyz)).tolist()
-
-    def plane(self, normal: list[float], offset: float) -> dict[str, object]:
-        turned = self.turn.apply(normal)
-        return {"normal": turned.tolist(), "offset": offset + float(turned @ self.shift)}
+def plane(moved: RigidTransform, normal: list[float], offset: float) -> dict[str, object]:
+    """A plane of a scene that was moved."""
+    turned = moved.rotation.apply(normal)
+    return {"normal": turned.tolist(), "offset": offset + float(turned @ moved.translation)}
 
 
-def constraints(turned: Turned) -> dict[str, object]:
+def constraints(moved: RigidTransform) -> dict[str, object]:
     """Every kind of constraint that is not bound to the frame's axes."""
     box = {
         "kind": "oriented_box",
-        "center": turned.point(0.0, 0.0, 0.05),
+        "center": moved.apply([0.0, 0.0, 0.05]).tolist(),
         "half_extents": [0.05, 0.05, 0.045],
-        "quaternion": turned.turn.as_quat().tolist(),
+        "quaternion": moved.rotation.as_quat().tolist(),
     }
-    hole = {"kind": "sphere", "center": turned.point(0.02, 0.0, 0.08), "radius": 0.01}
-    far = {"kind": "half_space", **turned.plane([0.0, 1.0, 0.0], -0.02)}
-    wall = {**box, "center": turned.point(-0.2, 0.0, 0.1), "half_extents": [0.02, 0.2, 0.1]}
+    hole = {"kind": "sphere", "center": moved.apply([0.02, 0.0, 0.08]).tolist(), "radius": 0.01}
+    far = {"kind": "half_space", **plane(moved, [0.0, 1.0, 0.0], -0.02)}
+    aside = moved.apply([-0.2, 0.0, 0.1]).tolist()
+    wall = {**box, "center": aside, "half_extents": [0.02, 0.2, 0.1]}
+    down = moved.rotation.apply([-0.2, 0.1, -1.0]).tolist()
     return {
-        "viewpoint": turned.point(*VIEW),
-        "up": turned.direction(0.0, 0.0, 2.0),
-        "support": turned.plane([0.0, 0.0, 1.0], 0.0),
+        "viewpoint": moved.apply(VIEW).tolist(),
+        "up": moved.rotation.apply([0.0, 0.0, 2.0]).tolist(),
+        "support": plane(moved, [0.0, 0.0, 1.0], 0.0),
         "approach_region": {"include": [box], "exclude": [hole]},
         "contact_region": {"include": [far]},
         "approach_direction": {
-            "cones": [{"direction": turned.direction(-0.2, 0.1, -1.0), "max_angle": 0.9}],
+            "cones": [{"direction": down, "max_angle": 0.9}],
             "preset": "top-down",
         },
         "collision": {
@@ -416,36 +399,37 @@ def constraints(turned: Turned) -> dict[str, object]:
     }
 
 
-def frame_only(turned: Turned) -> dict[str, object]:
-    return {"up": turned.direction(0.0, 0.0, 1.0), "num_approach_points": 16}
+def frame_only(moved: RigidTransform) -> dict[str, object]:
+    return {"up": moved.rotation.apply([0.0, 0.0, 1.0]).tolist(), "num_approach_points": 16}
 
 
-def found_plane(turned: Turned) -> dict[str, object]:
-    plane = {"viewpoint": turned.point(*VIEW), "support": {"kind": "ransac"}}
-    return frame_only(turned) | plane | {"order": "highest"}
+def found_plane(moved: RigidTransform) -> dict[str, object]:
+    plane = {"viewpoint": moved.apply(VIEW).tolist(), "support": {"kind": "ransac"}}
+    return frame_only(moved) | plane | {"order": "highest"}
 
 
 @pytest.mark.parametrize("request_of", [constraints, frame_only, found_plane])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_turned_scene_has_the_same_grasps_turned(request_of, seed) -> None:
-    still, turned = Turned(0), Turned(seed)
-    still.turn, still.shift = Rotation.identity(), np.zeros(3)
+    rng = np.random.default_rng(seed)
+    turn = Rotation.random(rng=rng)
+    moved = RigidTransform.from_components(rng.uniform(-0.4, 0.4, 3), turn)
     cloud = box_on_table(4000, table=request_of is found_plane)
     here, there = (
-        detector().detect(way.points(cloud), DetectOptions.model_validate(request_of(way)))
-        for way in (still, turned)
+        detector().detect(way.apply(cloud), DetectOptions.model_validate(request_of(way)))
+        for way in (RigidTransform.identity(), moved)
     )
     assert len(here.grasps) >= 5
     for name, count in here.counts.items():  # a point on a border may fall on either side
         assert abs(there.counts[name] - count) <= 1 + 0.02 * count, name
     contacts = np.array([grasp.contact_point for grasp in there.grasps])
     for a in here.grasps[:5]:
-        apart = np.linalg.norm(contacts - turned.points(a.contact_point), axis=1)
+        apart = np.linalg.norm(contacts - moved.apply(a.contact_point), axis=1)
         same = [there.grasps[row] for row in np.flatnonzero(apart < 5e-4)]
-        rotation = turned.turn.as_matrix() @ a.T_cloud_hand[:3, :3]
+        rotation = turn.as_matrix() @ a.T_cloud_hand[:3, :3]
         assert any(
             np.allclose(b.T_cloud_hand[:3, :3], rotation, atol=5e-3)
-            and np.allclose(b.T_cloud_tcp[:3, 3], turned.points(a.T_cloud_tcp[:3, 3]), atol=1e-3)
+            and np.allclose(b.T_cloud_tcp[:3, 3], moved.apply(a.T_cloud_tcp[:3, 3]), atol=1e-3)
             and abs(b.score - a.score) < 0.02
             and abs(b.clearance - a.clearance) < 1e-3
             and abs(b.width - a.width) < 1e-3

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from tests.checks import refusal
 
 from edgegrasp_camera.depth import DepthView, Intrinsics, fuse_depth_images
@@ -19,7 +20,7 @@ from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, pars
 from edgegrasp_model.ranking import densest_first
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene import network
-from edgegrasp_model.scene.cloud import CloudInput
+from edgegrasp_model.scene.cloud import CloudInput, pose_matrix
 from edgegrasp_results import Detection, Grasp
 from edgegrasp_training.recipes import build_network
 
@@ -378,11 +379,8 @@ def test_an_object_without_a_good_grasp_has_a_reason(size, options, reason) -> N
 
 def hands(places: list[float], turns: list[float]) -> np.ndarray:
     """Upright hands along x, turned about the approach, radians.  # (E, 4, 4)."""
-    poses = np.tile(np.eye(4, dtype=np.float32), (len(places), 1, 1))
-    poses[:, 0, 3] = places
-    cosine, sine = np.cos(turns), np.sin(turns)
-    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cosine, -sine, sine, cosine
-    return poses
+    turned = Rotation.from_euler("z", np.reshape(turns, (-1, 1))).as_matrix()
+    return pose_matrix(turned, np.outer(places, (1, 0, 0))).astype(np.float32)
 
 
 def test_hands_are_averaged_with_others_on_the_same_object_that_are_near_and_turned_alike() -> None:
@@ -412,8 +410,7 @@ def level(width: float, length: float, turn: float) -> np.ndarray:
     """A level rectangle seen from above: a point every 4 mm, sampled in its own axes."""
     sides = [np.linspace(-side / 2, side / 2, round(side / 0.004) + 1) for side in (width, length)]
     x, y = (grid.ravel() for grid in np.meshgrid(*sides))
-    cosine, sine = np.cos(turn), np.sin(turn)
-    points = np.stack([cosine * x - sine * y, sine * x + cosine * y, 0 * x + TOP], axis=1)
+    points = Rotation.from_euler("z", turn).apply(np.stack([x, y, 0 * x + TOP], axis=1))
     return points + np.random.default_rng(0).normal(0.0, 0.0003, points.shape)
 
 

@@ -14,7 +14,7 @@ from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import SupportPlane
-from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_model.scene.cloud import Cloud, unit
 from edgegrasp_model.scene.scene import Surroundings
 from edgegrasp_training.recipes import RECIPES, build_network
 
@@ -38,8 +38,7 @@ class RandomScene:
         """4 balls, some 40 edge grasps."""
         rng = np.random.default_rng(seed)
         points = rng.uniform(-0.06, 0.06, (150, 3)) * (1.0, 1.0, 0.4)
-        normals = rng.normal(size=(150, 3))
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = unit(rng.normal(size=(150, 3)))
         approach_index = rng.choice(150, 4, replace=False)
         distance = np.linalg.norm(points[approach_index][:, None] - points, axis=2)  # (A, N)
         edges = np.argwhere((distance > 0.003) & (distance < 0.038))
@@ -145,7 +144,7 @@ def look(seed: int) -> HandBatch:
     """What the hands of 60 random pairs of a cloud see of it."""
     rng = np.random.default_rng(seed)
     points = (rng.uniform(-0.5, 0.5, (150, 3)) * (0.06, 0.05, 0.07)).astype(np.float32)
-    cloud = Cloud(points, points / np.linalg.norm(points, axis=1, keepdims=True))
+    cloud = Cloud(points, unit(points))
     candidates, _ = edge_grasps(cloud, *rng.integers(150, size=(2, 60)), PANDA)
     up, camera = np.float32([0.0, 0.0, 1.0]), np.float32([[0.3, 0.2, 0.5]])
     support = SupportPlane(normal=(0.0, 0.0, 1.0), offset=-0.05)

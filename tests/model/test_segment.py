@@ -103,10 +103,7 @@ def test_background_around_them_makes_no_other_objects(seed: int, around: set[st
     assert kept <= standing(plain, boxes, T_world_camera)
     up = T_world_camera[:3, :3] @ crowded.support.normal
     assert up[2] > np.cos(np.radians(5))
-    height = crowded.support.offset - crowded.support.normal @ (
-        -T_world_camera[:3, :3].T @ T_world_camera[:3, 3]
-    )
-    assert abs(height) < 0.01
+    assert abs(crowded.support.offset + up @ T_world_camera[:3, 3]) < 0.01  # its height
     assert_grasped(crowded, boxes, T_world_camera)
     for grasp in crowded.grasps:
         assert grasp.approach_direction @ crowded.support.normal < 0.11  # none from below
@@ -273,9 +270,8 @@ def test_a_segment_for_every_pixel_takes_no_more_approach_points() -> None:
 def test_objects_that_one_of_three_views_shows_as_one_stay_apart() -> None:
     grid = np.stack(np.meshgrid(*[np.arange(0.0, 0.04, 0.002)] * 2), axis=-1).reshape(-1, 2)
     left = np.pad(grid, ((0, 0), (0, 1)))
-    seen = np.tile(np.concatenate([left, left + np.array([0.048, 0, 0])]), (3, 1)).astype(
-        np.float32
-    )
+    both = np.concatenate([left, left + np.array([0.048, 0, 0])]).astype(np.float32)
+    seen = np.tile(both, (3, 1))
     number = np.repeat([0, 0, 1, 2, 3, 4], len(left))
     confidence, view = np.array([0.9, 0.8, 0.7, 0.6, 0.5]), np.array([0, 1, 1, 2, 2])
     joined, best = merge_views(seen, number, confidence, view)

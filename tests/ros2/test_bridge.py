@@ -17,6 +17,7 @@ from edgegrasp_camera import InvalidRequest
 from edgegrasp_client import GraspClient, GraspTracker, InvalidRequestError, Robot
 from edgegrasp_client.conversions import PANDA_LINK8, matrix_from_quaternion
 from edgegrasp_client.options import DetectOptions
+from edgegrasp_model.scene.cloud import pose_matrix
 from edgegrasp_results import ArmPlan, ArmTrajectory
 from edgegrasp_sim.poses import translation
 
@@ -30,9 +31,7 @@ HEADER = {"stamp": STAMP, "frame_id": "camera"}
 MATRIX = [60.0, 0.0, 15.5, 0.0, 60.0, 11.5, 0.0, 0.0, 1.0]
 DEPTH = np.random.default_rng(0).integers(500, 600, (24, 32)).astype(np.uint16)
 
-T_base_camera = np.eye(4)
-T_base_camera[:3, :3] = Rotation.from_euler("x", 2.5).as_matrix()
-T_base_camera[:3, 3] = 0.4, 0.0, 0.7
+T_base_camera = pose_matrix(Rotation.from_euler("x", 2.5).as_matrix(), (0.4, 0.0, 0.7))
 FRAMES = {"camera": T_base_camera, "base": np.eye(4), "hand": np.eye(4), "link8": PANDA_LINK8}
 
 
@@ -132,11 +131,9 @@ def test_the_first_pose_follows_its_object_from_message_to_message(real_server):
 
 
 def matrix(pose: Any) -> np.ndarray:
-    transform = np.eye(4)
-    turn = pose.orientation
-    transform[:3, :3] = matrix_from_quaternion([turn.x, turn.y, turn.z, turn.w])
-    transform[:3, 3] = pose.position.x, pose.position.y, pose.position.z
-    return transform
+    turn, place = pose.orientation, pose.position
+    rotation = matrix_from_quaternion([turn.x, turn.y, turn.z, turn.w])
+    return pose_matrix(rotation, (place.x, place.y, place.z))
 
 
 @pytest.mark.parametrize(("kind", "encoding"), [(np.uint16, "16UC1"), (np.float32, "32FC1")])

@@ -67,8 +67,6 @@ class Raw:
 
 
 class Grpc(Raw):
-    name = "grpc"
-
     def __init__(self, server: Server, *options: tuple[str, int]) -> None:
         options = (("grpc.max_send_message_length", -1), *options)
         self.channel = aio.insecure_channel(server.grpc_address, options)
@@ -95,8 +93,6 @@ class Grpc(Raw):
 
 
 class Rest(Raw):
-    name = "rest"
-
     def __init__(self, server: Server) -> None:
         limits = httpx.Limits(max_connections=None)
         self.http = httpx.AsyncClient(base_url=server.http_url, timeout=PATIENCE, limits=limits)

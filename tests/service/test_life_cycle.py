@@ -7,9 +7,8 @@ import pty
 import signal
 import socket
 import tempfile
-import threading
-import time
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import httpx
@@ -17,6 +16,7 @@ import numpy as np
 import pytest
 from grpc import StatusCode
 from grpc_health.v1 import health_pb2, health_pb2_grpc
+from tests.programs import until
 
 from edgegrasp_client import AsyncGraspClient, GraspClient, GraspClientError, StreamRequest
 from edgegrasp_model.errors import EdgeGraspError
@@ -144,22 +144,17 @@ def call(address: str, cloud: np.ndarray, came: list[str], streams: bool) -> Non
 
 def test_sigterm_under_load(start_dummy, cloud: np.ndarray) -> None:
     """Every request that was accepted is answered; the others are told, and the exit code is 0."""
-    with start_dummy(seconds=0.02) as server:
+    with ThreadPoolExecutor(9) as threads, start_dummy(seconds=0.02) as server:
         ways = [(server.grpc_address, False), (server.grpc_address, True), (server.http_url, False)]
         came: list[list[str]] = [[] for _ in range(3 * len(ways))]
-        threads = [
-            threading.Thread(target=call, args=(address, cloud, mine, streams))
+        calls = [
+            threads.submit(call, address, cloud, mine, streams)
             for mine, (address, streams) in zip(came, ways * 3, strict=True)
         ]
-        for thread in threads:
-            thread.start()
-        end = time.monotonic() + 3 * PATIENCE
-        while not all(len(mine) >= 3 for mine in came):
-            assert time.monotonic() < end
-            time.sleep(0.01)
+        until(lambda: all(len(mine) >= 3 for mine in came))
         assert server.stop() == 0
-        for thread in threads:
-            thread.join(PATIENCE)
+        for each in calls:
+            each.result(PATIENCE)
     for mine in came:
         assert set(mine[:-1]) == {"OK"}
         assert mine[-1] == "ServerUnavailableError"
@@ -179,8 +174,7 @@ def test_a_closed_terminal_stops_what_was_started_in_it(start_dummy) -> None:
     with start_dummy(**there) as server, httpx.Client(base_url=server.http_url) as http:
         os.close(inside)
         server.process.send_signal(signal.SIGHUP)  # with the terminal there: a reload
-        while 'reloads_total{outcome="succeeded"} 1.0' not in http.get("/metrics").text:
-            threading.Event().wait(0.05)
+        until(lambda: 'reloads_total{outcome="succeeded"} 1.0' in http.get("/metrics").text)
         os.close(terminal)
         assert server.process.wait(timeout=30) == 0
 

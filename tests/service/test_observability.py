@@ -2,13 +2,13 @@
 
 import asyncio
 import contextlib
-import io
 import json
 import logging
 import os
 import re
 from pathlib import Path
 from typing import Any, TextIO
+from unittest.mock import Mock
 
 import grpc
 import httpx
@@ -107,15 +107,10 @@ def test_requests_outlive_a_log_that_nobody_reads(start_dummy, cloud: np.ndarray
     os.close(write)
 
 
-class Closed(io.TextIOBase):
-    def fileno(self) -> int:
-        raise OSError("closed")
-
-
 @pytest.mark.parametrize("name", ["closed", "none", "full disk", "pipe with no end"])
 def test_lines_not_written_are_counted(name: str) -> None:
     with contextlib.ExitStack() as ends:
-        stream: TextIO | None = {"closed": Closed()}.get(name)
+        stream: TextIO | None = {"closed": Mock(fileno=Mock(side_effect=OSError))}.get(name)
         if name == "full disk":
             stream = ends.enter_context(Path("/dev/full").open("w"))
         elif name == "pipe with no end":
@@ -128,9 +123,6 @@ def test_lines_not_written_are_counted(name: str) -> None:
         writer.handle(logging.makeLogRecord({"msg": "%d", "args": ("no number",)}))
         writer.close()
     assert writer.dropped == 4
-
-
-DASHBOARD = Path(__file__).parents[2] / "docker" / "grafana" / "edgegrasp.json"
 
 
 async def read(running: Any) -> dict[Any, float]:
@@ -218,7 +210,8 @@ async def test_the_dashboard_names_metrics_that_exist(serve, cloud: np.ndarray) 
     page = server.metrics.page().decode()
     kinds = [line.split()[2:] for line in page.splitlines() if line.startswith("# TYPE ")]
     exist = {name: "histogram" if kind == "histogram" else "" for name, kind in kinds}
-    dashboard = json.loads(DASHBOARD.read_text())
+    file = Path(__file__).parents[2] / "docker" / "grafana" / "edgegrasp.json"
+    dashboard = json.loads(file.read_text())
     queries = " ".join(
         target["expr"] for panel in dashboard["panels"] for target in panel["targets"]
     )

@@ -9,7 +9,6 @@ import zlib
 from collections import Counter
 from collections.abc import Callable
 
-import httpx
 import numpy as np
 import psutil
 import pytest
@@ -189,9 +188,8 @@ async def test_the_servers_own_limit_holds_without_a_deadline(serve, transport, 
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "soon", "1_0", "1e999"])
-def test_a_timeout_that_is_none_is_refused(dummy_server, text: str) -> None:
-    headers = {"X-Request-Timeout": text}
-    response = httpx.post(f"{dummy_server.http_url}/v1/grasps", headers=headers, content=b"")
+def test_a_timeout_that_is_none_is_refused(http, text: str) -> None:
+    response = http.post("/v1/grasps", headers={"X-Request-Timeout": text}, content=b"")
     assert (response.status_code, response.json()["field"]) == (400, "X-Request-Timeout")
 
 

@@ -86,11 +86,10 @@ def test_shapes_are_read_as_they_are_described(tmp_path: Path) -> None:
 
 
 def test_both_engines_see_the_same() -> None:
-    for package in ("pybullet", "mujoco"):
-        pytest.importorskip(package, reason=f"{package} is not installed")
     T_world_camera = look_at(np.array([0.6, 0.3, 0.5]), np.array([0.15, 0.15, 0.05]))
     images = []
     for engine in ("pybullet", "mujoco"):
+        pytest.importorskip(engine, reason=f"{engine} is not installed")
         with make_world(engine) as world:
             OPEN_TABLE.add_to(world)
             load_object(world, CUBE, (0.15, 0.15, 0.075), (0.0, 0.0, 0.38, 0.92), 1.0)

@@ -108,9 +108,8 @@ def test_random_hands_differ_between_scenes_and_are_what_the_network_is_told(tmp
         if len(view.tried()):
             hand, seen = view.hand, tried_grasps(view, RECIPES["edgegrasp-plus"]).seen
             measures = (hand.max_opening, hand.tip_z - hand.palm_z, hand.pad_half_width)
-            assert seen.description[:, 71:74] == pytest.approx(
-                np.tile(measures, (len(seen.points), 1)), rel=1e-3
-            )
+            expected = np.tile(measures, (len(seen.points), 1))
+            assert seen.description[:, 71:74] == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("index", range(0, NUM_DRAWN, 13))
