@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 import tempfile
 import webbrowser
 from contextlib import suppress
@@ -36,6 +37,7 @@ def serve(
     """
     # gRPC's own log lines are not JSON, and a pipe that is not read would block it.
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # until the server has its own handler
     from edgegrasp_service.settings import load_settings
 
     loaded = load_settings(config, **settings)

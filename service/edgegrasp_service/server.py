@@ -6,9 +6,11 @@ import errno
 import gc
 import ipaddress
 import logging
+import resource
 import signal
 import socket
 import sys
+from asyncio import constants
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -52,7 +54,7 @@ class Server:
         service, admission = self.service, self.service.admission
         watch = self.metrics.watch
         watch("ready", "1: requests are answered", lambda: service.ready)
-        watch("requests_in_flight", "requests not yet answered", lambda: service.in_flight)
+        watch("requests_in_flight", "requests not yet answered", lambda: len(admission.calls))
         watch("requests_active", "requests that workers have", lambda: admission.at_work)
         waiting = "requests let in that no worker has"
         watch("queue_depth", waiting, lambda: len(admission.calls) - admission.at_work)
@@ -117,7 +119,7 @@ class Server:
             log_config=None,
             access_log=False,
             lifespan="off",
-            http=partial(HttpProtocol, self._settings, places),  # type: ignore[arg-type]
+            http=partial(HttpProtocol, self.service, places),  # type: ignore[arg-type]
             ws="none",
             backlog=MAX_ACCEPTED_AT_ONCE,
             server_header=False,
@@ -169,6 +171,11 @@ def run(settings: Settings, nursery: Nursery | None = None) -> None:
         AddressInUse: A port cannot be bound.
         EdgeGraspError: Weights cannot be used.
     """
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with contextlib.suppress(ValueError):  # the usual 1024 are too few for all connections
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    # For connections that do not shake hands, and hold no place until they have.
+    constants.SSL_HANDSHAKE_TIMEOUT = settings.read_seconds
     with contextlib.closing(start_logging(settings, sys.stderr)) as log:
         warn(settings)
         asyncio.run(_serve_until_signalled(settings, log, nursery))
@@ -183,6 +190,7 @@ async def _serve_until_signalled(
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # process 1 of a container inherits dead workers
     terminal = _at_a_terminal()
 
     async def reload() -> None:
@@ -237,7 +245,10 @@ def _listen(host: str, port: int) -> socket.socket:
             if trying.connect_ex(place) == errno.ECONNREFUSED:
                 Path(place).unlink(missing_ok=True)
     try:
-        listening = socket.create_server(address, family=family, backlog=BACKLOG)
+        both = host == "::" and socket.has_dualstack_ipv6()  # as gRPC does
+        listening = socket.create_server(
+            address, family=family, backlog=BACKLOG, dualstack_ipv6=both
+        )
     except OSError as error:
         if family != socket.AF_UNIX and error.errno not in (errno.EADDRINUSE, errno.EACCES):
             fix = "Give an address of this machine."

@@ -15,7 +15,7 @@ MIB = 2**20
 UNIX_PREFIX = "unix:"  # prefix of a host that is a folder of sockets
 PREFIX = "EDGEGRASP_"
 CONFIG_VARIABLE = PREFIX + "CONFIG"
-NOT_SETTINGS = (CONFIG_VARIABLE, PREFIX + "CLIENT_")  # the latter belong to the client's commands
+CLIENT_PREFIX = PREFIX + "CLIENT_"  # of the client's commands
 LIST_SETTINGS = ("weights", "grippers", "robots", "allowed_hosts")
 
 Port = Annotated[int, Field(ge=0, le=65535)]
@@ -154,7 +154,8 @@ def _read_environment() -> dict[str, Any]:
     """The settings in EDGEGRASP_* variables, including unknown names; lists are JSON."""
     fields: dict[str, Any] = {}
     for variable, text in os.environ.items():
-        if not text or not variable.startswith(PREFIX) or variable.startswith(NOT_SETTINGS):
+        ours = variable.startswith(PREFIX) and not variable.startswith(CLIENT_PREFIX)
+        if not text or not ours or variable == CONFIG_VARIABLE:
             continue
         name = variable.removeprefix(PREFIX).lower()
         try:

@@ -7,6 +7,7 @@ import asyncio
 import contextlib
 import json
 import os
+import resource
 import socket
 import struct
 import sys
@@ -291,7 +292,11 @@ async def test_health_is_answered_while_every_connection_has_a_request(serve, cl
 
     held = [ask(), ask()]
     await running.until(lambda: len(running.server.service.admission.calls) == 2)
-    assert (await ask()).status_code == 429
+    refused = await ask()
+    assert refused.status_code == 429
+    assert refused.headers["x-request-id"]
+    counted = 'requests_total{code="429",method="other",transport="http"} 1.0'
+    assert counted in (await http.get("/metrics")).text
     for path in ("/health/live", "/health/ready"):
         assert (await http.get(path)).status_code == 200
     running.stages.open("evaluate")
@@ -299,8 +304,12 @@ async def test_health_is_answered_while_every_connection_has_a_request(serve, cl
 
 
 async def test_silent_grpc_connections_are_closed_for_others(serve, cloud) -> None:
-    """None of those others is refused before that."""
+    """None of those others is refused before that, nor if descriptors were short for a while."""
     running = await serve(max_connections=30)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
+    await asyncio.sleep(0.3)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     with connections(running.server.grpc_address, 90, http2_opening()) as held:
         await check_health(running.server.grpc_address)
         assert (await running.connect("grpc").detect(cloud)).fine
@@ -341,6 +350,8 @@ async def test_silent_health_checks_and_watchers_hold_up_nobody(running) -> None
     stub = health_pb2_grpc.HealthStub(running.channel(*OWN_CONNECTION))
     watching = [stub.Watch(health_pb2.HealthCheckRequest()) for _ in range(80)]
     await running.until(lambda: running.server.service.in_flight > 60)
+    # They are no load that another machine would share.
+    assert "edgegrasp_requests_in_flight 0.0" in (await running.http().get("/metrics")).text
     for _ in range(5):
         await check_health(running.server.grpc_address)
     for call in (*silent, *watching):

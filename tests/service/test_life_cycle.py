@@ -13,6 +13,7 @@ from typing import Any
 
 import httpx
 import numpy as np
+import psutil
 import pytest
 from grpc import StatusCode
 from grpc_health.v1 import health_pb2, health_pb2_grpc
@@ -177,6 +178,30 @@ def test_a_closed_terminal_stops_what_was_started_in_it(start_dummy) -> None:
         until(lambda: 'reloads_total{outcome="succeeded"} 1.0' in http.get("/metrics").text)
         os.close(terminal)
         assert server.process.wait(timeout=30) == 0
+
+
+SERVE_AS_A_CONTAINER_DOES = """
+import ctypes
+from benchmarks.serve_dummy import main
+ctypes.CDLL(None).prctl(36, 1)  # PR_SET_CHILD_SUBREAPER: it gets orphans, as process 1 does
+main()
+"""
+
+
+def test_reloads_in_a_container_leave_no_dead_processes(start_dummy) -> None:
+    program = "-c", SERVE_AS_A_CONTAINER_DOES
+    with start_dummy(program=program) as server, httpx.Client(base_url=server.http_url) as http:
+        server.process.send_signal(signal.SIGHUP)
+        until(lambda: 'reloads_total{outcome="succeeded"} 1.0' in http.get("/metrics").text)
+        front = psutil.Process(server.process.pid)
+        until(lambda: psutil.STATUS_ZOMBIE not in [each.status() for each in front.children()])
+
+
+@pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this machine has no IPv6")
+async def test_all_addresses_are_those_of_both_protocols(serve, transport: str, cloud) -> None:
+    address = (await serve(host="::")).address(transport).replace("[::]", "127.0.0.1")
+    async with AsyncGraspClient(address) as client:
+        assert len((await client.detect(cloud, timeout=20)).grasps) == 10
 
 
 async def test_sockets_of_a_folder(serve, transport: str, cloud: np.ndarray) -> None:

@@ -86,7 +86,7 @@ def test_bad_settings_and_files_are_named(config: Path, given: Any, sentence: st
     assert isinstance(given, dict) or "server.toml" in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["htp_port", "token"])
+@pytest.mark.parametrize("name", ["htp_port", "token", "config_file"])
 def test_unknown_variables_are_named_but_for_a_clients(monkeypatch, name: str) -> None:
     monkeypatch.setenv("EDGEGRASP_CLIENT_TOKEN", TOKEN)
     monkeypatch.setenv("EDGEGRASP_HOST", "")  # as a compose file leaves what is not set

@@ -131,8 +131,8 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         most = self._service.settings.max_connections
         while True:
             await asyncio.sleep(TRIM_SECONDS)
-            if len([*DESCRIPTORS.iterdir()]) - len(others) > most:
-                with contextlib.ExitStack() as duplicates:
+            with contextlib.suppress(OSError), contextlib.ExitStack() as duplicates:
+                if len([*DESCRIPTORS.iterdir()]) - len(others) > most:
                     _trim(self._port, most, duplicates)
 
     def service(self, handler_call_details: grpc.HandlerCallDetails) -> Any:

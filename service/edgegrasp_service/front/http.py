@@ -6,7 +6,7 @@ import logging
 import math
 import re
 import sys
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,6 @@ from edgegrasp_model.gripper import gripper_names, load_gripper
 from edgegrasp_service import errors
 from edgegrasp_service.front.service import MAX_HEADERS, GraspService, Place, Places
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics, network_of
-from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.process import PIECE_BYTES, Job, Method
 
 logger = logging.getLogger(__name__)
@@ -302,9 +301,9 @@ def _error_response(call: Call, scope: Scope, error: Exception) -> Response:
 class HttpProtocol(HttpToolsProtocol):
     """Closes connections whose headers are too slow; refused clients can read why."""
 
-    def __init__(self, settings: Settings, places: Places, **arguments: Any) -> None:
+    def __init__(self, service: GraspService, places: Places, **arguments: Any) -> None:
         super().__init__(**arguments)
-        self._settings = settings
+        self._service, self._settings = service, service.settings
         self._places = places
         self._header_timer: asyncio.TimerHandle | None = None  # while headers arrive
         self._header_bytes = 0
@@ -392,9 +391,13 @@ class HttpProtocol(HttpToolsProtocol):
             return
         problem = errors.report(error)
         body = errors.problem_document(problem)
+        call = Call("http", "other", "", self.client[0] if self.client else "")
+        call.code = str(problem.status)
+        with suppress(EdgeGraspError), self._service.observe(call):
+            raise error
         head = (
             f"HTTP/1.1 {problem.status} {problem.kind}\r\n"
-            "content-type: application/problem+json\r\n"
+            f"content-type: application/problem+json\r\n{REQUEST_ID_HEADER}: {call.request_id}\r\n"
             f"content-length: {len(body)}\r\nconnection: close\r\n\r\n"
         )
         if pending:
