@@ -32,7 +32,7 @@ from edgegrasp_results import Detection, Grasp, Scoring
 
 DEFAULT_ADDRESS = "127.0.0.1:50051"
 POLL_SECONDS = 0.1
-CLOSED = "This client is closed. Make a new one."
+CLOSED = "This client is closed, or another process made it. Make a new one."
 
 Parameters = ParamSpec("Parameters")
 
@@ -70,6 +70,7 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
     ) -> None:
         self._timeout = seconds_of(timeout)
         self._retry, self._closed, self._answered = retry, False, False
+        self._pid = os.getpid()
         kind = RestTransport if is_rest(address) else GrpcTransport
         self._transport: RestTransport | GrpcTransport = kind(address, token, tls)
 
@@ -153,7 +154,8 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
         if held not in (True, False):
             raise invalid("held", repr(held), "Give True or False.")
         tried = {"model": detection.model, "score": float(grasp.score), "held": bool(held)}
-        await self._retried(partial(self._transport.record_outcome, tried), timeout)
+        # Not retried: it may have been written.
+        await self._transport.record_outcome(tried, self._seconds(timeout))
 
     async def ready(self, *, timeout: float | None = None) -> bool:
         """Whether the server can answer requests; False if it is unreachable or still loading."""
@@ -177,7 +179,7 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
 
     def _seconds(self, timeout: float | None) -> float:
         """The timeout of a call; raises GraspClientError if it cannot be made any more."""
-        if self._closed:
+        if self._closed or self._pid != os.getpid():  # a fork would read another's answers
             raise errors.GraspClientError(CLOSED)
         return self._timeout if timeout is None else seconds_of(timeout)
 

@@ -1,6 +1,8 @@
 """The gRPC transport: requests, answers and errors as messages."""
 
+import asyncio
 from base64 import b64decode
+from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping, Sequence
 from dataclasses import astuple
 from itertools import chain
@@ -34,6 +36,7 @@ CHANNEL_OPTIONS = (
 HEALTH_CHECK = "/grpc.health.v1.Health/Check"
 SERVING = b"\x08\x01"
 
+ACCEPT_SECONDS = 0.5  # for a server to accept a stream, before requests are sent all the same
 ERROR_METADATA = "edgegrasp-error-bin"
 
 
@@ -76,17 +79,21 @@ class GrpcTransport:
     ) -> AsyncGenerator[StreamAnswer, None]:
         """An answer to each of the named requests with their timeouts."""
         failed: list[Exception] = []
-        refused: dict[str, GraspClientError] = {}  # by the client; they are sent empty
+        refused: deque[GraspClientError | None] = deque()  # by the client; they are sent empty
         sent = grasp_pb2.DetectGraspsStreamRequest
 
         async def messages() -> AsyncIterator[grasp_pb2.DetectGraspsStreamRequest]:
             try:
+                # A write to a stream that is refused would hide why; Ray's are late to accept.
+                accepted = asyncio.ensure_future(call.initial_metadata())
+                await asyncio.wait([accepted], timeout=ACCEPT_SECONDS)
                 async for name, request, seconds in requests:
-                    message = None
+                    message, wrong = None, None
                     try:
                         message = message_of(request)
                     except GraspClientError as error:
-                        refused[name] = error
+                        wrong = error
+                    refused.append(wrong)
                     yield sent(request_id=name, request=message, timeout=seconds)
             except Exception as error:  # gRPC would only log it
                 failed.append(error)
@@ -94,12 +101,12 @@ class GrpcTransport:
         call = self._service.DetectGraspsStream(messages(), metadata=self._metadata)
         try:
             async for answer in call:
+                wrong = refused.popleft()
                 if answer.HasField("detection"):
                     detection = read_as(Detection, answer.detection)
                     yield StreamAnswer(answer.request_id, detection)
                 else:
-                    error = _described(answer.error.message, answer.error.detail)
-                    error = refused.pop(answer.request_id, error)
+                    error = wrong or _described(answer.error.message, answer.error.detail)
                     yield StreamAnswer(answer.request_id, error=error)
         except grpc.RpcError as error:
             raise _error_of(error, self._address) from None

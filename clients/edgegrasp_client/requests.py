@@ -200,7 +200,7 @@ def cloud_file(cloud: Cloud) -> tuple[str, bytes]:
         if cloud.shape[1:] == (3,) and cloud.dtype in (np.float32, np.float64):
             with np.errstate(over="ignore"):  # the server refuses infinity
                 cloud = np.ascontiguousarray(cloud, dtype=np.float32)
-        return "npy", npy_bytes(cloud)
+        return "npy", npy_bytes(np.ma.filled(cloud, np.nan))
     if not isinstance(cloud, str | PathLike):
         kind = f"a {type(cloud).__name__}"
         value = f"dtype {cloud.dtype}" if isinstance(cloud, np.ndarray) else kind
@@ -268,6 +268,7 @@ def _depth_fields(depth: object, path: str) -> dict[str, Any]:
         raise invalid(path, f"a {type(depth).__name__}", fix)
     if depth.ndim == 3 and depth.shape[2] == 1:
         depth = depth[..., 0]
+    depth = np.ma.filled(depth, 0)
     if depth.ndim != 2 or depth.dtype.name not in DEPTH_ENCODINGS:
         raise invalid(path, f"shape {depth.shape}, dtype {depth.dtype}", fix)
     little_endian = depth.dtype.newbyteorder("<")

@@ -54,7 +54,7 @@ class Grasp:
     contact_point: Float32  # (3,) p_c, metres, cloud frame
     approach_direction: Float32  # (3,) unit, the direction the hand moves; +z of the hand
     collision_free: bool  # whether the open hand touches nothing at the grasp and on its way
-    clearance: float  # metres from the open hand at the grasp to the nearest surface; <= 0: inside
+    clearance: float  # metres from the open hand at the grasp to the nearest surface; < 0: inside
     object: int | None = None  # number of the object that the contact is on; None: no object
     arm: ArmPlan | None = None  # None: no robot was given, or time ran out
     id: int | None = None  # the same in all answers that follow it; None without `previous`

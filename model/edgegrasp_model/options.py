@@ -607,7 +607,7 @@ class DetectOptions(Strict):
     one, an estimate in a camera's frame, else +z"""
     support: SupportChoice = AutoPlane()
     """plane that the objects rest on and the hand stays above; a kind alone is allowed; null:
-    none"""
+    none, and no objects are recognised"""
     objects: ObjectsOption = "auto"
     """objects to grasp: those recognised (auto), some of them by number, or everything above the
     support (off); all else is an obstacle. If segment_ids are sent, those above 0 are the

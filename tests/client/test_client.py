@@ -24,6 +24,7 @@ from edgegrasp_client import (
     Detection,
     Grasp,
     GraspClient,
+    GraspClientError,
     GraspTracker,
     GripperOutline,
     InvalidRequestError,
@@ -136,7 +137,10 @@ def test_a_forked_process_asks_over_rest_alone(dummy_server, cloud) -> None:
             try:
                 GraspClient(dummy_server.grpc_address)
             except InvalidRequestError:
-                os._exit(0 if found else 2)
+                try:
+                    client.detect(cloud)  # its connection is its parent's
+                except GraspClientError as error:
+                    os._exit(0 if found and "another process" in str(error) else 2)
             os._exit(1)
         assert os.waitpid(child, 0)[1] == 0
         assert client.detect(cloud).grasps
@@ -202,9 +206,13 @@ def test_answers_are_those_of_single_requests(client, cloud) -> None:
 
 
 def test_what_cannot_be_sent_is_an_error_and_the_stream_goes_on(client, cloud) -> None:
-    requests = [StreamRequest(cloud), StreamRequest("nowhere.ply"), StreamRequest(cloud)]
-    first, missing, last = client.detect_stream(requests)
+    clouds = [cloud, "nowhere.ply", cloud, cloud[:0]]
+    first, missing, last, empty = client.detect_stream(
+        [StreamRequest(each, request_id="a") for each in clouds]  # as who needs no names sends it
+    )
     assert_same(first.result(), last.result())
+    with pytest.raises(InvalidRequestError, match="cloud"):
+        empty.result()
     with pytest.raises(InvalidRequestError, match="nowhere"):
         missing.result()
     with pytest.raises(InvalidRequestError, match="Give a cloud"):

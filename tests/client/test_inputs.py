@@ -74,6 +74,10 @@ def test_depth_images_are_sent_in_every_form(client) -> None:
     for camera in ((60.0, 60.0, 14.5, 9.5), np.array(nested), np.ravel(nested)):
         found = client.detect(depth_images=[{"depth": millimetres, "intrinsics": camera}])
         assert contacts(found) == contacts(expected)
+    masked = np.ma.masked_greater(millimetres, np.median(millimetres))
+    found = client.detect(depth_images=[depth_image(depth=masked)])
+    zeros = client.detect(depth_images=[depth_image(depth=masked.filled(0))])
+    assert contacts(found) == contacts(zeros) != contacts(expected)
     views = [depth_image(), depth_image(T_cloud_camera=np.eye(4).tolist())]
     ids = np.arange(1200)
     assert client.detect(depth_images=views, segment_ids=ids).counts["points"] == 1200

@@ -231,6 +231,19 @@ def test_where_every_hand_collides_further_points_are_tried_and_hands_are_marked
         assert Counter(found.debug.outcome)[Outcome.COLLISION] == found.counts["checked"]
 
 
+def test_an_obstacle_beside_the_object_is_not_closed_on() -> None:
+    best = detect().grasps[0]
+    side = np.sign(best.T_cloud_hand[:3, 1] @ (best.T_cloud_tcp[:3, 3] - best.contact_point))
+    place = best.contact_point - 0.008 * side * best.T_cloud_hand[:3, 1]
+    post = {"kind": "box", "min": (place - 0.003).tolist(), "max": (place + 0.003).tolist()}
+    found = detect(collision={"obstacles": [post]})
+    assert found.grasps
+    for grasp in found.grasps:
+        x, y, z = np.linalg.inv(grasp.T_cloud_hand) @ np.append(place, 1.0) @ np.eye(4, 3)
+        between = abs(x) < PANDA.pad_half_width and abs(y) < PANDA.max_opening / 2
+        assert not (between and PANDA.palm_z < z < PANDA.tip_z)
+
+
 def test_an_unknown_viewpoint_gets_a_warning_and_too_many_voxels_are_refused() -> None:
     found = detector().detect(CLOUD)
     assert found.grasps

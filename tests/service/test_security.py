@@ -12,7 +12,13 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_client import AccessDeniedError, AsyncGraspClient, ServerUnavailableError, Tls
+from edgegrasp_client import (
+    AccessDeniedError,
+    AsyncGraspClient,
+    ServerUnavailableError,
+    StreamRequest,
+    Tls,
+)
 from edgegrasp_service.errors import InvalidSettings, ReloadFailed
 from edgegrasp_service.probe import is_ready, read_settings
 from edgegrasp_service.security import ServerTls, Tokens
@@ -101,6 +107,9 @@ async def test_tokens(serve, transport: str, cloud: np.ndarray) -> None:
         error = await refused(address, token=token)
         assert isinstance(error, AccessDeniedError)
         assert token is None or token not in str(error)
+        stream = running.ours(transport, token=token).detect_stream([StreamRequest(cloud)] * 3)
+        with pytest.raises(AccessDeniedError):
+            [answer.result() async for answer in stream]
 
 
 PROTECTED = [

@@ -59,18 +59,18 @@ def collides(
         lowest = np.minimum(height, height + behind * rise)
         lowest = np.minimum(lowest, height + lift * (UP @ normal))
         hit |= np.asarray(lowest < request.margin - SLACK)
+    side, inner = gripper.pad_half_width, gripper.max_opening / 2
+    low, high = (-side, -inner, gripper.palm_z), (side, inner, gripper.tip_z)
     if scene.obstacles is not None:
-        moves = [(swept, 0.0)] if lift == 0.0 else [(swept, 0.0), (boxes, lift)]
-        for shapes, way in moves:
+        closing = np.concatenate([swept, [[low, high]]])  # and what is between the fingers
+        for shapes, way in [(closing, 0.0), (boxes, lift)][: 1 + (lift > 0.0)]:
             solid = SolidBoxes.of_hands(T_cloud_hand, shapes)
             for near, theirs in near_pairs(solid, scene.obstacles, way):
                 overlap = separation(solid.take(near), theirs, way * UP.astype(np.float64)) < 0
-                hit[near[overlap] // len(boxes)] = True
+                hit[near[overlap] // len(shapes)] = True
     if request.margin >= 0.0:
         free = np.flatnonzero(~hit)
         background = scene.cloud.points[scene.object_of_point == BACKGROUND]
-        side, inner = gripper.pad_half_width, gripper.max_opening / 2
-        low, high = (-side, -inner, gripper.palm_z), (side, inner, gripper.tip_z)
         hands = in_hands(background, T_cloud_hand[free])
         between, *_ = points_in_hand_boxes(hands, *np.array([low, high], np.float32))
         hit[free] = np.bincount(between, minlength=len(free)) >= MIN_BACKGROUND_VOXELS
@@ -92,6 +92,7 @@ def clearances(scene: Scene, T_cloud_hand: Float32, opening: Float32, gripper: G
         nearest, solid = nearest.astype(np.float64), SolidBoxes.of_hands(T_cloud_hand, boxes)
         for near, theirs in near_pairs(solid, scene.obstacles, np.repeat(nearest, len(boxes))):
             np.minimum.at(nearest, near // len(boxes), signed_distance(solid.take(near), theirs))
+    nearest[np.abs(nearest) < SLACK] = 0.0  # a hand that touches is not within
     return nearest.astype(np.float32)
 
 

@@ -640,7 +640,7 @@ class DetectOptions(_message.Message):
     @_builtins.property
     def support(self) -> Global___Support:
         """Plane that the objects rest on and the hand stays above; a kind alone is allowed; disabled:
-        none.
+        none, and no objects are recognised.
         """
 
     @_builtins.property
@@ -2274,7 +2274,7 @@ class Grasp(_message.Message):
     collision_free: _builtins.bool
     """Whether the open hand touches nothing at the grasp and along its approach and retreat."""
     clearance: _builtins.float
-    """Metres from the open hand at the grasp to the nearest surface; 0 or less: within it."""
+    """Metres from the open hand at the grasp to the nearest surface; less than 0: within it."""
     object: _builtins.int
     """Number of the object that the contact point is on; absent (null in JSON): no object."""
     id: _builtins.int

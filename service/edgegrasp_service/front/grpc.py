@@ -47,6 +47,7 @@ REFLECTION = tuple(f"grpc.reflection.{version}.ServerReflection" for version in 
 
 MAX_WATCHERS = 64  # of health, and readers of the interface by reflection
 WATCH_SECONDS = 1.0  # seconds between two looks at the health
+ABORT_SECONDS = 0.1  # in which a client that reads slowly is told that its call has ended
 STREAM_IDLE_SECONDS = 300.0  # for which a stream may stay open without a message
 STREAM_GRACE_SECONDS = 10.0  # seconds after which an idle stream yields its place to another one
 MAX_STREAM_FIELDS = 16  # in a message of a stream, which has three
@@ -163,8 +164,11 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                 if method in UNTIMED_METHODS:
                     await context.send_initial_metadata(name)
                 await behave(call, context)
-            except errors.Cancelled:
-                raise asyncio.CancelledError from None  # an error could not be sent either
+            except errors.Cancelled as error:
+                with contextlib.suppress(TimeoutError):  # the client may be gone
+                    async with asyncio.timeout(ABORT_SECONDS):
+                        await context.abort(grpc.StatusCode.CANCELLED, str(error))
+                raise asyncio.CancelledError from None
             except aio.AbortError:
                 raise
             except Exception as error:
@@ -410,7 +414,7 @@ def _bounds(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.keepalive_timeout_ms", 10_000),
         # Clients resolve the name again from time to time, and find new servers.
         ("grpc.max_connection_age_ms", 300_000),
-        ("grpc.http2.min_recv_ping_interval_without_data_ms", 20_000),
+        ("grpc.http2.min_ping_interval_without_data_ms", 20_000),
     ]
 
 
