@@ -141,7 +141,8 @@ class Picture:
         self._axes.imshow(image)
         self._axes.autoscale(False)
         self._point = 72 * WIDTH / columns  # points that a pixel is wide
-        self._figure.text(0.015, self._foot / 2, title, fontsize=10, va="center")
+        where = 0.015, self._foot / 2
+        self._figure.text(*where, title, fontsize=10, va="center", parse_math=False)
 
     def _shaded(self, depth: Float64) -> Float64:
         """(H, W, 3) the cloud in greys."""

@@ -118,13 +118,13 @@ def _write(
 
 def summary(done: Sequence[SceneFigures]) -> dict[str, Any]:
     """Figures over all scenes; shares are of the judged grasps, None if there are none."""
-    best = sum(figures.best for figures in done)
-
-    def share(name: str) -> float | None:
-        return sum(getattr(figures, name) for figures in done) / best if best else None
-
     # For a heap that is labelled as one object, neither plane nor objects are known.
     apart = [figures for figures in done if figures.plane_labelled]
+
+    def share(name: str) -> float | None:
+        judged = apart if name == "from_below" else done
+        best = sum(figures.best for figures in judged)
+        return sum(getattr(figures, name) for figures in judged) / best if best else None
 
     def mean(name: str, judged: Sequence[SceneFigures]) -> float | None:
         shares = [getattr(figures.segmentation, name) for figures in judged]
@@ -133,7 +133,7 @@ def summary(done: Sequence[SceneFigures]) -> dict[str, Any]:
     return {
         "scenes": len(done),
         "refused": sum(bool(figures.refused) for figures in done),
-        "best": best,
+        "best": sum(figures.best for figures in done),
         **{name: share(name) for name in SHARES},
         "objects": sum(figures.objects for figures in apart),
         "objects_with_grasp": sum(figures.objects_with_grasp for figures in apart),

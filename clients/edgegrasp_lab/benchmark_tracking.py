@@ -292,7 +292,7 @@ def _plot(path: Path, done: dict[str, list[Followed]]) -> None:
     for name, each in done.items():
         seconds, away, _ = np.reshape(each[0].off, (-1, 3)).T
         axes.plot(seconds, away, label=name, linewidth=1)
-    axes.set(xlabel="seconds", ylabel="mm", ylim=(0, 3))
+    axes.set(xlabel="seconds", ylabel="mm", ylim=(0, None))
     figure.legend(loc="outside right upper", fontsize=8)
     figure.savefig(path)
     pyplot.close(figure)

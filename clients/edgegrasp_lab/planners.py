@@ -42,8 +42,9 @@ def open_planner(
         GraspClientError: the server does not answer.
     """
     if choice.planner not in SHIPPED:
-        if choice.model or choice.weights or choice.server:
-            given = "leave out --model, --weights and --server, which it would not see"
+        unseen = options.keys() - {"gripper", "robot", "collision"}
+        if choice.model or choice.weights or choice.server or unseen:
+            given = "leave out --model, --weights, --server and options, which it would not see"
             raise ValueError(f"planner is {choice.planner}; {given}")
         _loaded(choice.planner)  # fails here on a wrong name, not in every worker
         yield ChosenPlanner(partial(named_planner, choice.planner), {"name": choice.planner})

@@ -28,7 +28,8 @@ def translation(x: float, y: float, z: float) -> Float64:
 def require_pose(T_world_hand: ArrayLike) -> Float64:
     """Check that the pose of a hand is a finite rigid transform (4, 4); raises ValueError."""
     T = np.asarray(T_world_hand, dtype=np.float64)
-    R = T[:3, :3] if T.shape == (4, 4) and np.isfinite(T).all() else np.zeros((3, 3))
+    rigid = T.shape == (4, 4) and np.isfinite(T).all() and T[3].tolist() == [0, 0, 0, 1]
+    R = T[:3, :3] if rigid else np.zeros((3, 3))
     if not np.allclose(R @ R.T, np.eye(3), rtol=0.0, atol=1e-3) or np.linalg.det(R) < 0:
         wanted = "pass a finite 4 x 4 matrix with a right-handed rotation without scale"
         raise ValueError(f"T_world_hand is not a rigid transform: {T.tolist()}; {wanted}")

@@ -40,11 +40,11 @@ class DepthNoise:
         if self.gamma_shape > 0:
             noisy = noisy * rng.gamma(self.gamma_shape, self.gamma_scale)
         if self.correlated_std > 0 and rng.random() < self.correlated_share:
-            cells = np.floor_divide(depth.shape, self.correlated_pixels)
+            cells = np.maximum(np.floor_divide(depth.shape, self.correlated_pixels), 1)
             coarse = rng.normal(0.0, self.correlated_std, cells)
             factors = np.divide(depth.shape, coarse.shape)
             noisy = noisy + zoom(coarse, factors, order=1, mode="nearest", grid_mode=True)
-        return noisy
+        return np.where(depth < 0.999 * camera.far, noisy, depth)  # nothing stays nothing
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,7 +35,7 @@ def test_what_the_cloud_hides_of_a_hand_is_faint(behind: bool) -> None:
     y = 0.2 if behind else -0.2
     T = np.array([[0, 1, 0, 0], [1, 0, 0, y], [0, 0, -1, 0.1], [0, 0, 0, 1]])
     stream, grasp = io.BytesIO(), SimpleNamespace(T_cloud_hand=T, score=1.0, width=0.08)
-    picture = Picture(View.of(wall, (0.0, -1.0, 0.0)), wall)
+    picture = Picture(View.of(wall, (0.0, -1.0, 0.0)), wall, title="$_$")  # no formula
     picture.grasps([grasp])
     picture.save(stream)
     red, green, blue = np.moveaxis(pixels(stream), 2, 0)

@@ -61,6 +61,7 @@ def test_training_pauses_goes_on_and_is_recalibrated(data, run, tmp_path) -> Non
         (("benchmark", "--planner", "json:no_such"), "cannot be loaded"),
         (("benchmark", "--planner", "math:pi"), "is not callable"),
         (("benchmark", "--planner", "json:loads", "--model", "edgegrasp"), "leave out --model"),
+        (("benchmark", "--planner", "json:loads", "--min-score", "0.9"), "leave out --model"),
         (("benchmark", "--robot", "ur5", "--gripper", "panda"), "ur5 has its own"),
         (("benchmark", "--ray", "10.0.0.1:6379"), "pass --server"),
         (("benchmark", "--model", "absent.safetensors"), "no such file"),

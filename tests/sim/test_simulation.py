@@ -137,6 +137,16 @@ def test_an_observation_holds_the_objects_alone_and_an_image_shows_them(simulati
     assert 1000 < red.sum() < 20_000
 
 
+def test_an_object_without_a_solid_is_refused(engine: str, tmp_path: Path) -> None:
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    mesh = '<collision><geometry><mesh filename="flat.obj"/></geometry></collision>'
+    file = tmp_path / "flat.urdf"
+    file.write_text(f'<robot name="flat"><link name="flat">{mesh}</link></robot>')
+    refused = pytest.raises(ValueError, match=r"flat\.urdf has no solid collision shape")
+    with ClutterSimulation(engine=engine) as simulation, refused:
+        simulation.reset_from_poses([ObjectPlacement(file, 1.0, (0.1, 0.1, 0.1), UPRIGHT)])
+
+
 def test_wrong_use_is_refused(simulation: ClutterSimulation) -> None:
     rng = np.random.default_rng(0)
     with pytest.raises(ValueError, match="scene is 'heap'; choose one of packed, pile"):
@@ -144,8 +154,9 @@ def test_wrong_use_is_refused(simulation: ClutterSimulation) -> None:
     with pytest.raises(FileNotFoundError, match="no object file"):
         simulation.reset_from_poses([ObjectPlacement(Path("gone.urdf"), 1.0, (0, 0, 0), UPRIGHT)])
     simulation.reset_from_poses([cube_at(0.15, 0.15)])
-    with pytest.raises(ValueError, match="T_world_hand is not a rigid transform"):
-        simulation.try_grasp(np.zeros((4, 4)))
+    for wrong in (np.zeros((4, 4)), np.diag([1.0, 1, 1, 0]), translation(0.1, 0.1, 0.1).T):
+        with pytest.raises(ValueError, match="T_world_hand is not a rigid transform"):
+            simulation.try_grasp(wrong)
     with ClutterSimulation({}) as empty:
         with pytest.raises(RuntimeError, match="call reset"):
             empty.try_grasp(np.eye(4))

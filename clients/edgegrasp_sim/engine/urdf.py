@@ -59,7 +59,9 @@ def _read_urdf(path: Path, _changed: int) -> Shape:
     hulls = [hull for part in solid if (hull := convex_hull(part.points - centre)) is not None]
     if not hulls:
         raise ValueError(f"{path} has no solid collision shape")
-    return Shape(centre, [Surface(part.points - centre, part.faces) for part in visible], hulls)
+    return Shape(
+        centre, [Surface(part.points - centre, part.faces) for part in visible or solid], hulls
+    )
 
 
 @lru_cache(maxsize=256)

@@ -12,6 +12,7 @@ from pybullet_utils.bullet_client import BulletClient
 from edgegrasp_camera.arrays import Float64, Int64
 from edgegrasp_sim import engine
 from edgegrasp_sim.engine import ArmModel, Contact, HandModel, Intrinsics, Parts, Vector
+from edgegrasp_sim.engine.urdf import read_urdf
 from edgegrasp_sim.poses import about_z
 
 SOLVER_ITERATIONS = 100
@@ -83,6 +84,7 @@ class PybulletWorld(AbstractContextManager["PybulletWorld"]):
     def load_urdf(
         self, path: Path, position: Vector, quaternion_xyzw: Vector, scale: float
     ) -> "PybulletBody":
+        read_urdf(path, scale)  # PyBullet itself takes damaged files without a word
         try:
             uid = self.client.loadURDF(str(path), position, quaternion_xyzw, globalScaling=scale)
         except pybullet.error as error:
