@@ -167,7 +167,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
             except errors.Cancelled as error:
                 with contextlib.suppress(TimeoutError):  # the client may be gone
                     async with asyncio.timeout(ABORT_SECONDS):
-                        await context.abort(grpc.StatusCode.CANCELLED, str(error))
+                        await _abort(call, context, errors.report(error))
                 raise asyncio.CancelledError from None
             except aio.AbortError:
                 raise

@@ -393,8 +393,6 @@ class HttpProtocol(HttpToolsProtocol):
         body = errors.problem_document(problem)
         call = Call("http", "other", "", self.client[0] if self.client else "")
         call.code = str(problem.status)
-        with suppress(EdgeGraspError), self._service.observe(call):
-            raise error
         head = (
             f"HTTP/1.1 {problem.status} {problem.kind}\r\n"
             f"content-type: application/problem+json\r\n{REQUEST_ID_HEADER}: {call.request_id}\r\n"
@@ -403,6 +401,9 @@ class HttpProtocol(HttpToolsProtocol):
         if pending:
             self.cycle.disconnected = True  # the application can send nothing more
             self.cycle.message_event.set()
+        else:
+            with suppress(EdgeGraspError), self._service.observe(call):
+                raise error
         self.transport.write(head.encode() + body)
         self._linger()
         self.transport.close()
