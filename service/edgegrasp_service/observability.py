@@ -230,6 +230,8 @@ class Metrics:
         self.workers_replaced = counter("workers_replaced", "worker processes that died")
         self._model_info = self._gauge("model_info", "loaded weights", MODEL_LABELS)
         self.reloads = counter("reloads", "weights loaded anew", ("outcome",))
+        for outcome in ("succeeded", "failed"):  # at 0, so that the first one is an increase
+            self.reloads.labels(outcome)
 
     def count_call(self, call: Call) -> None:
         """Count a call that has ended; a request within a stream counts as a result."""
