@@ -88,12 +88,12 @@ class GrpcTransport:
                 accepted = asyncio.ensure_future(call.initial_metadata())
                 await asyncio.wait([accepted], timeout=ACCEPT_SECONDS)
                 async for name, request, seconds in requests:
-                    message, wrong = None, None
+                    message = None
                     try:
                         message = message_of(request)
+                        refused.append(None)
                     except GraspClientError as error:
-                        wrong = error
-                    refused.append(wrong)
+                        refused.append(error)
                     yield sent(request_id=name, request=message, timeout=seconds)
             except Exception as error:  # gRPC would only log it
                 failed.append(error)

@@ -283,12 +283,12 @@ def test_files_of_every_kind_are_shown_and_sent(dummy_server, open_page, tmp_pat
     assert page.inner_text("#summary") == "No grasps yet"
     page.set_input_files("#files", [tmp_path / "cloud.npy"])
     page.locator("#approach").select_option("cone")
-    for angle, told in (("22.5", '"max_angle":0.3927'), ("60", '"max_angle":1.0472')):
+    for angle, sent in (("22.5", '"max_angle":0.3927'), ("60", '"max_angle":1.0472')):
         page.locator("#cone_angle").fill(angle)
         page.locator("#approach").select_option("")
         page.locator("#approach").select_option("cone")
         page.get_by_text("Find grasps").click()
-        page.locator("#curl").get_by_text(told).wait_for(state="attached")
+        page.locator("#curl").get_by_text(sent).wait_for(state="attached")
     page.set_input_files("#files", [tmp_path / "cloud.npy", tmp_path / "camera.npz"])
     page.get_by_text("Open one cloud").wait_for()
     (tmp_path / "cut.npy").write_bytes((tmp_path / "cloud.npy").read_bytes()[:301])

@@ -47,7 +47,7 @@ REFLECTION = tuple(f"grpc.reflection.{version}.ServerReflection" for version in 
 
 MAX_WATCHERS = 64  # of health, and readers of the interface by reflection
 WATCH_SECONDS = 1.0  # seconds between two looks at the health
-ABORT_SECONDS = 0.1  # in which a client that reads slowly is told that its call has ended
+ABORT_SECONDS = 0.1  # seconds to send a client that reads slowly the end of its call
 STREAM_IDLE_SECONDS = 300.0  # for which a stream may stay open without a message
 STREAM_GRACE_SECONDS = 10.0  # seconds after which an idle stream yields its place to another one
 MAX_STREAM_FIELDS = 16  # in a message of a stream, which has three

@@ -6,7 +6,7 @@ import logging
 import math
 import re
 import sys
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -391,20 +391,20 @@ class HttpProtocol(HttpToolsProtocol):
             return
         problem = errors.report(error)
         body = errors.problem_document(problem)
-        call = Call("http", "other", "", self.client[0] if self.client else "")
-        call.code = str(problem.status)
         head = (
             f"HTTP/1.1 {problem.status} {problem.kind}\r\n"
-            f"content-type: application/problem+json\r\n{REQUEST_ID_HEADER}: {call.request_id}\r\n"
-            f"content-length: {len(body)}\r\nconnection: close\r\n\r\n"
+            "content-type: application/problem+json\r\n"
+            f"content-length: {len(body)}\r\nconnection: close\r\n"
         )
-        if pending:
-            self.cycle.disconnected = True  # the application can send nothing more
+        if pending:  # a call that the application counts
+            self.cycle.disconnected = True  # it can send nothing more
             self.cycle.message_event.set()
         else:
-            with suppress(EdgeGraspError), self._service.observe(call):
-                raise error
-        self.transport.write(head.encode() + body)
+            call = Call("http", "other", "", self.client[0] if self.client else "")
+            with self._service.observe(call):
+                call.problem, call.code = problem, str(problem.status)
+            head += f"{REQUEST_ID_HEADER}: {call.request_id}\r\n"
+        self.transport.write(f"{head}\r\n".encode() + body)
         self._linger()
         self.transport.close()
 

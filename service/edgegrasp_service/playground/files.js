@@ -37,6 +37,11 @@ export async function readScene(files, camera) {
   return { ...scene, points: position.array, colors: color ? fromLinear(color.array) : null };
 }
 
+/** The numbers of a text, separated by commas; NaN for a part that is none. */
+export function listed(text) {
+  return text.replace(/[[\]]/g, "").split(",").map((part) => (part.trim() ? Number(part) : NaN));
+}
+
 function ending(file) {
   return file.name.split(".").pop().toLowerCase();
 }
@@ -80,7 +85,7 @@ async function readImages(images, camera) {
 
 /** The fields of a Scene that a depth image (H, W) has. */
 function fromDepth(array, file, colors, { intrinsics, depth_scale }) {
-  const given = intrinsics.replace(/[[\]\s]/g, "").split(",").map((part) => (part ? Number(part) : NaN));
+  const given = listed(intrinsics);
   const [fx, fy, cx, cy] = given.length === 9 ? [0, 4, 2, 5].map((place) => given[place]) : given; // of a matrix
   if (![4, 9].includes(given.length) || !given.every(Number.isFinite) || !fx || !fy) {
     throw new NeedsCamera(`${file.name}: give the camera's fx, fy, cx, cy in pixels.`);

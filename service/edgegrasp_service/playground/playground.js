@@ -1,7 +1,7 @@
 // The page: what is asked, of the same API as anyone's, and what is shown of the answer.
 
 import { beside } from "./arm.js";
-import { NeedsCamera, readScene } from "./files.js";
+import { NeedsCamera, listed, readScene } from "./files.js";
 import { View, colorOf, partsOf } from "./view.js";
 
 const API = new URL("..", import.meta.url).href.replace(/\/$/, ""); // the server's own address
@@ -57,8 +57,8 @@ async function openSample() {
     const answer = await reach(`samples/${encodeURIComponent(name)}`);
     if (!answer.ok) throw new Error(`${name}: the server answers ${answer.status}.`);
     return new File([await answer.blob()], name);
-  }));
-  if (await open(files)) await ask();
+  })).catch((error) => say(error.message, true));
+  if (files && (await open(files))) await ask();
 }
 
 /** Read files and show them; whether that went well. */
@@ -458,8 +458,12 @@ function typeShape(name) {
     if (!values) return say("Three numbers are needed: x, y, z.", true);
     shape[field] = values;
   }
-  if (name === "cone") shape.max_angle = (Number($("cone_angle").value) * Math.PI) / 180;
+  if (name === "cone") shape.max_angle = coneAngle();
   setShape(name, shape);
+}
+
+function coneAngle() {
+  return (Number($("cone_angle").value) * Math.PI) / 180;
 }
 
 function takeDrawn(points) {
@@ -486,7 +490,7 @@ $("ask").addEventListener("submit", (event) => {
   ask();
 });
 $("files").addEventListener("change", ({ target }) => take([...target.files]));
-$("sample").addEventListener("change", () => openSample().catch((error) => say(error.message, true)));
+$("sample").addEventListener("change", openSample);
 $("token").addEventListener("change", async () => (await listModels()) && (state.scene ? ask() : openSample()));
 for (const name of ["intrinsics", "depth_scale", "viewpoint"]) {
   $(name).addEventListener("change", () => state.files.length && open(state.files));
@@ -513,7 +517,7 @@ $("follow").addEventListener("change", () => {
 $("keep").addEventListener("click", () => ($("debug").checked = true) && ask());
 $("approach").addEventListener("change", ({ target }) => {
   const down = state.answer ? state.answer.up.map((value) => -value) : [0, 0, -1];
-  setShape("cone", target.value === "cone" && state.scene ? { direction: down, max_angle: (Number($("cone_angle").value) * Math.PI) / 180 } : null);
+  setShape("cone", target.value === "cone" && state.scene ? { direction: down, max_angle: coneAngle() } : null);
 });
 for (const name of ["region", "workspace", "cone"]) {
   $(`${name}_row`).addEventListener("change", ({ target }) => target.tagName === "INPUT" && typeShape(name));
@@ -569,7 +573,7 @@ function typed(id, count) {
 }
 
 function numbers(text, count) {
-  const values = text.replace(/[[\]]/g, "").split(",").map((part) => (part.trim() ? Number(part) : NaN));
+  const values = listed(text);
   return values.length === count && values.every(Number.isFinite) ? values : null;
 }
 
