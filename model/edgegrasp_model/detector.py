@@ -182,7 +182,7 @@ class GraspDetector:
             if sample is None:
                 continue
             logits = self._logits(prepared, scene, sample.candidates) / self.metadata.temperature
-            sample = replace(sample, logits=logits.astype(np.float32))
+            sample = sample.scored(logits.astype(np.float32))
             scored = sample if scored is None else scored.followed_by(sample)
         return scored
 
@@ -261,7 +261,7 @@ class GraspDetector:
         options = options or DetectOptions()
         unused = dict.fromkeys(("approach_region", "contact_region", "num_approach_points"))
         options = options.model_copy(update=unused)
-        prepared = self.prepare(cloud, options, max_voxels, thin=False)
+        prepared = self.prepare(cloud, options, max_voxels, thin=edges is None)
         rows = len(prepared.selected.labels)
         asked: Array = check_hand_poses(hand_poses) if edges is None else check_edges(edges, rows)
         evaluations = [Evaluation(None, NoGrasp.NO_POINT)] * len(asked)

@@ -8,14 +8,13 @@ from edgegrasp_camera.arrays import Array, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import HandView, hand_views
 from edgegrasp_model.candidates.edge_grasps import MIN_EDGE_LENGTH, Candidates, edge_grasps, retract
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.gripper import HALF_TURN, Gripper
 from edgegrasp_model.options import MAX_CANDIDATES, are_rigid
 from edgegrasp_model.results import NoGrasp
 from edgegrasp_model.scene.cloud import wrong_array
 from edgegrasp_model.scene.scene import Scene
 
 TOUCH_DEPTH = 0.004  # metres behind the outermost point; others there are touched first too
-FLIPPED = np.diag(np.array([-1.0, -1.0, 1.0, 1.0], dtype=np.float32))  # the same hand, y reversed
 
 
 @dataclass(frozen=True)
@@ -99,9 +98,11 @@ def from_hand_poses(
     off_contact = x**2 + (z - gripper.contact_z_at(2 * np.abs(y))) ** 2
     facing = np.full((2, len(T_cloud_hand)), -np.inf)  # (+y, -y): cosine of normal and finger
     touched = np.zeros((2, len(T_cloud_hand)), dtype=np.int64)  # rows of `view`
+    half = np.zeros(len(T_cloud_hand), dtype=np.float32)  # metres to the outermost point between
     for side, outward in enumerate((y, -y)):
         outermost = np.full(len(T_cloud_hand), -np.inf, dtype=np.float32)
         np.maximum.at(outermost, hand, outward)
+        half = np.maximum(half, outermost)
         first = np.flatnonzero(outward > outermost[hand] - TOUCH_DEPTH)
         hands, best = _least(hand[first], off_contact[first])
         touched[side, hands] = between[first[best]]
@@ -116,12 +117,11 @@ def from_hand_poses(
     for row in found.tolist():
         reason[row] = None
     given = T_cloud_hand[found]
-    pose = np.where((side[found] == 0)[:, None, None], given, given @ FLIPPED)
+    pose = np.where((side[found] == 0)[:, None, None], given, given * HALF_TURN)
     a, c = approach[found], view.row[contact[found]]
     edge = scene.cloud.points[c] - scene.cloud.points[a]
     depth = np.maximum(np.einsum("ed,ed->e", edge, pose[:, :3, 2]), 0.0)
-    opening = 2 * np.abs(view.position[1, contact[found]])
-    return Given(Candidates(found, a, c, depth, opening, pose), reason, given)
+    return Given(Candidates(found, a, c, depth, 2 * half[found], pose), reason, given)
 
 
 def _approach_points(view: HandView, contact: Int64, crop_radius: float) -> Int64:

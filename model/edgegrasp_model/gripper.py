@@ -19,6 +19,9 @@ GRIPPER_FOLDER = Path(__file__).parent / "grippers"
 APPROACH_LENGTH = 0.05  # metres of straight approach that must be free, or is described
 FINGER_LENGTH = 0.0465  # metres of finger length from the tips: as long as the Panda's
 
+# Factors for the columns of a hand's pose that turn the hand by 180 degrees about its z.
+HALF_TURN = np.array([-1.0, -1.0, 1.0, 1.0], dtype=np.float32)
+
 
 @dataclasses.dataclass(frozen=True)
 class Gripper:
@@ -154,7 +157,7 @@ def gripper_fields(name_or_path: str | Path) -> dict[str, Any]:
             f"gripper: got {str(name_or_path)!r}. Use one of {gripper_names()} or a .toml file."
         )
     try:
-        fields = tomllib.loads(path.read_text())
+        fields = tomllib.loads(path.read_text("utf-8"))
         gripper_from_fields(fields)
         return fields
     except (InvalidGripper, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

@@ -12,7 +12,7 @@ from edgegrasp_camera.arrays import Float64, Floats
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.options import Collision, Place
 from edgegrasp_model.scene.cloud import pose_matrix
-from edgegrasp_model.scene.obstacles import box_pose
+from edgegrasp_model.scene.obstacles import SolidBoxes, box_pose, near_pairs, separation
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.support import heights_over
 from edgegrasp_results import DetectedObject, Grasp
@@ -110,12 +110,13 @@ def places_for(
     place: Place,
     load: Load,
     voxels: Float64,  # (V, 3) base frame, what is seen around it
+    obstacles: SolidBoxes,  # base frame, beside it
     scene: Scene,
     T_base_cloud: Float64,
 ) -> Iterator[Float64]:
     """Poses T_base_box (4, 4) in which a load meets nothing, a region's middle first.
 
-    Neither voxels nor the support, into which its foot would be pressed.
+    Neither voxels, obstacles nor the support, into which its foot would be pressed.
     """
     T_cloud_base = np.linalg.inv(T_base_cloud)
     in_box = moved(np.linalg.inv(load.T_base_box), load.points)
@@ -127,7 +128,14 @@ def places_for(
             pose[2, 3] -= foot  # of a region whose bottom is a little too low
         off, half = load.above_its_foot
         around = np.abs(moved(np.linalg.inv(pose), voxels) - (0.0, 0.0, off))
-        if not (around < half + VOXEL_SIZE / 2).all(axis=1).any():
+        if (around < half + VOXEL_SIZE / 2).all(axis=1).any():
+            continue
+        size = np.maximum(load.half - RELEASE_HEIGHT, 1e-6)
+        box = SolidBoxes(pose[None, :3, 3], (np.diag(size) @ pose[:3, :3].T)[None])
+        pairs = near_pairs(box, obstacles, 0.0)
+        if not any(
+            (separation(box.take(near), each, np.zeros(3)) < 0).any() for near, each in pairs
+        ):
             yield pose
 
 
@@ -137,7 +145,8 @@ def _places(place: Place, load: Load) -> Iterator[Float64]:
         return
     low, high = np.array(place.region.min), np.array(place.region.max)
     shares = sorted(product(PLACE_SHARES, PLACE_SHARES), key=lambda pair: np.hypot(*pair))
-    for share, turn in product(shares, range(TURNS_IN_REGION)):
+    ways = product(range(TURNS_IN_REGION), range(len(shares)))
+    for turn, spot in sorted(ways, key=sum):  # other turns and other spots alternate
         about = Rotation.from_euler("z", 2 * np.pi * turn / TURNS_IN_REGION).as_matrix()
         pose = np.eye(4)
         pose[:3, :3] = about @ load.T_base_box[:3, :3]
@@ -145,6 +154,6 @@ def _places(place: Place, load: Load) -> Iterator[Float64]:
         reach[2] += load.below / 2 + RELEASE_HEIGHT / 2
         room = (high - low) / 2 - reach
         if (room > 0.0).all():
-            pose[:2, 3] = ((low + high) / 2)[:2] + share * room[:2]
+            pose[:2, 3] = ((low + high) / 2)[:2] + shares[spot] * room[:2]
             pose[2, 3] = low[2] + 2 * reach[2] - np.abs(pose[2, :3]) @ load.half
             yield pose

@@ -14,14 +14,16 @@ from roboplan.toppra import PathParameterizerTOPPRA, SplineFittingMode, TOPPRAOp
 
 from edgegrasp_camera.arrays import Float64, Floats
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.gripper import HALF_TURN
 from edgegrasp_model.options import DetectOptions, Place, RobotArm
 from edgegrasp_model.results import Following
-from edgegrasp_model.scene.cloud import unit
+from edgegrasp_model.scene.cloud import CanonicalFrame, unit
+from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_results import ArmPlan, ArmTrajectory, DetectedObject, Detection, Grasp
 from edgegrasp_robot.held import Held, can_leave, held_by, load_of, places_for
 from edgegrasp_robot.robot import GROUP, Robot
-from edgegrasp_robot.surroundings import HELD_NAME, Load, Surroundings, carrying, moved, surrounded
+from edgegrasp_robot.surroundings import HELD_NAME, Load, Surroundings, carrying, surrounded
 
 MAX_TRIED = 200  # most grasps that are tried with the arm, in their order
 MAX_PLACES = 6  # in a region, that the arm may be asked for with one grasp
@@ -35,10 +37,9 @@ STEP_SECONDS = 0.01  # seconds between the rows of a trajectory
 TRAJECTORY_CHECK_STEP = 0.005  # radians between the joints that are checked along a trajectory
 PATH_CHECK_STEP = 0.03  # along a path; finer where its trajectory touches something after all
 PATH_SECONDS = 1.0  # of a request, for searches that find no path; others take milliseconds
+LIMIT_SLACK = 1e-3  # radians or metres by which encoders may be beyond a limit
 IK_RESTARTS = 2  # of the inverse kinematics, from joints at random
 TRAVEL_COST = 0.02  # cost, as a share of a score, per radian of the joint that turns most
-# Factors for the columns of a hand's pose: unchanged, and turned by 180 degrees about its z.
-AS_IT_IS, HALF_TURN = np.array([[1.0, 1.0, 1.0, 1.0], [-1.0, -1.0, 1.0, 1.0]], np.float32)
 FAILURES = ["out_of_reach", "arm_collision", "no_place"]  # the last that holds is counted
 NO_REACH = "no grasp is within the arm's reach; see counts."
 
@@ -52,7 +53,8 @@ def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
         fix = f"Send {count}: {', '.join(robot.joint_names)}."
         raise InvalidRequest("options.robot.joints", f"{len(asked.joints)} numbers", fix)
     joints = np.array(asked.joints)
-    for row in np.flatnonzero((joints < robot.lower) | (joints > robot.upper)):
+    beyond = (joints < robot.lower - LIMIT_SLACK) | (joints > robot.upper + LIMIT_SLACK)
+    for row in np.flatnonzero(beyond):
         low, high = robot.lower[row], robot.upper[row]
         fix = f"{robot.joint_names[row]} moves between {low:g} and {high:g}: send where it is."
         raise InvalidRequest(f"options.robot.joints.{row}", f"{joints[row]:g}", fix)
@@ -84,6 +86,8 @@ def plan_picks(
     assert asked is not None
     if scene is None:
         return detection
+    start_joints = np.clip(asked.joints, robot.lower, robot.upper).tolist()
+    asked = asked.model_copy(update={"joints": start_joints})
     start = time.perf_counter()
     points = points if scene.corrected is None else scene.corrected
     picks: list[_Pick] = []
@@ -185,7 +189,8 @@ class _Arm:
             return _Pick(grasp, ArmPlan(reachable=False), "hand_collision")
         T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand
         length = self._options.collision.approach_length
-        poses, turns = _straight(T_base_hand, T_base_hand[:3, 2], -length, 0.0), [AS_IT_IS]
+        poses = _straight(T_base_hand, T_base_hand[:3, 2], -length, 0.0)
+        turns = [np.ones_like(HALF_TURN)]
         if self._robot.gripper.symmetric:
             turns.append(HALF_TURN)
             if T_base_hand[:3, 0] @ self._start_x < 0.0:
@@ -270,8 +275,9 @@ class _Arm:
         if load is None or not back:
             return None
         around, over = self._around.without(load), max(rules.approach_length, rules.retreat_length)
-        voxels = moved(around.T_base_scene, around.voxels)
-        places = places_for(place, load, voxels, self._scene, self._T_base_cloud)
+        obstacles = SolidBoxes.from_shapes(rules.obstacles, CanonicalFrame(self._T_base_cloud))
+        free = around.voxels, obstacles
+        places = places_for(place, load, *free, self._scene, self._T_base_cloud)
         if (first := next(places, None)) is None:
             if grasp.object is not None:
                 self._without_place.add(grasp.object)

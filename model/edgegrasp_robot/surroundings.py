@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Bools, Float64, Floats
 from edgegrasp_model.errors import InvalidRequest, StartCollision
-from edgegrasp_model.options import Box, OrientedBox, RobotArm
-from edgegrasp_model.scene.cloud import pose_matrix, unit
+from edgegrasp_model.options import Box, OrientedBox, RobotArm, SupportPlane
+from edgegrasp_model.scene.cloud import CanonicalFrame, pose_matrix, unit
 from edgegrasp_model.scene.obstacles import box_pose
-from edgegrasp_model.scene.scene import Scene
+from edgegrasp_model.scene.scene import Scene, plane_in
 from edgegrasp_model.scene.support import heights_over
 from edgegrasp_robot.robot import HAND, Robot, touching
 
@@ -55,8 +55,7 @@ class Surroundings(NamedTuple):
 
     own: set[int]  # numbers of objects that are the arm itself, as the camera sees it
     boxes: list[Obstacle]  # the support and the request's obstacles
-    voxels: Float64  # (V, 3) centers of those of the cloud and of unseen space, scene frame
-    T_base_scene: Float64  # (4, 4)
+    voxels: Float64  # (V, 3) centers of those of the cloud and of unseen space, base frame
 
     def all(self) -> list[Obstacle]:
         """Every obstacle."""
@@ -66,14 +65,13 @@ class Surroundings(NamedTuple):
         # octomap allows no certainty.
         cells = np.tile([0.0, 0.0, 0.0, VOXEL_SIZE, 0.97, 0.5], (len(self.voxels), 1))
         cells[:, :3] = self.voxels
-        return [*self.boxes, ("the cloud", core.OcTree(list(cells), VOXEL_SIZE), self.T_base_scene)]
+        return [*self.boxes, ("the cloud", core.OcTree(list(cells), VOXEL_SIZE), np.eye(4))]
 
     def without(self, load: Load) -> "Surroundings":
         """The same once a load is taken away."""
-        centers = moved(self.T_base_scene, self.voxels)
-        inside = np.abs(moved(np.linalg.inv(load.T_base_box), centers)) < load.half
-        own = inside.all(axis=1)
-        own |= cKDTree(load.points).query(centers, distance_upper_bound=NEAR_HELD)[0] <= NEAR_HELD
+        inside = np.abs(moved(np.linalg.inv(load.T_base_box), self.voxels)) < load.half
+        near = cKDTree(load.points).query(self.voxels, distance_upper_bound=NEAR_HELD)[0]
+        own = inside.all(axis=1) | (near <= NEAR_HELD)
         return self._replace(voxels=self.voxels[~own])
 
 
@@ -119,16 +117,18 @@ def surrounded(
     for row, (T_cloud_box, half) in enumerate(map(box_pose, boxes)):
         place = T_base_cloud @ T_cloud_box
         known.append((f"collision.obstacles.{row}", core.Box(*(2 * half)), place))
-    T_base_scene = T_base_cloud @ np.linalg.inv(scene.frame.T_canonical_cloud)
+    in_base = CanonicalFrame(T_base_cloud @ np.linalg.inv(scene.frame.T_canonical_cloud))
+    flat, support = np.asarray(points).reshape(-1, 3), None
     if scene.support is not None:
-        slab, T_scene_slab = _slab(scene, points, np.linalg.inv(T_base_scene)[:3, 3])
-        known.append(("the support", slab, T_base_scene @ T_scene_slab))
-    voxels = _voxels(robot, joints, scene, points, T_base_scene)
+        support = plane_in(in_base, scene.support)
+        known.append(("the support", *_slab(support, flat, T_base_cloud)))
+    voxels = _voxels(support, flat, T_base_cloud)
+    voxels = voxels[~_near_robot(robot, joints, voxels, SELF_DISTANCE)]
     if asked.avoid_unseen:
-        hidden = _hidden(scene, voxels, T_base_scene)
-        hidden = hidden[~_near_robot(robot, joints, moved(T_base_scene, hidden), SELF_DISTANCE)]
+        hidden = _hidden(support, voxels, in_base.points(scene.viewpoints))
+        hidden = hidden[~_near_robot(robot, joints, hidden, SELF_DISTANCE)]
         voxels = np.concatenate([voxels, hidden])
-    around = Surroundings(own, known, voxels, T_base_scene)
+    around = Surroundings(own, known, voxels)
     obstacles = around.all()
     names = [name for name, _, _ in obstacles]
     with _standing_in([robot.scene, robot.straight], robot, obstacles):
@@ -165,23 +165,21 @@ def _standing_in(
                 planned.removeGeometry(name)
 
 
-def _slab(scene: Scene, points: object, base: Float64) -> tuple[core.Box, Float64]:
-    """The support and its pose T_scene_slab (4, 4), with the arm's base (3,) in the scene frame.
+def _slab(support: SupportPlane, points: Floats, T_base_cloud: Float64) -> tuple[core.Box, Float64]:
+    """The support, a plane of the base frame, and its pose T_base_slab (4, 4).
 
-    A slab below the whole plane; of a support above the base, what is seen of it.
+    A slab below the whole plane; of a support above the base, what points (N, 3) show of it.
     """
-    assert scene.support is not None
-    normal, height = np.array(scene.support.normal), float(heights_over(scene.support, base))
-    upright = Rotation.align_vectors(normal[None], [[0.0, 0.0, 1.0]])[0].as_matrix()
+    upright = Rotation.align_vectors([support.normal], [[0.0, 0.0, 1.0]])[0].as_matrix()
     size, middle = np.array(SUPPORT_SIZE), np.zeros(3)
-    if height < LOW_BASE:
-        seen = scene.frame.points(np.asarray(points).reshape(-1, 3))
-        seen = seen[np.abs(heights_over(scene.support, seen)) < VOXEL_SIZE]  # NaN is not
+    if -support.offset < LOW_BASE:
+        seen = moved(T_base_cloud, points)
+        seen = seen[np.abs(heights_over(support, seen)) < VOXEL_SIZE]  # NaN is not
         if len(seen):
-            low, high = np.percentile((seen - base) @ upright[:, :2], (0.5, 99.5), axis=0)
+            low, high = np.percentile(seen @ upright[:, :2], (0.5, 99.5), axis=0)
             size, middle[:2] = np.array([*(high - low), 2 * VOXEL_SIZE]), (low + high) / 2
-    middle[2] = -height - size[2] / 2
-    return core.Box(*size), pose_matrix(upright, base + upright @ middle)
+    middle[2] = support.offset - size[2] / 2
+    return core.Box(*size), pose_matrix(upright, upright @ middle)
 
 
 def _own_objects(robot: Robot, joints: Float64, scene: Scene, T_base_cloud: Float64) -> set[int]:
@@ -210,40 +208,35 @@ def _near_robot(robot: Robot, joints: Float64, points: Float64, distance: float)
     return core.RobotBodyFilter(robot.scene, options).computeMask(joints, placed)
 
 
-def _voxels(
-    robot: Robot, joints: Float64, scene: Scene, points: object, T_base_scene: Float64
-) -> Float64:
-    """Centers (V, 3) of the cloud's voxels, scene frame, without the support's and the arm's."""
-    flat = np.asarray(points).reshape(-1, 3)
-    T, base = scene.frame.T_canonical_cloud, np.linalg.inv(T_base_scene)[:3, 3]
-    if scene.support is None:
-        kept = np.flatnonzero(np.isfinite(flat).all(axis=1))
+def _voxels(support: SupportPlane | None, points: Floats, T_base_cloud: Float64) -> Float64:
+    """Centers (V, 3) of the voxels of points (N, 3), base frame, without the support's.
+
+    Their grid is the base's: it must not depend on which part of a cloud was selected.
+    """
+    if support is None:
+        kept = np.flatnonzero(np.isfinite(points).all(axis=1))
     else:  # in single precision, since most of an image is support
-        plane = np.append(scene.support.normal, -scene.support.offset)
-        plane = (plane @ scene.frame.T_canonical_cloud).astype(flat.dtype)
-        height = flat @ plane[:3] + plane[3]
-        if heights_over(scene.support, base) < LOW_BASE:  # what is below is in its way too
+        plane = np.append(support.normal, -support.offset)
+        plane = (plane @ T_base_cloud).astype(points.dtype)
+        height = points @ plane[:3] + plane[3]
+        if -support.offset < LOW_BASE:  # what is below is in its way too
             height = np.abs(height)
         kept = np.flatnonzero(height > VOXEL_SIZE / 2)  # NaN is not
-    # In cells of the scene's frame, from the arm's base.
-    cells = flat[kept] @ (T[:3, :3].T / VOXEL_SIZE).astype(flat.dtype)
-    cells += ((T[:3, 3] - base) / VOXEL_SIZE).astype(flat.dtype)
+    cells = points[kept] @ (T_base_cloud[:3, :3].T / VOXEL_SIZE).astype(points.dtype)
+    cells += (T_base_cloud[:3, 3] / VOXEL_SIZE).astype(points.dtype)
     cells = cells[np.einsum("ij,ij->i", cells, cells) < (MAX_RANGE / VOXEL_SIZE) ** 2]
-    cells += (base / VOXEL_SIZE).astype(flat.dtype)
-    centers = _centers(cells, shifts=(-MARGIN, MARGIN))
-    return centers[~_near_robot(robot, joints, moved(T_base_scene, centers), SELF_DISTANCE)]
+    return _centers(cells, shifts=(-MARGIN, MARGIN))
 
 
-def _hidden(scene: Scene, voxels: Float64, T_base_scene: Float64) -> Float64:
-    """Centers (U, 3) of voxels that others hide from every camera, above the support."""
-    base = np.linalg.inv(T_base_scene)[:3, 3]
+def _hidden(support: SupportPlane | None, voxels: Float64, viewpoints: Float64) -> Float64:
+    """Centers (U, 3) of voxels that others hide from every camera (W, 3), above the support."""
     steps = np.arange(VOXEL_SIZE, 2 * MAX_RANGE, VOXEL_SIZE)[:, None, None]
     hidden = []
-    for eye in scene.viewpoints.astype(np.float64):
+    for eye in viewpoints:
         places = (voxels + steps * unit(voxels - eye)).reshape(-1, 3)
-        kept = np.einsum("ij,ij->i", places - base, places - base) < MAX_RANGE**2
-        if scene.support is not None:
-            kept &= heights_over(scene.support, places) > VOXEL_SIZE / 2
+        kept = np.einsum("ij,ij->i", places, places) < MAX_RANGE**2
+        if support is not None:
+            kept &= heights_over(support, places) > VOXEL_SIZE / 2
         hidden.append(places[kept] / VOXEL_SIZE)
     return _centers(*hidden)
 

@@ -3,8 +3,7 @@
 import numpy as np
 from tests.many_options import OWN_GRIPPER
 
-from edgegrasp_model.given import FLIPPED
-from edgegrasp_model.gripper import gripper_fields
+from edgegrasp_model.gripper import HALF_TURN, gripper_fields
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import NoGrasp
 from edgegrasp_model.scene.cloud import CloudInput
@@ -125,7 +124,7 @@ def test_hand_poses_of_detected_grasps_find_their_own_contacts() -> None:
         assert abs(contact[0]) < PANDA.pad_half_width
         assert abs(contact[1]) < PANDA.max_opening / 2
     assert near > 0.8 * len(poses)
-    flipped = detector().score(cloud, ask(gripper=hand), hand_poses=poses @ FLIPPED)
+    flipped = detector().score(cloud, ask(gripper=hand), hand_poses=poses * HALF_TURN)
     assert not all(each.grasp.collision_free for each in flipped.evaluations)
     for one, other in zip(scored.evaluations, flipped.evaluations, strict=True):
         np.testing.assert_allclose(one.grasp.score, other.grasp.score, atol=1e-3)

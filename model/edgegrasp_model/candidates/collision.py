@@ -23,6 +23,7 @@ from edgegrasp_model.scene.segment import BACKGROUND
 from edgegrasp_model.unseen import enters_unseen
 
 FINGER_SURROUNDINGS = 0.006  # metres around a finger that count as near it
+MIN_BOX_WIDTH = 0.005  # metres across the way; narrower ones may pass between voxels
 MIN_BACKGROUND_VOXELS = 8  # voxels of background between the fingers that keep them from closing
 
 
@@ -40,6 +41,8 @@ def collides(
     that the hands were fully checked earlier: unseen space and background are left out.
     """
     boxes = gripper.open_boxes + request.margin * np.array([[-1.0], [1.0]])  # (B, 2, 3)
+    thin = np.maximum(MIN_BOX_WIDTH - (boxes[:, 1] - boxes[:, 0]), 0.0) / 2 * (1.0, 1.0, 0.0)
+    boxes += np.stack([-thin, thin], axis=1)
     behind, lift = request.approach_length, 0.0  # metres along the hand's z, and straight up
     if request.retreat_direction == "up":
         lift = request.retreat_length

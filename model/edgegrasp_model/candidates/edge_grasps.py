@@ -165,7 +165,8 @@ def retract(
     rise = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
         back = np.where(clearance >= 0, 0.0, -clearance / rise)
-    clear = (back >= 0) & (back <= gripper.tip_z - gripper.contact_z - FIT_MARGIN)
+    room = max(gripper.tip_z - gripper.contact_z - FIT_MARGIN, 0.0)
+    clear = (back >= 0) & (back <= room)
     pose = pose.copy()
     pose[clear, :3, 3] += back[clear, None] * candidates.approach[clear]
     return replace(candidates, T_cloud_hand=pose), clear

@@ -20,7 +20,7 @@ from edgegrasp_model.candidates.edge_grasps import (
     retract,
     spread_out,
 )
-from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.gripper import HALF_TURN, Gripper
 from edgegrasp_model.kernels import non_max_suppression
 from edgegrasp_model.options import (
     APPROACH_STREAM,
@@ -44,6 +44,7 @@ class Sample:
 
     candidates: Candidates  # E of them
     collision_free: Bools  # (E,)
+    turned: Bools  # (E,) by 180 degrees about z once scored: free that way only
     drawn: Candidates  # all of them, C
     outcome: NDArray[np.int8]  # (C,) each one's OUTCOME_CODE; RETURNED: it is to be scored
     row: Int64  # (E,) indices of the candidates among them
@@ -54,11 +55,18 @@ class Sample:
         return Sample(
             Candidates.concatenate([self.candidates, other.candidates]),
             np.concatenate([self.collision_free, other.collision_free]),
+            np.concatenate([self.turned, other.turned]),
             Candidates.concatenate([self.drawn, other.drawn]),
             np.concatenate([self.outcome, other.outcome]),
             np.concatenate([self.row, other.row + len(self.drawn)]),
             np.concatenate([self.logits, other.logits]),
         )
+
+    def scored(self, logits: Float32) -> "Sample":
+        """This sample with its logits (E,); the network saw the hands as they were drawn."""
+        pose = self.candidates.T_cloud_hand
+        pose = np.where(self.turned[:, None, None], pose * HALF_TURN, pose)
+        return replace(self, candidates=replace(self.candidates, T_cloud_hand=pose), logits=logits)
 
 
 class Sampler:
@@ -121,6 +129,12 @@ class Sampler:
         checked = drawn.take(row)
         hands = checked.T_cloud_hand, checked.opening
         free = ~collides(self.scene, *hands, self.gripper, options.collision)
+        turned = np.zeros_like(free)
+        if not self.gripper.symmetric:  # it has a camera at one side, say
+            hit = checked.take(np.flatnonzero(~free))
+            hands = hit.T_cloud_hand * HALF_TURN, hit.opening
+            turned[~free] = ~collides(self.scene, *hands, self.gripper, options.collision)
+            free |= turned
         outcome[passed] = OUTCOME_CODE[Outcome.NOT_CHECKED]
         outcome[row] = OUTCOME_CODE[Outcome.NOT_SCORED]
         if mode != "ignore":
@@ -134,10 +148,10 @@ class Sampler:
         if mode == "penalise":  # then those that collide
             rest = random_rows(np.flatnonzero(new & ~free), most - len(scored), self._rng)
             scored = np.sort(np.concatenate([scored, rest]))
-        row, free = row[scored], free[scored]
+        row, free, turned = row[scored], free[scored], turned[scored]
         outcome[row] = OUTCOME_CODE[Outcome.RETURNED]
         self.counts["scored"] += len(row)
-        return Sample(drawn.take(row), free, drawn, outcome, row)
+        return Sample(drawn.take(row), free, turned, drawn, outcome, row)
 
     def all(self) -> Sample:
         """Two rounds, whatever their scores."""

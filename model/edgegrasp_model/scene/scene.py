@@ -231,6 +231,7 @@ def build_scene(
     point_of_row = np.full(sent.rows_sent, -1, dtype=np.int64)
     point_of_row[sent.row] = np.where(kept, np.cumsum(kept) - 1, -1)[voxels.voxel]
     spare = 0.0 if isinstance(options.support, SupportPlane) else FOUND_PLANE_CLEARANCE
+    objects = in_cloud[kept][number >= 0]
     return Scene(
         cloud=cloud,
         up=UP,
@@ -240,7 +241,7 @@ def build_scene(
         approach_allowed=approach,
         contact_allowed=contact,
         object_of_point=number,
-        support=None if support is None else _plane_under_hands(support.plane, frame, spare),
+        support=None if support is None else plane_in(frame, support.under(objects, spare)),
         at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, sent.points),
         viewpoints=(eyes[:0] if options.viewpoint is None else eyes).astype(np.float32),
         confidence=selected.confidence,
@@ -260,15 +261,13 @@ def _seen_from_above(points: Float32, up: Float64 | None) -> tuple[Int64, Float6
     return near, (points[near].mean(axis=0, dtype=np.float64) + USUAL_DISTANCE * over)[None]
 
 
-def _plane_under_hands(plane: SupportPlane, frame: CanonicalFrame, spare: float) -> SupportPlane:
-    """The plane that hands stay above, canonical frame: `spare` metres over one that was found."""
+def plane_in(frame: CanonicalFrame, plane: SupportPlane) -> SupportPlane:
+    """A plane of the cloud's frame in another one."""
     normal = np.asarray(plane.normal)
     length = float(np.linalg.norm(normal))
     foot = frame.points(normal * (plane.offset / length**2))
     turned = frame.directions(normal) / length
-    return SupportPlane.model_construct(
-        normal=tuple(turned.tolist()), offset=float(foot @ turned) + spare
-    )
+    return SupportPlane.model_construct(normal=tuple(turned.tolist()), offset=float(foot @ turned))
 
 
 def _up(

@@ -66,6 +66,20 @@ class Support:
     # Rise over the plane at (x, y): of 1, x, y, x^2, x y, y^2.
     bow: Float64 = field(default_factory=lambda: np.zeros(6))
 
+    def under(self, objects: Floats, least: float) -> SupportPlane:
+        """The plane nearest to the support under objects (N, 3), which hands stay above.
+
+        Where what is seen lies less than `least` metres over the support's plane, that counts.
+        """
+        terms = _bow_terms(*self.frame.points(objects)[:, :2].T)
+        rise = np.clip(self.bow @ terms, least, MAX_BOW)
+        height, *slope = np.linalg.lstsq(terms[:3].T, rise)[0]
+        normal, origin = np.array([-slope[0], -slope[1], 1.0]), self.frame.T_canonical_cloud[:3, 3]
+        return SupportPlane.model_construct(
+            normal=tuple(self.frame.directions_in_cloud(normal).tolist()),
+            offset=float(height - normal @ origin),
+        )
+
     def heights(self, seen: "ViewedPoints") -> tuple[Float32, Float32]:
         """Heights (N,) over the support, which may be bowed, and up to which points belong to it.
 
@@ -332,7 +346,7 @@ def measure_support(seen: ViewedPoints, plane: SupportPlane, least: float, whole
     # If the cloud was cut off above the plane, only objects on it are near.
     if near.sum() < MIN_PLANE_POINTS or (not whole and (height[near] < 1e-4).mean() < 0.2):
         return Support(plane, frame, least)
-    terms, bow = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y]), np.zeros(6)
+    terms, bow = _bow_terms(x, y), np.zeros(6)
     ridge = 1e-6 * np.eye(6)  # keeps the bow small where little of the support is seen
     for _ in range(4):
         near = np.abs(height - bow @ terms) < thick
@@ -340,7 +354,12 @@ def measure_support(seen: ViewedPoints, plane: SupportPlane, least: float, whole
         bow = np.asarray(np.linalg.solve(held @ terms.T + ridge, held @ height))
     off = np.abs(height - bow @ terms)[near]
     growth = 1.4826 * float(np.median(off / np.square(distance[near])))
-    return Support(plane, frame, least, float(np.median(off)), float(near.mean()), growth, bow)
+    residual = float(np.median(np.abs(height[near])))
+    return Support(plane, frame, least, residual, float(near.mean()), growth, bow)
+
+
+def _bow_terms(x: Floats, y: Floats) -> Floats:
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
 
 
 @compiled("contract")
