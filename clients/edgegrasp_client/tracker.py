@@ -130,4 +130,6 @@ def _read(images: Iterable[Any], latest: "queue.Queue[Any]", stopped: threading.
             latest.put(image)
     except Exception as error:
         end = error
-    latest.put(end)  # once the last image is taken
+    while not stopped.is_set():  # once the last image is taken
+        with suppress(queue.Full):
+            return latest.put(end, timeout=0.1)

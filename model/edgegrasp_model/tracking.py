@@ -45,7 +45,7 @@ REGISTRATION_DISTANCES = (*(0.03,) * 4, *(0.015,) * 4, *(0.008,) * 4)
 SURFACE_SPACING = 0.004  # metres along a surface to its nearest point, where it continues
 TANGENT_WEIGHT = 0.3  # weight of distances beyond that, relative to 1 across the surface
 # Prior for no motion, in points: where the shape leaves motion undetermined, the object stays.
-STILL_PRIOR = (0.5,) * 3 + (0.3,) * 3
+STILL_PRIOR = (20.0,) * 3 + (0.3,) * 3
 MIN_REGISTERED_POINTS = 6  # points that say how an object moved
 FOUND_SHARE, WELL_SEEN_SHARE = 0.5, 0.75  # share of its points on the cloud: found; well seen
 # Points this near to an object's surface belong to it: metres, or spacings of the surface's points.
@@ -82,11 +82,12 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
         return options
     some = subsample(points, 2000)
     apart = np.asarray(cKDTree(some).query(np.array(places))[0])
-    if options.viewpoint is not None:  # what is out of view may be anywhere near the camera
+    if options.viewpoint is not None:  # what is out of view or hidden may be near the camera
         eye = np.reshape(options.viewpoint, (-1, 3)).mean(axis=0)
-        aside, _ = cKDTree(unit(some - eye)).query(unit(places - eye))
+        aside, row = cKDTree(unit(some - eye)).query(unit(places - eye))
         distance = np.linalg.norm(places - eye, axis=1)
-        apart[(aside > OUT_OF_VIEW_ANGLE) & (distance < MAX_VIEW_DISTANCE)] = 0.0
+        unseen = (aside > OUT_OF_VIEW_ANGLE) | (np.linalg.norm(some[row] - eye, axis=1) < distance)
+        apart[unseen & (distance < MAX_VIEW_DISTANCE)] = 0.0
     if (away := float(np.min(apart))) > MAX_FRAME_DISTANCE:
         value = f"grasps {away:.2g} m from the nearest point of the cloud"
         fix = "Send previous in the frame of this cloud, or leave it out."
