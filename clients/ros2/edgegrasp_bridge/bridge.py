@@ -39,6 +39,7 @@ ENCODINGS = {  # of sensor_msgs/Image: type of a value, channels
 DELETE_ALL, LINE_LIST = 3, 5  # of visualization_msgs/Marker
 LINE_WIDTH = 0.003  # metres
 KEPT_MESSAGES = 30  # images or clouds that a mask may still be of
+MAX_BEHIND = 5.0  # seconds that a camera's image may be older than another camera's beside it
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,8 @@ def read_parameters(given: Mapping[str, Any]) -> tuple[Settings, dict[str, Any]]
     for name, value in given.items():
         if name.startswith(OPTION_PREFIX) and not (isinstance(value, str) and value == ""):
             options[name.removeprefix(OPTION_PREFIX)] = option_of_text(value)
+    if options.get("objects") is False:  # as YAML reads off
+        options["objects"] = "off"
     return Settings(**own), options
 
 
@@ -109,12 +112,15 @@ class Inbox:
     def __init__(self) -> None:
         self._sources = {field: deque[Any](maxlen=KEPT_MESSAGES) for field in ("cloud", "depth")}
         self._cameras: dict[str, Any] = {}  # by their frames
+        self._newest: dict[str, Any] = {}  # depth images, by their frames
         self._mask: Any = None
         self._joints: dict[str, float] = {}
 
     def take(self, field: str, message: Any, mask_age: float) -> bool:
         """Keep a message of a field of Scene; whether there is something new to detect in."""
-        if field == "camera":
+        new = field in self._sources
+        if field == "camera":  # that of the first image may come after it
+            new = message.header.frame_id not in self._cameras and len(self._newest) > 0
             self._cameras[message.header.frame_id] = message
         elif field == "mask":
             self._mask = message
@@ -122,8 +128,22 @@ class Inbox:
             self._joints |= zip(message.name, map(float, message.position), strict=False)
         else:
             self._sources[field].append(message)
+            if field == "depth":
+                self._newest[message.header.frame_id] = message
         masked = self._mask is not None and mask_age > 0
-        return field == "mask" if masked else field in self._sources
+        return self._mask_is_due(field, message, mask_age) if masked else new
+
+    def _mask_is_due(self, field: str, message: Any, mask_age: float) -> bool:
+        """Whether a message completes a mask and its image, or shows that they do not match."""
+        sources = next(filter(None, map(list, self._sources.values())), [])
+        if field not in ("mask", *self._sources) or not sources:
+            return field == "mask"
+        its = self._mask.header.stamp
+        age = _seconds(sources[-1].header.stamp, its)
+        if age < 0 or field == "mask":  # younger than the newest image: its own is still to come
+            return age >= 0
+        known = any(each.header.stamp == its for each in sources)
+        return message.header.stamp == its or not known or age > mask_age
 
     def scene(self, mask_age: float) -> Scene:
         """The newest cloud or depth image of each camera; with a mask, the image it was made of.
@@ -137,9 +157,8 @@ class Inbox:
             return Scene(joints=self._joints)
         source, mask = sources[-1], self._mask if mask_age > 0 else None
         if mask is not None:
-            newest, its = source.header.stamp, mask.header.stamp
-            age = newest.sec - its.sec + 1e-9 * (newest.nanosec - its.nanosec)
-            if age > mask_age:
+            its = mask.header.stamp
+            if (age := _seconds(source.header.stamp, its)) > mask_age:
                 why = f"The mask is {age:.3g} s older than the newest image"
                 raise ValueError(f"{why}. Send masks, or set mask_age: {mask_age:g} s.")
             same = [each for each in sources if each.header.stamp == its]
@@ -148,9 +167,12 @@ class Inbox:
             source = max(same, key=lambda each: each.header.frame_id == mask.header.frame_id)
         if clouds:
             return Scene(cloud=source, mask=mask, joints=self._joints)
-        latest = {each.header.frame_id: each for each in (sources if mask is None else [source])}
-        # The first one's frame is the answer's, which must not change from image to image.
-        source, *more = (latest[frame] for frame in sorted(latest))
+        latest = [source]
+        if mask is None:
+            # The first one's frame is the answer's, which must not change from image to image.
+            now, newest = source.header.stamp, sorted(self._newest.copy().items())
+            latest = [each for _, each in newest if _seconds(now, each.header.stamp) <= MAX_BEHIND]
+        source, *more = latest
         others = tuple((each, self._camera_of(each)) for each in more)
         return Scene(None, source, self._camera_of(source), mask, others, self._joints)
 
@@ -160,6 +182,11 @@ class Inbox:
         alone = len(self._cameras) == len(frames) == 1
         only = next(iter(self._cameras.values())) if alone else None
         return self._cameras.get(depth.header.frame_id, only)
+
+
+def _seconds(late: Any, early: Any) -> float:
+    """Seconds from one stamp to another."""
+    return float(late.sec - early.sec + 1e-9 * (late.nanosec - early.nanosec))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -374,6 +401,8 @@ def _robot(
     if None in joints and "joints" not in given:
         missing = robot.joint_names[joints.index(None)]
         raise ValueError(f"joint_states: no position of {missing!r} has arrived.")
+    if "T_base_cloud" in given:
+        return {"joints": joints, **given}
     T_base_cloud = lookup(robot.base_frame, scene.header.frame_id, scene.header.stamp)
     return {"joints": joints, "T_base_cloud": T_base_cloud.ravel().tolist(), **given}
 

@@ -47,7 +47,8 @@ class EdgeGraspNode(Node):
         settings, _ = self._read()
         self.client = GraspClient(settings.server, timeout=settings.timeout)
         self._inbox = bridge.Inbox()
-        self._followed, self._tracker = {}, GraspTracker()  # options, and the tracker made of them
+        self._followed: Any = None  # the options and the frame that the tracker is for
+        self._tracker = GraspTracker()
         self._buffer = Buffer()
         self._listener = TransformListener(self._buffer, self)
         self._poses = self.create_publisher(PoseArray, "grasps", 1)
@@ -96,15 +97,18 @@ class EdgeGraspNode(Node):
     def _detect(self, object_cloud: Any = None, follow: bool = False) -> Any:
         settings, options = self._read()
         object_cloud = object_cloud if object_cloud and object_cloud.data else None
-        if options != self._followed:
-            self._followed, self._tracker = options, GraspTracker(**options)
-        tracker = self._tracker if follow else None
         scene = self._inbox.scene(0.0 if object_cloud is not None else settings.mask_age)
+        asked = options, scene.header and scene.header.frame_id
+        if follow and asked != self._followed:
+            self._followed, self._tracker = asked, GraspTracker(**options)
+        tracker = self._tracker if follow else None
         found = bridge.detect(
             self.client, scene, settings, options, self._lookup, object_cloud, tracker
         )
         for warning in found.warnings:
             self.get_logger().warning(warning)
+        if settings.follow and not follow:  # an action's answer is not the followed grasp
+            return found, settings
         motions = zip(self._motions, bridge.trajectories(found), strict=False)
         for publisher, message, fields in (
             (self._poses, PoseArray(), bridge.pose_array(found)),
