@@ -220,7 +220,7 @@ def _check_outputs(asked: DetectFlags, fields: Mapping[str, Any]) -> None:
 def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
     """The options from the flags, and from the file where no flag is given."""
     try:
-        fields = json.loads(file.read_text()) if file else {}
+        fields = json.loads(file.read_text("utf-8")) if file else {}
         if not isinstance(fields, dict):
             raise ValueError("a JSON object is needed")
     except ValueError as error:

@@ -1,6 +1,7 @@
 """The program `edgegrasp`: a table of commands, whose modules are imported when they run."""
 
 import importlib
+import io
 import os
 import sys
 from typing import Annotated, Any
@@ -76,6 +77,8 @@ def load_command(name: str) -> Any:
 
 def _missing(name: str, error: ModuleNotFoundError) -> str:
     _, extra, _ = COMMANDS[name]
+    if error.name in ("PIL", "matplotlib"):  # pictures alone
+        extra = "view"
     said = f"edgegrasp {name}: {error}"
     return said if "pip install" in said else f"{said}. pip install 'edgegrasp[{extra}]'"
 
@@ -108,6 +111,8 @@ def _common(
 
 def main() -> None:
     """Run the program; a full disk ends it with a message, a closed pipe without one."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # not every terminal knows every character
     try:
         try:
             app()

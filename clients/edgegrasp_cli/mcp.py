@@ -9,6 +9,7 @@ import importlib.metadata
 import io
 import json
 import re
+import signal
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -74,6 +75,8 @@ def mcp(
     with asked.connect(asked.server) as client:
         tools = grasp_tools(client, folder.resolve())
         if http is None:
+            # A thread that waits for standard input would keep Python from ending.
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
             tools.run()
         else:
             where = host.strip("[]") or "127.0.0.1"  # IPv6 is in brackets
@@ -256,7 +259,7 @@ def _tool(function: Callable[..., Any], folder: Path) -> "Tool":
 @functools.cache
 def _schema_of_options() -> tuple[dict[str, Any], dict[str, Any]]:
     """The JSON Schema of options, without grippers as boxes, and what it refers to."""
-    document = resources.files("edgegrasp.v1").joinpath("openapi.json").read_text()
+    document = resources.files("edgegrasp.v1").joinpath("openapi.json").read_text("utf-8")
     schemas = json.loads(document.replace("#/components/schemas/", "#/$defs/"))
     schemas = schemas["components"]["schemas"]
     options = schemas["DetectOptions"]

@@ -80,7 +80,8 @@ def open_inference(
         models = Models(client, name, asked.timeout)
         place = f"[{host}]" if ":" in host else host  # IPv6 is in brackets
         with grpc_server(models, f"{place}:{grpc_port}"):
-            print(f"Open Inference on http://{place}:{http_port} and gRPC {place}:{grpc_port}")
+            addresses = f"http://{place}:{http_port} and gRPC {place}:{grpc_port}"
+            print(f"Open Inference on {addresses}", flush=True)
             uvicorn.run(http_app(models), host=host, port=http_port, log_level="warning")
 
 

@@ -47,7 +47,7 @@ def add(
         "gripper": str(Path(gripper).absolute()) if gripper.endswith(".toml") else gripper,
     }
     lines = [f"{name} = {json.dumps(value)}\n" for name, value in fields.items()]
-    output.write_text("".join([*lines, NO_OFFSET]))
+    output.write_text("".join([*lines, NO_OFFSET]), "utf-8")
     try:
         check(output)
     except EdgeGraspError as error:

@@ -106,7 +106,7 @@ def _write(
     names = [name + part for name in done for part in ("", "-labels")]
     pictures = (image("png", (output / f"{name}.png").read_bytes(), name) for name in names)
     title = f"{model} in {len(done)} scenes of real cameras"
-    (output / "index.html").write_text(page(title, [*map(table, tables), *pictures]))
+    (output / "index.html").write_text(page(title, [*map(table, tables), *pictures]), "utf-8")
     for head, *cells in tables:
         columns = (Column(name, no_wrap=name in ("scene", "plane")) for name in head)
         shown = Table(*columns, box=None)

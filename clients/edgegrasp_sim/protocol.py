@@ -123,7 +123,7 @@ def load_protocol(name: str) -> Protocol:
 
 def _constants(path: Path) -> dict[str, Any]:
     """The tables of a file, and those constants of its `base`, which ships, that it leaves out."""
-    table = tomllib.loads(path.read_text())
+    table = tomllib.loads(path.read_text("utf-8"))
     if "base" not in table:
         return table
     base = table.pop("base")

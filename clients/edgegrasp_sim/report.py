@@ -83,7 +83,7 @@ def write_report(folder: ResultFolder, summary: dict[str, Any]) -> Path:
         f"<pre>{escape(json.dumps(facts, indent=1))}</pre></details>",
     ]
     path = folder.path / "report.html"
-    path.write_text(page(title, parts))
+    path.write_text(page(title, parts), "utf-8")
     return path
 
 

@@ -53,7 +53,7 @@ def _read_tokens(setting: str, path: Path | None) -> dict[bytes, Token]:
     if path is None:
         return {}
     try:
-        lines = [line.partition("#")[0].strip() for line in path.read_text().splitlines()]
+        lines = [line.partition("#")[0].strip() for line in path.read_text("utf-8").splitlines()]
     except (OSError, UnicodeDecodeError) as error:
         why = f"{setting}: got {str(path)!r}. It cannot be read: {error}."
         raise InvalidSettings(why) from None

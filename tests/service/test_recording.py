@@ -137,10 +137,9 @@ def test_outcomes_are_appended_until_the_file_is_full(start_dummy, cloud, tmp_pa
 
 
 def test_there_are_no_outcomes_unless_the_operator_wants_them(dummy_server) -> None:
-    assert httpx.post(f"{dummy_server.http_url}/v1/outcomes", json=TRIED).status_code == 404
-    tried = Job("RecordOutcome", "http", b"{}", 60.0, "application/json")  # as Ray lets through
-    told = answer.answer(tried, DummyCatalogue(), Settings()).error
-    assert "outcomes_file" in told.fix
+    refused = httpx.post(f"{dummy_server.http_url}/v1/outcomes", json=TRIED)
+    assert refused.status_code == 400
+    assert "outcomes_file" in refused.json()["fix"]
 
 
 def test_lines_are_whole_or_not_there(tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ METHODS = {
 PUBLIC_METHODS = ("Live", "Ready", "Docs")
 
 # The contract, written by hand as grasp.proto is.
-OPENAPI_DOCUMENT = json.loads(Path(grasp_pb2.__file__).with_name("openapi.json").read_text())
+OPENAPI_DOCUMENT = json.loads(Path(grasp_pb2.__file__).with_name("openapi.json").read_text("utf-8"))
 
 
 class HttpMiddleware:
@@ -188,9 +188,8 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
         swagger_favicon_url=f"{ASSETS}/favicon.png",
     )
     index = RedirectResponse(PLAYGROUND if settings.playground else "/docs")
-    work = [path for path in WORK if path != "/v1/outcomes" or settings.outcomes_file is not None]
     routes: list[BaseRoute] = [
-        *(Route(path, _Work(service, WORK[path]), methods=["POST"]) for path in work),
+        *(Route(path, _Work(service, WORK[path]), methods=["POST"]) for path in WORK),
         Route("/v1/models", partial(listed, "models")),
         Route("/v1/robots", partial(listed, "robots")),
         Route("/v1/models:reload", reload, methods=["POST"]),

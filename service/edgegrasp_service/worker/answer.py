@@ -156,7 +156,7 @@ class _Work:
         if not kind.lower().startswith(JSON):  # foreign web pages cannot send it
             fix = f"Send {JSON}."
             raise errors.UnsupportedMediaType("Content-Type", repr(kind[:40]), fix)
-        if path is None:  # Ray has this path without the setting too
+        if path is None:
             raise InvalidRequest("path", "/v1/outcomes", "Set the setting `outcomes_file`.")
         tried = parse(recording.TriedGrasp, read_json("body", self.job.body), "body")
         self.catalogue.get(tried.model)  # raises UnknownModel
