@@ -286,7 +286,7 @@ class WorkerPool:
                 await worker.start()
         except TimeoutError:  # it is stopped or hangs; its death is handled like any other
             worker.close()
-            nursery.kill()
+            nursery.close()
             why = "the process that workers fork from does not answer"
             raise errors.InvalidSettings(why) from None
         except BaseException:
@@ -351,13 +351,8 @@ class Nursery:
         """Fork a worker that talks over a socket."""
         socket.send_fds(self._control, [b"w"], [its_end.fileno()])
 
-    def kill(self) -> None:
-        """Kill the nursery, even if it is stopped; `watch` notices."""
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(self.pid, signal.SIGKILL)
-
     def close(self) -> None:
-        """Kill the nursery; the workers that it forked continue."""
+        """Kill the nursery, even if it is stopped; `watch` notices, and its workers continue."""
         self._process.kill()
         self._process.wait()
         (self._writer or self._control).close()
