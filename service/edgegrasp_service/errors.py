@@ -136,8 +136,7 @@ def report(error: Exception) -> Problem:
         field, value, fix = _sendable(error.field), _sendable(error.value), error.fix
     detail = f"{field}: got {value}. {fix}" if field else str(error)
     retry_after = error.retry_after if isinstance(error, Overloaded) else None
-    kind = kind_of(type(error))
-    return Problem(kind, detail, field, value, fix, code, status, retry_after)
+    return Problem(kind_of(type(error)), detail, field, value, fix, code, status, retry_after)
 
 
 def no_message(data: bytes) -> InvalidRequest:

@@ -80,8 +80,7 @@ def network_of(address: str) -> str:
         found = ipaddress.IPv6Address(address)
     except ValueError:
         return address
-    mapped = found.ipv4_mapped
-    return str(mapped or ipaddress.ip_network((int(found) >> 64 << 64, 64)))
+    return str(found.ipv4_mapped or ipaddress.ip_network((int(found) >> 64 << 64, 64)))
 
 
 CALL: ContextVar[Call | None] = ContextVar("call", default=None)  # of the running task, for logs

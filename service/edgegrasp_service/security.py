@@ -65,8 +65,7 @@ def _read_tokens(setting: str, path: Path | None) -> dict[bytes, Token]:
                 f"{setting}: got {len(text)} letters as token {number}. Use at least 16 of "
                 "A-Z a-z 0-9 - . _ ~ + /, such as `openssl rand -hex 32` prints."
             )
-        is_admin = setting.startswith("admin")
-        tokens[_digest(text)] = Token(name or f"{setting} {number}", is_admin)
+        tokens[_digest(text)] = Token(name or f"{setting} {number}", setting.startswith("admin"))
     if not tokens:
         raise InvalidSettings(f"{setting}: got {str(path)!r}. It has no token; write one per line.")
     return tokens

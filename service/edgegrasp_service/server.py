@@ -113,9 +113,8 @@ class Server:
 
     def _http_server(self, places: Places) -> "_HttpServer":
         tls = self.service.tls
-        router = create_router(self.service, self.metrics)
         config = uvicorn.Config(
-            HttpMiddleware(router, self.service),
+            HttpMiddleware(create_router(self.service, self.metrics), self.service),
             log_config=None,
             access_log=False,
             lifespan="off",

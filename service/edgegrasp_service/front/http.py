@@ -228,9 +228,8 @@ class _Work:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request; raises the errors of `GraspService`."""
         service, call, headers = self.service, scope["call"], Headers(scope=scope)
-        timeout = requested_timeout(headers)
         size = int(headers.get("content-length", service.settings.max_body_bytes))
-        async with service.admit(call, size, timeout):
+        async with service.admit(call, size, requested_timeout(headers)):
             body, more = bytearray(), True
             start = asyncio.get_running_loop().time()
             while more:

@@ -73,9 +73,8 @@ def load_catalogue(settings: Settings) -> "ModelCatalogue":
     # Torch takes seconds to import, and some tests do without it.
     from edgegrasp_model.detector import ModelCatalogue, choose_device
 
-    device = choose_device(settings.device)
     catalogue = ModelCatalogue.load(
-        settings.weights, settings.default_model, device, settings.grippers
+        settings.weights, settings.default_model, choose_device(settings.device), settings.grippers
     )
     catalogue.warm_up()
     load_robots(settings)
@@ -118,8 +117,7 @@ def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
             facts.grasps = len(result.grasps)
         else:
             with work.stage("score"):
-                most = settings.max_voxels
-                result = detector.score(cloud, options, **given, max_voxels=most)
+                result = detector.score(cloud, options, **given, max_voxels=settings.max_voxels)
             facts.grasps = len(result.evaluations)
         facts.model, facts.counts = result.model, dict(result.counts)
         with work.stage("encode"):
@@ -154,8 +152,7 @@ class _Work:
         """Append a tried grasp, the digest of its weights and the time to the outcomes' file."""
         kind, path = self.job.content_type, self.settings.outcomes_file
         if not kind.lower().startswith(JSON):  # foreign web pages cannot send it
-            fix = f"Send {JSON}."
-            raise errors.UnsupportedMediaType("Content-Type", repr(kind[:40]), fix)
+            raise errors.UnsupportedMediaType("Content-Type", repr(kind[:40]), f"Send {JSON}.")
         if path is None:
             raise InvalidRequest("path", "/v1/outcomes", "Set the setting `outcomes_file`.")
         tried = parse(recording.TriedGrasp, read_json("body", self.job.body), "body")
@@ -200,8 +197,7 @@ class _Work:
                 fields = read_request(self.job)
                 self.options = options = parse_options(fields["options"])
                 detector = self.catalogue.get(options.model)
-                scores = self.job.method == "ScoreGrasps"
-                given = _given(fields, options, most) if scores else {}
+                given = _given(fields, options, most) if self.job.method == "ScoreGrasps" else {}
                 in_time = self._within_deadline(most, self.catalogue.pace.point)
                 cloud, options = decode_cloud(fields, options, in_time)
         except MemoryError:

@@ -139,8 +139,7 @@ async def received(reader: asyncio.StreamReader) -> Any:
     """As `receive`, in the front."""
     try:
         length, body_length = MESSAGE_HEADER.unpack(await reader.readexactly(MESSAGE_HEADER.size))
-        text = await reader.readexactly(length)
-        return unpack(text, await reader.readexactly(body_length))
+        return unpack(await reader.readexactly(length), await reader.readexactly(body_length))
     except (asyncio.IncompleteReadError, OSError):
         return None
 

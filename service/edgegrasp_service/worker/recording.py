@@ -98,8 +98,7 @@ def append_line(path: Path, line: bytes) -> None:
     written.
     """
     try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        with os.fdopen(descriptor, "r+b", buffering=0) as file:
+        with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o644), "r+b", buffering=0) as file:
             fcntl.flock(file, fcntl.LOCK_EX)  # workers write one at a time
             end = file.seek(0, os.SEEK_END)
             if end > MAX_OUTCOMES_BYTES:
