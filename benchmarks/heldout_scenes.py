@@ -183,8 +183,7 @@ class Maker:
         if self.rng.random() < 0.8:
             self.box((wide, 0.01, 3 * high), (0, deep / 2, high / 2))
         self.room(1.0)
-        half = (wide / 2 - 0.06, deep / 2 - 0.05)
-        self.drop(int(self.rng.integers(2, 7)), half, 0.004, 0.6)
+        self.drop(int(self.rng.integers(2, 7)), (wide / 2 - 0.06, deep / 2 - 0.05), 0.004, 0.6)
         return Made(low, (55, 88), (245, 295), (0.5, 1.1), wide / 2)
 
     def walls(self, x: float, y: float, high: float, slope: float, thick: float) -> None:

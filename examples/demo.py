@@ -56,8 +56,7 @@ def main(seed: int, output: Path, engine: str | None = None) -> None:
         print(f"Executed the best one in the simulator: {verdict}.")
 
     output.mkdir(parents=True, exist_ok=True)
-    points = trimesh.Trimesh(seen.cloud, vertex_colors=colors, process=False)
-    points.export(output / "scene.ply")
+    trimesh.Trimesh(seen.cloud, vertex_colors=colors, process=False).export(output / "scene.ply")
     drawn = over_grpc.grasps[:LISTED]
     title = f"The {len(drawn)} best grasps among {placed} objects. Executed the best: {verdict}."
     view = View.of(crop(seen.cloud, seen.workspace, 0.05), seen.camera_position)

@@ -67,9 +67,8 @@ def metres(depth: Array, scale: float | None = None, field: str = "depth") -> Fl
         depth = depth[..., 0]
     whole = depth.dtype == np.uint16
     if depth.ndim != 2 or 0 in depth.shape or not (whole or depth.dtype.kind == "f"):
-        value = f"shape {depth.shape}, dtype {depth.dtype}"
         fix = "Send an image (H, W) of 16-bit whole numbers or of floats."
-        raise InvalidRequest(field, value, fix)
+        raise InvalidRequest(field, f"shape {depth.shape}, dtype {depth.dtype}", fix)
     with np.errstate(over="ignore"):  # infinite is no reading
         found = depth.astype(np.float32)
         found *= scale or (MILLIMETRE if whole else 1.0)

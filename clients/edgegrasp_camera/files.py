@@ -100,9 +100,8 @@ def read_npy(data: bytes, max_points: int, field: str = "cloud") -> Array:
     fix = FIXES["npy"] if field == "cloud" else f"Send what numpy.save(file, {field}) writes."
     with _reading(field, "npy", len(data), fix):
         stream = io.BytesIO(data)
-        version = np.lib.format.read_magic(stream)
         read = np.lib.format.read_array_header_1_0
-        if version != (1, 0):
+        if np.lib.format.read_magic(stream) != (1, 0):
             read = np.lib.format.read_array_header_2_0
         shape, fortran_order, dtype = read(stream, max_header_size=MAX_NPY_HEADER)
         if not all(type(size) is int and size >= 0 for size in shape):
@@ -132,9 +131,8 @@ def _read_npz(data: bytes, max_points: int) -> CloudInput:
         arrays: dict[str, Any] = {}
         for name, info in members.items():
             if name in known:
-                content = _unzipped(archive, info, max_points)
                 field = "cloud" if name == "points" else name
-                arrays[name] = read_npy(content, max_points, field)
+                arrays[name] = read_npy(_unzipped(archive, info, max_points), max_points, field)
     rgb, unread = arrays.pop("rgb", None), sorted(members.keys() - known)
     said = (f"arrays of the file that are not read: {', '.join(unread[:5])}.",) if unread else ()
     if "depth" in arrays:

@@ -131,8 +131,7 @@ def models(*, asked: DetectorFlags) -> None:
     """List the weights that can be used, here or on a server."""
     names = (Column(name, no_wrap=True) for name in ("model", "architecture"))
     table = Table(*names, "parameters", "gripper", "device", box=box.SIMPLE)
-    waiting = Console(stderr=True).status("Loading weights…")
-    with waiting, open_client(asked) as client:
+    with Console(stderr=True).status("Loading weights…"), open_client(asked) as client:
         found = client.models()
     for row in found:
         name = f"{row.name} (default)" if row.default else row.name
@@ -186,8 +185,7 @@ class OwnDetector:
     def _catalogue(self) -> "ModelCatalogue":
         from edgegrasp_model.detector import ModelCatalogue, choose_device
 
-        device = choose_device(self.device)
-        return ModelCatalogue.load(self.weights, "", device, self.grippers)
+        return ModelCatalogue.load(self.weights, "", choose_device(self.device), self.grippers)
 
 
 def decoded(cloud: Any, asked: Mapping[str, Any]) -> tuple[CloudInput, DetectOptions]:

@@ -152,13 +152,12 @@ def joint_trajectories(motion: ArmTrajectory) -> list[Message]:
     where it opens. Each begins and ends at rest; without a stamp, it is executed as it comes.
     """
     stops = [0, motion.grasp_row, motion.release_row, len(motion.times) - 1]
-    parts = pairwise([row for row in stops if row is not None])
     return [
         {
             "joint_names": list(motion.joint_names),
             "points": [_point(motion, row, first) for row in range(first, last + 1)],
         }
-        for first, last in parts
+        for first, last in pairwise([row for row in stops if row is not None])
     ]
 
 

@@ -14,7 +14,6 @@ import numpy as np
 from google.protobuf.message import DecodeError, Message
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_camera.arrays import Array
 from edgegrasp_client.connection import Tls, invalid, is_local, token_metadata, unreachable
 from edgegrasp_client.errors import GraspClientError
 from edgegrasp_client.requests import Request, cloud_file
@@ -103,8 +102,7 @@ class GrpcTransport:
             async for answer in call:
                 wrong = refused.popleft()
                 if answer.HasField("detection"):
-                    detection = read_as(Detection, answer.detection)
-                    yield StreamAnswer(answer.request_id, detection)
+                    yield StreamAnswer(answer.request_id, read_as(Detection, answer.detection))
                 else:
                     error = wrong or _described(answer.error.message, answer.error.detail)
                     yield StreamAnswer(answer.request_id, error=error)
@@ -168,17 +166,14 @@ def message_of(request: Request) -> Any:
     """The message of a request; raises InvalidRequestError for what no message can hold."""
     fields: dict[str, Any] = {"options": request.options, "depth_images": request.depth_images}
     for name, array in request.arrays.items():
-        fields[name] = array if name in ("edges", "hand_poses") else _packed(array)
+        little_endian = array.astype(array.dtype.newbyteorder("<"), copy=False)
+        fields[name] = array if name in ("edges", "hand_poses") else little_endian.tobytes()
     if request.cloud is not None:
         fields["encoded"] = dict(zip(("format", "data"), cloud_file(request.cloud), strict=True))
     kind = grasp_pb2.ScoreGraspsRequest if request.scores else grasp_pb2.DetectGraspsRequest
     message = kind()
     fill(message, fields)
     return message
-
-
-def _packed(array: Array) -> bytes:
-    return array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
 
 
 def fill(message: Message, value: object, path: str = "") -> None:

@@ -271,12 +271,11 @@ def _depth_fields(depth: object, path: str) -> dict[str, Any]:
     depth = np.ma.filled(depth, 0)
     if depth.ndim != 2 or depth.dtype.name not in DEPTH_ENCODINGS:
         raise invalid(path, f"shape {depth.shape}, dtype {depth.dtype}", fix)
-    little_endian = depth.dtype.newbyteorder("<")
     return {
         "height": depth.shape[0],
         "width": depth.shape[1],
         "encoding": DEPTH_ENCODINGS[depth.dtype.name],
-        "data": np.ascontiguousarray(depth, dtype=little_endian).tobytes(),
+        "data": np.ascontiguousarray(depth, dtype=depth.dtype.newbyteorder("<")).tobytes(),
     }
 
 

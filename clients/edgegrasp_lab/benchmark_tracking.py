@@ -251,8 +251,7 @@ def _alike(one: Float64, other: Float64) -> bool:
 
 def _degrees(one: Float64, other: Float64) -> float:
     """The angle between the rotations of two poses (4, 4), degrees."""
-    turn = Rotation.from_matrix(one[:3, :3].T @ other[:3, :3])
-    return float(np.degrees(turn.magnitude()))
+    return float(np.degrees(Rotation.from_matrix(one[:3, :3].T @ other[:3, :3]).magnitude()))
 
 
 def summary(done: list[Followed]) -> dict[str, Any]:

@@ -43,8 +43,7 @@ def generate_data(
     for _, grasps, successes in track(made, "scenes", total=missing):
         tried, held = tried + grasps, held + successes
     share = f", {100 * held / tried:.1f} % held" if tried else ""
-    kept = asked.scenes - missing
-    print(f"{missing} scenes made, {kept} kept; {tried} grasps tried{share}.")
+    print(f"{missing} scenes made, {asked.scenes - missing} kept; {tried} grasps tried{share}.")
 
 
 class TrainFlags(TrainingOptions, use_attribute_docstrings=True):

@@ -43,8 +43,7 @@ class BenchmarkConfig:
             raise ValueError(f"rounds is {self.rounds}; run at least 1")
         if not self.seeds or min(self.seeds) < 0 or len({*self.seeds}) < len(self.seeds):
             raise ValueError(f"seeds is {self.seeds}; pass numbers of 0 or more, each seed once")
-        chosen = engines.choose_engine(self.engine, self.protocol.engine)
-        object.__setattr__(self, "engine", chosen)
+        object.__setattr__(self, "engine", engines.choose_engine(self.engine, self.protocol.engine))
 
     def object_set(self) -> ObjectSet:
         """The objects to draw scenes from; FileNotFoundError if `objects` holds none for them."""

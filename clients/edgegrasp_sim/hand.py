@@ -218,8 +218,7 @@ class ArmGripper(Gripper):
             raise ValueError("the grasp has no motion of the arm; plan it with a robot")
         start, grasp, end = motion.times[[0, motion.grasp_row, -1]]
         begin, end = (grasp, end) if away else (start, grasp)
-        steps = int(np.ceil((end - begin + SETTLE_SECONDS) / TIME_STEP))
-        for step in range(steps):
+        for step in range(int(np.ceil((end - begin + SETTLE_SECONDS) / TIME_STEP))):
             times = begin + (step + np.arange(1, substeps + 1) / substeps) * TIME_STEP
             times = times.clip(max=end)
             rows = [

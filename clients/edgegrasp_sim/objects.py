@@ -205,8 +205,7 @@ def prepare_mesh(mesh: Path) -> Path:
 
 def cache_folder() -> Path:
     """Where prepared objects are kept: below `$XDG_CACHE_HOME`, else below `~/.cache`."""
-    root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(root) / "edgegrasp" / "meshes"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "edgegrasp" / "meshes"
 
 
 def write_object(name: str, surface: str, folder: Path) -> Path:

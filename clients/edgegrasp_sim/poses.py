@@ -9,8 +9,7 @@ from edgegrasp_camera.arrays import Float64
 
 def quaternion_xyzw(T: Float64) -> list[float]:
     """The rotation part of a 4 x 4 rigid transform as a unit quaternion `xyzw`."""
-    turn = Rotation.from_matrix(T[:3, :3], assume_valid=True)
-    return [float(part) for part in turn.as_quat()]
+    return list(Rotation.from_matrix(T[:3, :3], assume_valid=True).as_quat().tolist())
 
 
 def about_z(angle: float) -> tuple[float, float, float, float]:

@@ -98,8 +98,7 @@ def make_table(layout: Layout) -> list[SceneObject]:
 
 def make_bin(layout: Layout) -> list[SceneObject]:
     """Drop objects into a bin one by one; those that do not fit are removed."""
-    dropped = _pour(layout, layout.num_objects, POUR_MARGIN)
-    return settle(layout.world, dropped, layout.surroundings)
+    return settle(layout.world, _pour(layout, layout.num_objects, POUR_MARGIN), layout.surroundings)
 
 
 def make_full_bin(layout: Layout) -> list[SceneObject]:
@@ -154,8 +153,7 @@ def _pour(layout: Layout, number: int, share: float) -> list[SceneObject]:
     low, high = np.asarray(layout.surroundings.bounds)[:, :2]
     margin = share * (high - low)
     walls = max(box.centre[2] + box.size[2] / 2 for box in layout.surroundings.boxes)
-    where = low + margin, high - margin
-    return _drop(layout, number, where, walls + POUR_HEIGHT, POUR_SECONDS)
+    return _drop(layout, number, (low + margin, high - margin), walls + POUR_HEIGHT, POUR_SECONDS)
 
 
 def _covered(layout: Layout, placed: Sequence[SceneObject]) -> float:

@@ -121,8 +121,7 @@ def _on_ray(
     own: dict[str, Any] = {}
     if address == LOCAL_RAY:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # only read from there
-        cores = workers or len(os.sched_getaffinity(0))
-        own = {"num_cpus": cores, "include_dashboard": False}
+        own = {"num_cpus": workers or len(os.sched_getaffinity(0)), "include_dashboard": False}
     try:
         ray.init(address=address, log_to_driver=False, logging_level="ERROR", **own)
     except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:

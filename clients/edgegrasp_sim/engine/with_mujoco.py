@@ -191,8 +191,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
             self._add_hull(body, f"{body.name} {number}", hull.points, friction=friction)
         added = MujocoBody(self, body, corners)
         added.set_pose(position, quaternion_xyzw)
-        centre = added.rotation @ shape.centre
-        added.set_pose(np.asarray(position) + centre, quaternion_xyzw)
+        added.set_pose(np.asarray(position) + added.rotation @ shape.centre, quaternion_xyzw)
         return added
 
     def add_box(
@@ -257,10 +256,9 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         body.gravcomp = 1.0
         palm = [part - model.centre for part in model.palm]
         _weigh(body, model.mass, np.concatenate(palm))
-        friction = (model.friction, 0, 0)
         for number, part in enumerate(palm):
             name = f"{body.name} palm {number}"
-            self._add_hull(body, name, part, friction=friction, contype=_HAND)
+            self._add_hull(body, name, part, friction=(model.friction, 0, 0), contype=_HAND)
         pads = (model.finger_friction, FINGER_SPINNING_FRICTION, 0)
         contact = {"friction": pads, "condim": 4, "priority": 2, "contype": _HAND}
         carrier = body

@@ -234,8 +234,7 @@ def detect(
     cloud = scene.cloud
     if object_cloud is not None:
         T = _pose_at(object_cloud.header, scene, settings, lookup)
-        of_object = _points(Scene(cloud=object_cloud), settings, lookup)
-        wanted = of_object @ T[:3, :3].T + T[:3, 3]
+        wanted = _points(Scene(cloud=object_cloud), settings, lookup) @ T[:3, :3].T + T[:3, 3]
         cloud, asked["segment_ids"] = object_in_scene(wanted, _points(scene, settings, lookup))
         asked.setdefault("viewpoint", [0.0, 0.0, 0.0])
     elif cloud is None:

@@ -41,9 +41,8 @@ class EdgeGraspNode(Node):
 
     def __init__(self) -> None:
         super().__init__("edgegrasp")
-        dynamic = ParameterDescriptor(dynamic_typing=True)
         for name, default in bridge.parameters().items():
-            self.declare_parameter(name, default, dynamic)
+            self.declare_parameter(name, default, ParameterDescriptor(dynamic_typing=True))
         settings, _ = self._read()
         self.client = GraspClient(settings.server, timeout=settings.timeout)
         self._inbox = bridge.Inbox()
