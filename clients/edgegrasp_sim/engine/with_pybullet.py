@@ -113,12 +113,10 @@ class PybulletWorld(AbstractContextManager["PybulletWorld"]):
         raise ValueError(f"engine is {self.name}; an arm takes mujoco")
 
     def render_depth(self, T_world_camera: Float64, camera: Intrinsics) -> Float64:
-        return self.render(T_world_camera, camera, pybullet.ER_NO_SEGMENTATION_MASK)[0]
+        return self.render(T_world_camera, camera)[0]
 
-    def render(
-        self, T_world_camera: Float64, camera: Intrinsics, flags: int = 0
-    ) -> tuple[Float64, Int64]:
-        """Depth, and the body at each pixel, -1 for none, unless the flags leave it out."""
+    def render(self, T_world_camera: Float64, camera: Intrinsics) -> tuple[Float64, Int64]:
+        """Depth, and the body at each pixel, -1 for none."""
         view = np.linalg.inv(T_world_camera)
         view[1:3] *= -1.0  # OpenGL's camera looks along -z with y up
         near, far = camera.near, camera.far
@@ -136,11 +134,10 @@ class PybulletWorld(AbstractContextManager["PybulletWorld"]):
             viewMatrix=view.flatten(order="F").tolist(),
             projectionMatrix=projection.flatten(order="F").tolist(),
             renderer=pybullet.ER_TINY_RENDERER,
-            flags=flags,
         )
         z = np.asarray(z_buffer, dtype=np.float64).reshape(shape)
         depth = far * near / (far - (far - near) * z)
-        return depth, np.resize(np.asarray(bodies, dtype=np.int64), shape)
+        return depth, np.asarray(bodies, dtype=np.int64).reshape(shape)
 
 
 class PybulletBody:
