@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from edgegrasp_cli.flags import model_flags, takes_flags
-from edgegrasp_service.settings import Settings
+from edgegrasp_service.settings import Settings, load_settings
 
 
 @takes_flags(settings=model_flags(Settings, panel="Settings"))
@@ -38,8 +38,6 @@ def serve(
     # gRPC's own log lines are not JSON, and a pipe that is not read would block it.
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # until the server has its own handler
-    from edgegrasp_service.settings import load_settings
-
     loaded = load_settings(config, **settings)
     if print_config:
         print(loaded.model_dump_json(indent=2))

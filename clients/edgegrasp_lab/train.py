@@ -13,6 +13,7 @@ from typer import Argument, Option
 
 from edgegrasp_cli.flags import takes_flags
 from edgegrasp_lab.flags import Cluster
+from edgegrasp_sim.engine import choose_engine
 from edgegrasp_training.options import GenerationOptions, TrainingOptions
 
 
@@ -33,7 +34,6 @@ def generate_data(
 
     Existing views are kept, so that the same command continues where it stopped.
     """
-    from edgegrasp_sim.engine import choose_engine
     from edgegrasp_training.generation import generate, missing_scenes
 
     print(f"engine: {choose_engine(asked.engine)}")
@@ -130,7 +130,6 @@ def generate_scenes(
 
     Example: edgegrasp generate-scenes data/scenes --objects OBJECTS --files 110
     """
-    from edgegrasp_sim.engine import choose_engine
     from edgegrasp_sim.workers import run_tasks
     from edgegrasp_training.scene_images import FILE, generate
 
