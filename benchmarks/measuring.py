@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import re
 import statistics
 import time
 from collections.abc import Callable, Mapping
@@ -37,13 +38,11 @@ def machine() -> dict[str, Any]:
     """The machine: its processor, speed, load and versions."""
     import torch
 
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
     left, right = torch.rand(4096, 1024), torch.rand(1024, 1024)
     product = statistics.median(interleaved({"product": lambda: left @ right})["product"])
     return {
-        "processor": models[0] if models else platform.processor(),
+        "processor": model[1] if model else platform.processor(),
         "cores": len(os.sched_getaffinity(0)),
         "capability": torch.backends.cpu.get_cpu_capability(),
         "threads": torch.get_num_threads(),
