@@ -66,8 +66,7 @@ class ContactGraspNet:
         objects = scene.cloud.points[scene.object_of_point >= 0]
         on_object = cKDTree(objects).query(contact + middle)[0] < ON_OBJECT
         row = np.flatnonzero(on_object & (score > CONFIDENT))
-        hands = T_hand[row], width[row]
-        row = row[~collides(scene, *hands, prepared.gripper, options.collision)]
+        row = row[~collides(scene, T_hand[row], width[row], prepared.gripper, options.collision)]
         if len(row) == 0:
             return None
         best = row[score[row].argmax()]

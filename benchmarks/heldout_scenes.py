@@ -178,8 +178,7 @@ class Maker:
         levels = -board / 2, high + board / 2, -high - 2 * board, 2 * high + 2 * board
         low, *_ = [self.box((wide, deep, board), (0, 0, level)) for level in levels]
         for side in (-1, 1):
-            centre = (side * (wide + board) / 2, 0, high / 2)
-            self.box((board, deep, 3 * high + 6 * board), centre)
+            self.box((board, deep, 3 * high + 6 * board), (side * (wide + board) / 2, 0, high / 2))
         if self.rng.random() < 0.8:
             self.box((wide, 0.01, 3 * high), (0, deep / 2, high / 2))
         self.room(1.0)

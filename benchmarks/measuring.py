@@ -62,5 +62,4 @@ def write_results(folder: Path, name: str, results: Mapping[str, Any]) -> None:
 def memory(pid: int) -> float:
     """Resident memory of a server's processes, MiB; shared pages count once."""
     front = psutil.Process(pid)
-    processes = [front, *front.children(recursive=True)]
-    return sum(one.memory_full_info().pss for one in processes) / MIB
+    return sum(one.memory_full_info().pss for one in [front, *front.children(recursive=True)]) / MIB

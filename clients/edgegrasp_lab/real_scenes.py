@@ -194,8 +194,7 @@ def load_scene(file: Path) -> RealScene:
     if camera is None:  # it is unknown, or could not have seen them
         seen = points[np.isfinite(points).all(axis=-1)].reshape(-1, 3)
         camera, rgb = View.of(seen, np.zeros(3), normal if normal.any() else (0, -1, 0)), None
-    flat = points.reshape(-1, 3)
-    return RealScene(file.stem, request, flat, labels, normal, offset, camera, rgb)
+    return RealScene(file.stem, request, points.reshape(-1, 3), labels, normal, offset, camera, rgb)
 
 
 def judge(

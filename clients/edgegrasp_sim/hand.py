@@ -357,5 +357,4 @@ def _object_between_fingers(
     half, depths = 0.5 * gripper.model.max_opening, [gripper.model.tip - d for d in _TARGET_DEPTHS]
     ends = np.array([[0.0, side * half, z, 1.0] for z in depths for side in (1, -1)])
     rays = ((each @ T_world_hand.T)[:, :3] for each in (ends, ends * (1.0, -1.0, 1.0, 1.0)))
-    hits = gripper.world.first_hits(*rays)
-    return next((objects[uid] for uid in hits if uid in objects), None)
+    return next((objects[uid] for uid in gripper.world.first_hits(*rays) if uid in objects), None)

@@ -80,14 +80,13 @@ def parameters() -> dict[str, Any]:
 
 def read_parameters(given: Mapping[str, Any]) -> tuple[Settings, dict[str, Any]]:
     """Settings, and options of a detection; text of an option that is JSON stands for its value."""
-    own = {each.name: given[each.name] for each in fields(Settings)}
     options = {}
     for name, value in given.items():
         if name.startswith(OPTION_PREFIX) and not (isinstance(value, str) and value == ""):
             options[name.removeprefix(OPTION_PREFIX)] = option_of_text(value)
     if options.get("objects") is False:  # as YAML reads off
         options["objects"] = "off"
-    return Settings(**own), options
+    return Settings(**{each.name: given[each.name] for each in fields(Settings)}), options
 
 
 class Scene(NamedTuple):
