@@ -51,17 +51,12 @@ def build_network(config: NetworkConfig, generator: torch.Generator | None = Non
     """Build a network with random weights, from the generator or from seed 0."""
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     # Layers initialise themselves from the global random stream, which is restored here.
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
+        torch.set_rng_state(generator.get_state())
         network = NETWORKS[config.architecture](config)
-    for module in network.modules():
-        if isinstance(module, nn.Linear):
-            # PyTorch's default, U(-1, 1) / sqrt(inputs), drawn from the given generator.
-            bound = module.in_features**-0.5
-            nn.init.uniform_(module.weight, -bound, bound, generator=generator)
-            if module.bias is not None:
-                nn.init.uniform_(module.bias, -bound, bound, generator=generator)
-            if config.architecture != "hand":
-                with torch.no_grad():
+        if config.architecture != "hand":
+            for module in network.modules():
+                if isinstance(module, nn.Linear):
                     module.weight.mul_(GAIN)
     return network
 
