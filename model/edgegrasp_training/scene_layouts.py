@@ -6,6 +6,7 @@ below let it: no physics engine could make as many scenes in the time.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -549,15 +550,13 @@ def _turned(rng: np.random.Generator, drawn: PoolMesh, how: str) -> PoolMesh:
     if how == "any":
         turn = Rotation.random(rng=rng).as_matrix()
     elif how == "lying":
-        try:
+        with suppress(QhullError):
             hull = ConvexHull(samples * factor)
             sides = np.diff(hull.points[hull.simplices], axis=1).transpose(1, 0, 2)
             size = np.linalg.norm(np.cross(*sides), axis=1)
             down = hull.equations[int(rng.choice(len(size), p=size / size.sum())), :3]
             to_down, _ = Rotation.align_vectors([[0, 0, -1]], [down])
             turn = turn @ to_down.as_matrix()
-        except QhullError:
-            pass
     return PoolMesh(((points * factor) @ turn.T, triangles), (samples * factor) @ turn.T)
 
 

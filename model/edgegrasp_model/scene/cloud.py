@@ -551,8 +551,7 @@ class CanonicalFrame:
 
     def points_in_cloud(self, points: ArrayLike) -> Float32:
         """Points (..., 3) of this frame in the cloud's."""
-        shifted = np.asarray(points, dtype=np.float64) - self.T_canonical_cloud[:3, 3]
-        return (shifted @ self.T_canonical_cloud[:3, :3]).astype(np.float32)
+        return self.directions_in_cloud(np.asarray(points) - self.T_canonical_cloud[:3, 3])
 
     def directions_in_cloud(self, directions: ArrayLike) -> Float32:
         """Directions (..., 3) of this frame in the cloud's."""

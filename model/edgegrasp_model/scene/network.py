@@ -280,16 +280,15 @@ def scene_features(
 ) -> Float32:
     """The network's input (INPUT_CHANNELS, H, W) for a range image; 0 where nothing was read."""
     known = np.zeros(3) if up is None else np.asarray(up, dtype=np.float64)
-    features = np.zeros((*points.shape[:2], INPUT_CHANNELS), dtype=np.float32)
-    _fill_features(
-        np.ascontiguousarray(points), known, up is not None, np.log(footprint) + 6.0, features
-    )
-    return features.transpose(2, 0, 1)  # channels last in memory, as the network reads them
+    image, offset = np.ascontiguousarray(points), np.log(footprint) + 6.0
+    # Channels last in memory, as the network reads them.
+    return _features(image, known, up is not None, offset).transpose(2, 0, 1)
 
 
 @compiled("contract")
-def _fill_features(points: Float32, up: Float64, known: bool, offset: float, out: Float32) -> None:
+def _features(points: Float32, up: Float64, known: bool, offset: float) -> Float32:
     height, width, _ = points.shape
+    out = np.zeros((height, width, INPUT_CHANNELS), np.float32)
     middle, count = np.zeros(3), 0
     for i in range(0, height, 2):
         for j in range(0, width, 2):
@@ -329,6 +328,7 @@ def _fill_features(points: Float32, up: Float64, known: bool, offset: float, out
                 out[i, j, 5], out[i, j, 6], out[i, j, 7] = nx / length, ny / length, nz / length
                 if known:
                     out[i, j, 9] = (up[0] * nx + up[1] * ny + up[2] * nz) / length
+    return out
 
 
 @compiled("contract")

@@ -94,8 +94,7 @@ def separation(ours: SolidBoxes, theirs: SolidBoxes, sweep: Float64 | None = Non
     crossed = crossed.reshape(len(center), 3 * edges.shape[1], 3)
     axes = np.concatenate([np.stack(own, axis=1), theirs.half, crossed], axis=1)  # (M, A, 3)
     length = np.linalg.norm(axes, axis=2)
-    scale = np.where(length > 1e-12, 1.0 / np.maximum(length, 1e-12), 0.0)
-    axes = axes * scale[..., None]
+    axes = axes * (1.0 / np.maximum(length, 1e-12))[..., None]
     reach = np.abs(axes @ edges.transpose(0, 2, 1)).sum(axis=2)
     reach += np.abs(axes @ theirs.half.transpose(0, 2, 1)).sum(axis=2)
     gap = np.abs(np.einsum("mad,md->ma", axes, theirs.center - center)) - reach

@@ -176,8 +176,6 @@ def group_pixels(pixels: Pixels) -> tuple[Int64, Float64]:
     seen = ~np.isnan(points[..., 2])
     held = seen & (classes.argmax(axis=0) == 2)
     number = np.where(held, UNDECIDED, BACKGROUND)
-    if not held.any():
-        return number, np.empty(0)
     index, pairs, strength = np.arange(held.size).reshape(held.shape), [], []
     right, lower = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])  # neighbours
     for link, (first, second) in zip(links, (right, lower), strict=True):
@@ -318,8 +316,6 @@ def with_raised_points(
     """
     rows = np.flatnonzero((number < 0) & (height > margin + MIN_RISE) & likely)
     held = np.flatnonzero((number >= 0) & (height > margin))
-    if len(rows) == 0 or len(held) == 0:
-        return number
     held = subsample(held)
     places = np.column_stack([plan, height])
     apart, nearest = cKDTree(places[held]).query(places[rows], distance_upper_bound=POINT_REACH)

@@ -85,9 +85,8 @@ class Support:
 
         The noise of depth cameras grows with the square of the distance.
         """
-        height, squared = np.empty((2, len(seen.points)), dtype=np.float32)
-        T, eye = self.frame.T_canonical_cloud, seen.viewpoint
-        _heights(seen.points, T, self.bow, eye, height, squared)
+        T_plane_cloud, eye = self.frame.T_canonical_cloud, seen.viewpoint
+        height, squared = _heights(seen.points, T_plane_cloud, self.bow, eye)
         if math.isnan(self.growth):
             return height, np.full_like(height, self.least)
         squared *= np.float32(MARGIN_DEVIATIONS * self.growth)
@@ -364,15 +363,10 @@ def _bow_terms(x: Floats, y: Floats) -> Floats:
 
 @compiled("contract")
 def _heights(
-    points: Float32,
-    T_plane_cloud: Float64,
-    bow: Float64,
-    eye: Float64,
-    height: Float32,
-    squared: Float32,
-) -> None:
-    """Fill in heights (N,) over a bowed plane, and squared distances (N,) from the camera."""
-    T = T_plane_cloud
+    points: Float32, T_plane_cloud: Float64, bow: Float64, eye: Float64
+) -> tuple[Float32, Float32]:
+    """Heights (N,) over a bowed plane, and squared distances (N,) from the camera."""
+    T, (height, squared) = T_plane_cloud, np.empty((2, len(points)), np.float32)
     for i in range(len(points)):
         a, b, c = points[i, 0], points[i, 1], points[i, 2]
         x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
@@ -381,6 +375,7 @@ def _heights(
         rise = min(max(rise, -MAX_BOW), MAX_BOW)
         height[i] = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3] - rise
         squared[i] = (a - eye[0]) ** 2 + (b - eye[1]) ** 2 + (c - eye[2]) ** 2
+    return height, squared
 
 
 def correct_depth_scale(
