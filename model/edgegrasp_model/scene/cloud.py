@@ -414,22 +414,6 @@ def voxelise(points: Floats, voxel_size: float, most: float = math.inf) -> Voxel
     return Voxels(voxel, count)
 
 
-def inliers_and_neighbours(points: Float32) -> tuple[Bools, Int64]:
-    """Which of points (N, 3) are no outliers, (N,), and rows (N, K) of the nearest to each.
-
-    The mean distance of an outlier to the 8 next to it is more than 2.5 standard deviations above
-    that of all points. The first of the rows is the point itself; K is 20, or N where it is less.
-    """
-    k = min(20, len(points))
-    # For a single round of queries a tree that is quickly built is faster.
-    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
-    distance, row = tree.query(points, k=range(1, k + 1))
-    if len(points) <= 8:
-        return np.ones(len(points), dtype=bool), np.asarray(row)
-    mean = np.asarray(distance)[:, 1:9].mean(axis=1)
-    return mean <= mean.mean() + 2.5 * mean.std(), np.asarray(row)
-
-
 def clean_cloud(
     sent: CheckedCloud,  # N points
     voxels: Voxels,  # of these points
@@ -441,7 +425,13 @@ def clean_cloud(
 
     Normals are as given, else estimated and turned to the camera.
     """
-    kept, near = inliers_and_neighbours(middles)
+    # For a single round of queries a tree that is quickly built is faster.
+    tree = cKDTree(middles, balanced_tree=False, compact_nodes=False)
+    distance, near = map(np.asarray, tree.query(middles, k=range(1, min(20, len(middles)) + 1)))
+    kept = np.ones(len(middles), dtype=bool)
+    if len(middles) > 8:  # outliers lie farther than others from the 8 points next to them
+        mean = distance[:, 1:9].mean(axis=1)
+        kept = mean <= mean.mean() + 2.5 * mean.std()
     points, normals = middles[kept], smallest_variance_directions(middles, near)[kept]
     seen_from = eyes.astype(np.float32)
     if len(eyes) > 1 and sent.view_ids is not None:

@@ -210,7 +210,7 @@ def build_scene(
     """
     sent, support, viewpoints = selected.sent, selected.support, selected.viewpoints
     obstacles = options.collision.obstacles
-    if len(sent.points) == 0 or not (selected.number >= 0).any():
+    if not (selected.number >= 0).any():
         counts |= {"voxels": 0, "kept": 0}
         return None
     frame = CanonicalFrame.of_scene(sent.points, selected.up, viewpoints[0])

@@ -290,7 +290,13 @@ def objects_above(
 ) -> tuple[Int64, Float64]:
     """The object (M,) of each point above the support, and the confidence (O,) of each object."""
     likely = (found.object + found.support)[above] > MIN_CONFIDENCE
-    number = with_raised_points(found.number[above], plan, height[above], margin[above], likely)
+    number, height = found.number[above], height[above]
+    # The network misses thin parts, such as handles and edges, of the object beside them.
+    rows = np.flatnonzero((number < 0) & (height > margin[above] + MIN_RISE) & likely)
+    held, places = subsample(np.flatnonzero(number >= 0)), np.column_stack([plan, height])
+    apart, nearest = cKDTree(places[held]).query(places[rows], distance_upper_bound=POINT_REACH)
+    near = np.isfinite(apart)
+    number[rows[near]] = number[held[np.asarray(nearest)[near]]]
     if not cut_off and (number >= 0).any():
         return number, found.confidence
     first = len(found.confidence)
@@ -301,27 +307,6 @@ def objects_above(
     certain = np.full(len(mean), CROPPED_CONFIDENCE) if cut_off else confidences(mean)
     number[new[certain[which] <= MIN_CONFIDENCE]] = BACKGROUND
     return number, np.concatenate([found.confidence, certain])
-
-
-def with_raised_points(
-    number: Int64,
-    plan: Float64,  # (N, 2) metres along the support
-    height: Float32,  # (N,) metres over it
-    margin: Float32,  # (N,) metres over it that belong to it
-    likely: Bools,  # (N,) whether they show an object or a support, not background
-) -> Int64:
-    """The numbers (N,), with points that rise above the support added to the object beside them.
-
-    The network misses thin parts such as handles and edges.
-    """
-    rows = np.flatnonzero((number < 0) & (height > margin + MIN_RISE) & likely)
-    held = np.flatnonzero((number >= 0) & (height > margin))
-    held = subsample(held)
-    places = np.column_stack([plan, height])
-    apart, nearest = cKDTree(places[held]).query(places[rows], distance_upper_bound=POINT_REACH)
-    near, number = np.isfinite(apart), number.copy()
-    number[rows[near]] = number[held[np.asarray(nearest)[near]]]
-    return number
 
 
 def with_clusters(number: Int64, plan: Float64, among: Bools, first: int) -> Int64:
