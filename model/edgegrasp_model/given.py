@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edgegrasp_camera.arrays import Array, Float32, Floats, Int64
-from edgegrasp_model.candidates.collision import HandView, hand_views
+from edgegrasp_model.candidates.collision import hand_views
 from edgegrasp_model.candidates.edge_grasps import MIN_EDGE_LENGTH, Candidates, edge_grasps, retract
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import HALF_TURN, Gripper
@@ -111,7 +111,11 @@ def from_hand_poses(
         facing[side, hands] = np.einsum("ed,ed->e", normal, closing)
     side = facing.argmax(axis=0)
     contact = touched[side, np.arange(len(T_cloud_hand))]  # rows of `view`
-    approach = _approach_points(view, contact, crop_radius)
+    approach = np.full(len(contact), -1, dtype=np.int64)  # rows of the cloud; -1: there is none
+    apart = np.linalg.norm(view.position - view.position[:, contact[view.candidate]], axis=0)
+    near = np.flatnonzero((apart > MIN_EDGE_LENGTH) & (apart < 0.99 * crop_radius))
+    hands, best = _least(view.candidate[near], (view.position[:2, near] ** 2).sum(axis=0))
+    approach[hands] = view.row[near[best]]
     found = np.flatnonzero(np.isfinite(facing.max(axis=0)) & (approach >= 0))
     reason: list[NoGrasp | None] = [NoGrasp.NOTHING_BETWEEN] * len(T_cloud_hand)
     for row in found.tolist():
@@ -122,17 +126,6 @@ def from_hand_poses(
     edge = scene.cloud.points[c] - scene.cloud.points[a]
     depth = np.maximum(np.einsum("ed,ed->e", edge, pose[:, :3, 2]), 0.0)
     return Given(Candidates(found, a, c, depth, 2 * half[found], pose), reason, given)
-
-
-def _approach_points(view: HandView, contact: Int64, crop_radius: float) -> Int64:
-    """Rows (M,) of the points nearest to the hands' axes, near the contacts (M,); else -1."""
-    result = np.full(len(contact), -1, dtype=np.int64)
-    apart = np.linalg.norm(view.position - view.position[:, contact[view.candidate]], axis=0)
-    near = np.flatnonzero((apart > MIN_EDGE_LENGTH) & (apart < 0.99 * crop_radius))
-    off_axis = (view.position[:2, near] ** 2).sum(axis=0)
-    hands, best = _least(view.candidate[near], off_axis)
-    result[hands] = view.row[near[best]]
-    return result
 
 
 def _least(group: Int64, key: Floats) -> tuple[Int64, Int64]:

@@ -378,10 +378,6 @@ class Voxels(NamedTuple):
         sums = [np.bincount(self.voxel, values[:, axis], len(self.size)) for axis in range(3)]
         return (np.stack(sums, axis=1) / self.size[:, None]).astype(np.float32)
 
-    def share(self, holds: Bools) -> Float64:
-        """Share (V,) of each voxel's points for which a condition (N,) holds."""
-        return np.bincount(self.voxel, holds, len(self.size)) / self.size
-
     def commonest(self, labels: NDArray[np.integer]) -> Int64:
         """Most common label (V,) in each voxel, from labels (N,); the lowest one on ties."""
         low, one = labels.min(), np.ones(len(labels), dtype=np.int64)

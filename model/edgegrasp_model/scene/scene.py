@@ -444,4 +444,4 @@ def _inside_shape(shape: Shape, points: Float32, voxels: Voxels, cloud: CheckedC
         case Segments():
             assert cloud.segment_ids is not None
             listed = np.isin(cloud.segment_ids, shape.ids)
-    return voxels.share(listed) >= 0.5
+    return np.asarray(np.bincount(voxels.voxel, listed, len(voxels.size)) >= voxels.size / 2)
