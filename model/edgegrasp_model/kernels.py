@@ -141,18 +141,21 @@ def signed_distance_to_boxes(hands: InHands, boxes: Float64) -> Float32:
 
 
 @compiled("contract")
-def free_way(hands: InHands, boxes: Float64, behind: float) -> Float32:
+def free_way(hands: InHands, boxes: Float64, behind: float, least: float, most: float) -> Float32:
     """How far (E,) hands can move along their z until a box has a point right ahead, metres.
 
     The hand's boxes are (B, 2, 3); points up to `behind` metres behind a box are in its way too.
-    Negative where a hand would have to move back; infinity where nothing is ahead.
+    Negative where a hand would have to move back; at most `most`, where nothing nearer is ahead.
+    Where it is less than `least`, it may be less still.
     """
     columns, turn, shift = hands
     sphere, way, solid = _blocks(columns), np.empty(len(turn), np.float32), boxes.astype(np.float32)
     ahead = np.empty(BLOCK_SIZE, np.float32)
     for e in range(len(turn)):
-        nearest = np.float32(np.inf)
+        nearest = np.float32(most)
         for b in range(len(solid)):
+            if nearest < least:
+                break
             box = solid[b].copy()
             low, high = box
             front = high[2]
@@ -160,8 +163,10 @@ def free_way(hands: InHands, boxes: Float64, behind: float) -> Float32:
             for k in range(len(sphere)):
                 high[2] = front + nearest  # farther boxes change nothing
                 if _may_reach(sphere[k], turn[e], shift[e], low, high):
-                    least = _least_between(columns, k, turn[e], shift[e], box, ahead)
-                    nearest = min(nearest, least - front)
+                    found = _least_between(columns, k, turn[e], shift[e], box, ahead)
+                    nearest = min(nearest, found - front)
+                    if nearest < least:
+                        break
         way[e] = nearest
     return way
 

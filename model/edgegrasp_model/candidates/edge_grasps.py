@@ -347,7 +347,9 @@ def _inserted(
     enough = np.flatnonzero(room >= least)
     candidates = candidates.take(enough)
     boxes = gripper.open_boxes + margin * np.array([[-1.0], [1.0]])
-    way = free_way(in_hands(points, candidates.T_cloud_hand), boxes, APPROACH_LENGTH) - FIT_MARGIN
+    seen = in_hands(points, candidates.T_cloud_hand)
+    ends = least + FIT_MARGIN, MAX_INSERTION + FIT_MARGIN  # beyond them, the way does not matter
+    way = free_way(seen, boxes, APPROACH_LENGTH, *ends) - FIT_MARGIN
     way = np.minimum(way, room[enough])
     row = np.flatnonzero(way >= least)
     hands = candidates.take(row)
