@@ -32,6 +32,7 @@ MARGIN_DEVIATIONS = 4.0  # standard deviations of its own points; PLANE_NOISE me
 MAX_MARGIN = 0.02  # metres
 GIVEN_PLANE_MARGIN = 0.005  # metres, of a plane that the caller gives
 MAX_BOW = 0.025  # metres by which a bowed support rises or sinks from its plane
+HEEDED_RISE = 0.001  # metres by which what is seen must rise over a plane for hands to heed it
 
 # The fit to points classified as support.
 MIN_PLANE_POINTS = 60
@@ -67,13 +68,16 @@ class Support:
     bow: Float64 = field(default_factory=lambda: np.zeros(6))
 
     def under(self, objects: Floats, least: float) -> SupportPlane:
-        """The plane nearest to the support under objects (N, 3), which hands stay above.
+        """The plane that hands stay above: as far as it is seen, the support under objects (N, 3).
 
-        Where what is seen lies less than `least` metres over the support's plane, that counts.
+        It is `least` metres over the support's plane, or higher where what is seen rises more.
         """
         terms = _bow_terms(*self.frame.points(objects)[:, :2].T)
-        rise = np.clip(self.bow @ terms, least, MAX_BOW)
-        height, *slope = np.linalg.lstsq(terms[:3].T, rise)[0]
+        rise = np.minimum(self.bow @ terms, MAX_BOW)
+        if rise.max() < max(least, HEEDED_RISE):
+            offset = self.plane.offset + least * float(np.linalg.norm(self.plane.normal))
+            return self.plane.model_copy(update={"offset": offset})
+        height, *slope = np.linalg.lstsq(terms[:3].T, np.maximum(rise, least))[0]
         normal, origin = np.array([-slope[0], -slope[1], 1.0]), self.frame.T_canonical_cloud[:3, 3]
         return SupportPlane.model_construct(
             normal=tuple(self.frame.directions_in_cloud(normal).tolist()),
