@@ -38,6 +38,7 @@ SWITCH_MARGIN = 0.1  # of the score, by which another grasp must be better
 MIN_FOLLOWED_SCORE = 0.25  # score from which a followed grasp may stay the first
 ALLOWED_OVERLAP = 0.006  # metres by which the hand of a followed grasp may overlap the cloud
 SEARCH_MARGIN = 0.03  # metres around followed objects in which they are searched
+HIDING_SHARE = 0.3  # of the distance from the camera, at which something hides what is behind it
 MAX_FRAME_DISTANCE = 0.5  # metres from the cloud beyond which `previous` must be in another frame
 OUT_OF_VIEW_ANGLE, MAX_VIEW_DISTANCE = 0.1, 2.0  # radians beside the view; metres from the camera
 # Registration: in each step, points farther from the cloud than this are left out, metres.
@@ -45,7 +46,8 @@ REGISTRATION_DISTANCES = (*(0.03,) * 4, *(0.015,) * 4, *(0.008,) * 4)
 SURFACE_SPACING = 0.004  # metres along a surface to its nearest point, where it continues
 TANGENT_WEIGHT = 0.3  # weight of distances beyond that, relative to 1 across the surface
 # Prior for no motion, in points: where the shape leaves motion undetermined, the object stays.
-STILL_PRIOR = (20.0,) * 3 + (0.3,) * 3
+STILL_PRIOR = (0.5,) * 3 + (0.3,) * 3
+LEAST_INFORMATION = 0.05  # of what a point says about a turn; less, as on a can, is noise
 MIN_REGISTERED_POINTS = 6  # points that say how an object moved
 FOUND_SHARE, WELL_SEEN_SHARE = 0.5, 0.75  # share of its points on the cloud: found; well seen
 # Points this near to an object's surface belong to it: metres, or spacings of the surface's points.
@@ -86,7 +88,8 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
         eye = np.reshape(options.viewpoint, (-1, 3)).mean(axis=0)
         aside, row = cKDTree(unit(some - eye)).query(unit(places - eye))
         distance = np.linalg.norm(places - eye, axis=1)
-        unseen = (aside > OUT_OF_VIEW_ANGLE) | (np.linalg.norm(some[row] - eye, axis=1) < distance)
+        before = np.linalg.norm(some[row] - eye, axis=1)
+        unseen = (aside > OUT_OF_VIEW_ANGLE) | (before < HIDING_SHARE * distance)
         apart[unseen & (distance < MAX_VIEW_DISTANCE)] = 0.0
     if (away := float(np.min(apart))) > MAX_FRAME_DISTANCE:
         value = f"grasps {away:.2g} m from the nearest point of the cloud"
@@ -289,7 +292,7 @@ def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
     if len(before) < MIN_REGISTERED_POINTS or len(cloud.points) < MIN_REGISTERED_POINTS:
         return T, 0.0
     spread = max(float(np.square(before - before.mean(axis=0)).sum(axis=1).mean()), 1e-9)
-    stiff, total = np.diag(np.multiply(STILL_PRIOR, [spread] * 3 + [1.0] * 3)), np.zeros(6)
+    still, total = np.diag(np.multiply(STILL_PRIOR, [spread] * 3 + [1.0] * 3)), np.zeros(6)
     for reach in REGISTRATION_DISTANCES:
         now = before @ T[:3, :3].T + T[:3, 3]
         apart, row = cloud.tree.query(now, distance_upper_bound=reach)
@@ -308,7 +311,13 @@ def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
         moves[:, :, 3:] = np.eye(3)
         rows, ends = np.einsum("kd,kdm->km", normal, moves), length > SURFACE_SPACING
         sides = moves[ends].reshape(-1, 6)
-        system = rows.T @ rows + TANGENT_WEIGHT * sides.T @ sides + stiff
+        system, stiff = rows.T @ rows + TANGENT_WEIGHT * sides.T @ sides + still, still.copy()
+        # What the points say about turns, whatever the shift: little about a can's axis, say.
+        alone = np.linalg.solve(system[3:, 3:], system[3:, :3])
+        known, axes = np.linalg.eigh(system[:3, :3] - system[:3, 3:] @ alone)
+        doubt = np.square(LEAST_INFORMATION * spread * len(arm)) / known
+        stiff[:3, :3] += (axes * doubt) @ axes.T
+        system += stiff - still
         target = rows.T @ across + TANGENT_WEIGHT * sides.T @ along[ends].ravel() - stiff @ total
         step = np.linalg.solve(system, target)
         total += step

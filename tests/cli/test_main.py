@@ -64,6 +64,11 @@ def test_version_short_help_completion_and_an_unknown_command(run) -> None:
     assert "--viewpoint" in done.output.split()
 
 
+def test_help_is_shown_on_a_terminal_that_does_not_know_every_character() -> None:
+    environment = {"PYTHONIOENCODING": "ascii"}
+    assert "--depth" in run_program(*EDGEGRASP, "detect", "--help", env=environment).stdout
+
+
 def test_a_full_disk_is_named_and_a_closed_pipe_is_not() -> None:
     for words in (["--version"], ["--help"]):
         shown = shlex.join([*EDGEGRASP, *words])

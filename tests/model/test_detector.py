@@ -231,6 +231,17 @@ def test_where_every_hand_collides_further_points_are_tried_and_hands_are_marked
         assert Counter(found.debug.outcome)[Outcome.COLLISION] == found.counts["checked"]
 
 
+def test_hands_stay_above_the_support_that_is_seen_not_the_one_that_is_given() -> None:
+    cloud = box_on_table(table=True, size=(0.03, 0.03, 0.02))
+    ends = np.stack(np.meshgrid(*PANDA.open_boxes[-1].T), axis=-1).reshape(-1, 3)  # of a finger
+    for offset in (0.0, -0.006):
+        found = detect(cloud, support={"normal": (0, 0, 1), "offset": offset}, min_score=0.0)
+        assert found.grasps
+        assert found.support.residual == pytest.approx(-offset, abs=1e-3)
+        for one in found.grasps:
+            assert (ends @ one.T_cloud_hand[2, :3] + one.T_cloud_hand[2, 3]).min() > -1e-3
+
+
 def test_an_obstacle_beside_the_object_is_not_closed_on() -> None:
     best = detect().grasps[0]
     side = np.sign(best.T_cloud_hand[:3, 1] @ (best.T_cloud_tcp[:3, 3] - best.contact_point))

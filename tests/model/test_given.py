@@ -131,6 +131,15 @@ def test_hand_poses_of_detected_grasps_find_their_own_contacts() -> None:
         np.testing.assert_allclose(one.grasp.contact_point, other.grasp.contact_point, atol=1e-6)
 
 
+def test_fingers_that_swing_are_as_free_when_scored_as_when_found() -> None:
+    asked = {"collision": "avoid", "min_score": 0.0, "gripper": "robotiq-2f-85"}
+    cloud = box_on_table(size=(0.04, 0.06, 0.02))
+    poses = [grasp.T_cloud_hand for grasp in detector().detect(cloud, ask(**asked)).grasps]
+    scored = detector().score(cloud, ask(gripper="robotiq-2f-85"), hand_poses=np.array(poses))
+    assert all(each.grasp.collision_free for each in scored.evaluations)
+    assert len(poses) > 10
+
+
 def test_poses_in_the_air_hold_nothing_and_colliding_ones_are_marked() -> None:
     poses = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (2, 1, 1))
     poses[0, :3, 3] = 1.0

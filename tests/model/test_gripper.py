@@ -45,6 +45,21 @@ def test_a_gripper_stays_clear_of_the_support_as_it_closes(gripper: Gripper) -> 
         assert clearance == pytest.approx(lowest, abs=2e-5)
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_hand_with_a_camera_at_one_side_is_turned_away_from_a_wall(side: int) -> None:
+    fields = tomllib.loads(PANDA_FILE) | {"contact_z": 0.1115}  # nearly at the tips
+    camera = np.sort([[side * 0.0316, -0.03, 0.0], [side * 0.12, 0.03, 0.085]], axis=0)
+    fields["hand"]["boxes"].append(camera.tolist())
+    box = box_on_table(size=(0.04, 0.3, 0.03))
+    wall = {"kind": "box", "min": [-1, 0.155, 0.05], "max": [1, 0.3, 0.3]}
+    asked = {"gripper": fields, "support": {"normal": (0, 0, 1), "offset": 0.0}, "viewpoint": VIEW}
+    region = {"include": [{"kind": "box", "min": [-1, 0.11, 0], "max": [1, 0.15, 1]}]}
+    asked |= {"collision": {"obstacles": [wall]}, "approach_region": region, "min_score": 0.0}
+    found = detector().detect(box, DetectOptions.model_validate(asked | {"top_k": 1000}))
+    ways = {round(float(one.T_cloud_hand[1, 0])) for one in found.grasps}
+    assert ways == {-side}
+
+
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [

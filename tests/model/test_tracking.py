@@ -50,6 +50,23 @@ def test_an_object_is_found_where_it_was_moved_to(millimetres: Any, degrees: flo
     assert share == 1.0
 
 
+def test_a_can_does_not_turn_with_a_camera_that_goes_around_it() -> None:
+    rng, total = np.random.default_rng(0), 0.0
+    before: np.ndarray | None = None
+    for camera in np.radians(range(0, 60, 2)):
+        angle = rng.uniform(-1.4, 1.4, 600)
+        outward = Rotation.from_euler("z", (camera + angle)[:, None]).apply([1.0, 0.0, 0.0])
+        points = 0.03 * outward + np.outer(rng.uniform(0.0, 0.12, 600), [0.0, 0.0, 1.0])
+        points += rng.normal(0.0, 0.0005, points.shape)
+        normals = Rotation.from_euler("z", (camera + 0.9 * angle)[:, None]).apply([1.0, 0.0, 0.0])
+        surface = Surface(points.astype(np.float32), normals.astype(np.float32), cKDTree(points))
+        if before is not None:
+            T, _ = registered(before, surface)
+            total += Rotation.from_matrix(T[:3, :3]).as_rotvec(degrees=True)[2]
+        before = sampled(points.astype(np.float32)).astype(np.float64)
+    assert abs(total) < 6
+
+
 def test_all_points_of_a_large_object_belong_to_it() -> None:
     places = np.stack(np.meshgrid(np.arange(0, 0.4, 0.0045), np.arange(0, 0.3, 0.0045)), axis=-1)
     points = np.pad(places.reshape(-1, 2), ((0, 0), (0, 1))).astype(np.float32)
@@ -125,6 +142,15 @@ def test_previous_of_another_hand_or_frame_is_refused(gripper: str, x: float, er
     previous = {"gripper": gripper, "grasps": [{"id": 7, "T_cloud_hand": pose}]}
     with pytest.raises(InvalidRequest, match=error):
         narrowed(parse_options({"previous": previous}), "panda", np.zeros((9, 3), np.float32))
+
+
+def test_what_is_hidden_behind_something_near_the_camera_is_not_of_another_frame() -> None:
+    pose = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0.8, 0, 0, 0, 1]
+    previous = {"gripper": "panda", "grasps": [{"id": 7, "T_cloud_hand": pose}]}
+    asked = parse_options({"previous": previous, "viewpoint": (0, 0, 0)})
+    plate = np.random.default_rng(0).uniform(-0.1, 0.1, (500, 3)).astype(np.float32)
+    plate[:, 2] = 0.1
+    assert narrowed(asked, "panda", plate).previous is not None
 
 
 @pytest.mark.parametrize(("begin", "low"), [(-0.1, -0.03), (0.0, 0.0), (0.2, 0.2)])

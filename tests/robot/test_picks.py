@@ -14,9 +14,10 @@ from tests.checks import refusal
 from tests.robot.arms import BOXES, HALF, TURNED, grid, picks_of, scene_of, surface
 
 from edgegrasp_model.options import parse_options
+from edgegrasp_model.scene.cloud import CanonicalFrame
 from edgegrasp_results import Tracking
 from edgegrasp_robot import load_robot
-from edgegrasp_robot.surroundings import _near_robot
+from edgegrasp_robot.surroundings import _near_robot, surrounded
 
 CLOSE, CLOSE_ANGLE = 1e-3, np.deg2rad(0.2)  # metres, radians
 
@@ -138,6 +139,20 @@ def test_searches_without_a_path_end(fr3, monkeypatch):
     assert detection.counts["with_trajectory"] == 0
     assert "no trajectory" in detection.warnings[0]
     assert sum(searched) < 0.11
+
+
+def test_which_part_of_the_cloud_was_selected_changes_no_voxel(fr3):
+    scene, cloud, _ = scene_of(fr3)
+    asked = {"name": "fr3", "T_base_cloud": TURNED.tolist(), "joints": fr3.home.tolist()}
+    voxels = []
+    for shift in (0.0, 0.004):  # of the origin, the mean of what was selected
+        T = scene.frame.T_canonical_cloud.copy()
+        T[:2, 3] += shift
+        part = replace(scene, frame=CanonicalFrame(T))
+        robot = parse_options({"robot": asked}).robot
+        with surrounded(fr3, part, cloud, robot, []) as around:
+            voxels.append(around.voxels)
+    np.testing.assert_allclose(*voxels, atol=1e-9)
 
 
 def test_what_is_out_of_reach_is_counted_and_comes_last(fr3):
@@ -325,6 +340,23 @@ def test_objects_are_put_into_a_region_in_one_motion(robot):
         assert (points > np.array(TRAY["min"]) - 0.002).all()
         assert (points < np.array(TRAY["max"]) + 0.002).all()
         assert points[:, 2].min() < 0.01
+
+
+def test_obstacles_of_the_request_are_not_put_into_either(fr3):
+    block = {"kind": "oriented_box", "center": [0.45, -0.4, 0.06], "half_extents": [HALF] * 3}
+    T_cloud_base = np.linalg.inv(TURNED)
+    turn = Rotation.from_matrix(T_cloud_base[:3, :3]).as_quat().tolist()
+    there = (T_cloud_base @ [*block["center"], 1.0])[:3].tolist()
+    options = {"collision": {"obstacles": [block | {"center": there, "quaternion": turn}]}}
+    found = picks_of(fr3, boxes=BOXES[:1], options=options, place={"region": TRAY}, plan="reach")
+    ((_, plan),) = plans_of(found)
+    assert np.abs(plan.T_base_place[:2, 3] - block["center"][:2]).max() > HALF
+
+
+def test_joints_may_be_a_hair_beyond_a_limit(fr3):
+    joints = np.where(np.arange(7) == 3, fr3.upper + 1e-4, fr3.home)
+    (_, plan), *_ = plans_of(picks_of(fr3, joints=joints))
+    np.testing.assert_allclose(plan.trajectory.positions[0], joints, atol=1e-3)
 
 
 def test_an_object_is_put_in_a_pose(fr3):

@@ -253,6 +253,20 @@ def test_a_mask_is_of_the_image_it_was_made_of_and_grows_old() -> None:
         inbox.scene(1.5)
 
 
+def test_a_slow_camera_stays_in_the_scene_and_the_first_image_waits_for_its_camera() -> None:
+    inbox, slow = Inbox(), make_image(DEPTH)
+    slow.header.frame_id = "a"
+    inbox.take("depth", slow, 1.0)
+    assert inbox.take("camera", CAMERA, 1.0)
+    for second in range(40):
+        fast = make_image(DEPTH)
+        fast.header.stamp.sec += second // 10
+        inbox.take("depth", fast, 1.0)
+    assert inbox.scene(1.0).depth is slow
+    fast.header.stamp.sec += 9  # the slow one has stopped
+    assert inbox.scene(1.0).depth is fast
+
+
 def test_images_of_several_cameras_are_one_cloud(asked) -> None:
     aside, other = make_image(DEPTH), SIZE | {"header": HEADER | {"frame_id": "link8"}}
     aside.header.frame_id = "link8"
@@ -284,6 +298,7 @@ def test_every_option_is_a_parameter(client, cloud) -> None:
     assert {f"options.{name}" for name in DetectOptions.__annotations__} < set(parameters)
     given = parameters | {
         "options.top_k": 2,
+        "options.objects": False,  # off, as YAML reads it
         "options.up": [0.0, 0.0, 1.0],
         "options.support": "none",
         "options.workspace": '{"min": [-1, -1, -1], "max": [1, 1, 1]}',
@@ -293,6 +308,7 @@ def test_every_option_is_a_parameter(client, cloud) -> None:
     settings, options = bridge.read_parameters(given)
     assert settings.joints.at(0.08) == {"finger": 0.04}
     assert options["workspace"]["max"] == [1, 1, 1]
+    assert options["objects"] == "off"
     found = detect(client, Scene(make_cloud(cloud)), settings, options)
     assert len(found.grasps) == 2
     with pytest.raises(InvalidRequestError, match="top_k"):

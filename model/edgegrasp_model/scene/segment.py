@@ -297,10 +297,10 @@ def objects_above(
     apart, nearest = cKDTree(places[held]).query(places[rows], distance_upper_bound=POINT_REACH)
     near = np.isfinite(apart)
     number[rows[near]] = number[held[np.asarray(nearest)[near]]]
-    if not cut_off and (number >= 0).any():
-        return number, found.confidence
     first = len(found.confidence)
-    number = with_clusters(number, plan, likely | cut_off, first)
+    # Beside objects, background stays background: only points of parts too small to keep are left.
+    among = likely & ((number == UNDECIDED) | ~(number >= 0).any())
+    number = with_clusters(number, plan, among | cut_off, first)
     new = np.flatnonzero(number >= first)
     which = number[new] - first
     mean = np.bincount(which, found.object[above[new]]) / np.bincount(which)
@@ -313,7 +313,7 @@ def with_clusters(number: Int64, plan: Float64, among: Bools, first: int) -> Int
     """The numbers (N,), with clusters of other points as further objects, from `first` on.
 
     For clouds whose support was cut off, in which the network sees objects without what they stand
-    on, and for a small object alone on a table, which it overlooks. `plan` (N, 2) are metres along
+    on, and for small or distant objects, which it overlooks. `plan` (N, 2) are metres along
     the support, `among` (N,) are the points that may belong to an object.
     """
     rows = np.flatnonzero((number < 0) & among)
