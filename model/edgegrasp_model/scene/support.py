@@ -74,7 +74,7 @@ class Support:
         """
         terms = _bow_terms(*self.frame.points(objects)[:, :2].T)
         rise = np.minimum(self.bow @ terms, MAX_BOW)
-        if rise.max() < max(least, HEEDED_RISE):
+        if rise.max(initial=0.0) < max(least, HEEDED_RISE):
             offset = self.plane.offset + least * float(np.linalg.norm(self.plane.normal))
             return self.plane.model_copy(update={"offset": offset})
         height, *slope = np.linalg.lstsq(terms[:3].T, np.maximum(rise, least))[0]
