@@ -287,9 +287,6 @@ def test_organised_clouds_keep_their_shape() -> None:
         decode_points(organised.tolist(), 39)
 
 
-# What is small on the way in and large inside is refused before it is large.
-
-
 def npz_of_many_members() -> bytes:
     entry = struct.Struct("<4s4B4HL2L5H2L")
     entries = b"".join(

@@ -191,10 +191,7 @@ def test_an_object_is_cut_out_of_the_scene_that_repeats_it() -> None:
         assert 0.97 * (~wanted).sum() < len(far) <= (~wanted).sum()
 
 
-# One stream of clouds, over either transport, synchronous or not.
-
-
-def test_answers_are_those_of_single_requests(client, cloud) -> None:
+def test_answers_of_a_stream_are_those_of_single_requests(client, cloud) -> None:
     requests = [StreamRequest(cloud, seed=seed, top_k=3) for seed in range(6)]
     answers = list(client.detect_stream(requests))
     assert len(answers) == 6

@@ -1,4 +1,4 @@
-"""Grasps on the handle of a mug, which a mask or a cloud of its own marks."""
+"""Grasps on the handle of a mug, which a mask or a cloud of its own marks, and on a bowl's rim."""
 
 import numpy as np
 from tests.model.rendered import box, camera, depth_image, render, seen_box, table, to_world
@@ -32,9 +32,6 @@ def test_grasps_are_on_what_a_mask_or_the_cloud_of_an_object_marks(real_server) 
         assert len(contacts) == 5
         away = [bar.distance(to_world(pose, contacts)) for bar in HANDLE]
         assert (np.min(away, axis=0) < 0.008).all()
-
-
-# Grasps on the rim of a bowl that is wider than the hand opens.
 
 
 RADIUS, RIM = 0.06, 0.055  # metres; the hand opens by 0.08

@@ -140,9 +140,6 @@ FORM = form(
     part("segment_ids", b"[%s0]" % (b"0, " * 39)),
 )
 
-
-# Whole requests
-
 THREE = st.lists(NUMBERS | st.none(), min_size=3, max_size=3)
 LISTS = st.one_of(
     VALUES,
@@ -234,9 +231,6 @@ def test_what_is_mutated_is_good() -> None:
     for file_format in FILES:
         for content in FILES[file_format]:
             decode_cloud({"cloud": File(file_format, content)}, DetectOptions(), MAX_POINTS)
-
-
-# Whatever is sent to a running server, it answers with less than 500, and stays as large.
 
 
 MAX_GROWTH = 100e6  # bytes; a request here is a few kB

@@ -1,4 +1,4 @@
-"""`edgegrasp benchmark-real`: scenes in its format, what grasps are worth in them, refusals."""
+"""`edgegrasp benchmark-real` and `benchmark-tracking`: scenes, what grasps are worth, refusals."""
 
 import json
 from pathlib import Path
@@ -204,9 +204,6 @@ def test_labels_are_compared_object_by_object(answer, pixels, overlap, called, s
     numbers = renumbered(LABELS, answer)
     assert (numbers == LABELS).sum() == same
     assert (numbers[numbers != LABELS] > 3).all()
-
-
-# `edgegrasp benchmark-tracking`: what it reports of scenes that stand still and that move.
 
 
 def test_the_grasp_of_a_recorded_scene_stays_where_it_is(run, refused, tmp_path: Path) -> None:

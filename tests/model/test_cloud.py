@@ -179,9 +179,6 @@ def test_rows_that_the_cloud_does_not_have_are_refused(shape: object, field: str
         check_region(Region(exclude=(shape,)), rows(), "contact_region")
 
 
-# Depth images, PointCloud2 and lists of a request.
-
-
 MANY = 100_000
 FX, FY, CX, CY = 60.0, 50.0, 15.5, 11.5
 
@@ -282,9 +279,6 @@ def test_views_are_fused_and_doubtful_intrinsics_get_a_warning() -> None:
         assert f"depth_images.{len(some) - 1}.intrinsics: cx 8 lies far from the" in warning
     (warning,) = read_depth_images(images[2:] * 2, MANY).warnings
     assert "two have the same camera position" in warning
-
-
-# sensor_msgs/PointCloud2
 
 
 def read(fields: dict[str, Any]) -> CloudInput:

@@ -423,9 +423,6 @@ def test_a_hand_among_good_ones_comes_before_a_lone_one_that_is_hardly_better() 
         assert densest_first(order, worth, poses)[0] == first
 
 
-# Grasps across an outline: seen from straight above, where no side of an object is seen.
-
-
 TOP = 0.3  # metres
 FIFTEEN_DEGREES = np.cos(np.radians(15.0))
 
@@ -446,7 +443,7 @@ def ring(radius: float) -> np.ndarray:
 
 
 def straight_down(points: np.ndarray) -> list[Grasp]:
-    """The grasps whose hand moves straight down."""
+    """The grasps of what is seen from straight above whose hand moves straight down."""
     floor = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.0)
     viewpoint = (0.0, 0.0, 0.9)
     options = DetectOptions(support=floor, viewpoint=viewpoint, suppression=None, top_k=500)

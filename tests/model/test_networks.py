@@ -1,4 +1,4 @@
-"""The ball networks, what all networks share, and their configuration."""
+"""The ball networks and the one of hands, what they share, and their configuration."""
 
 from dataclasses import dataclass, replace
 
@@ -135,9 +135,6 @@ def test_neither_single_precision_nor_recorded_gradients_change_a_score(architec
     exact = scores(network, scene.batch())
     torch.testing.assert_close(single.double(), exact, rtol=0, atol=0.01 * float(exact.std()))
     torch.testing.assert_close(network(scene.batch()).detach(), exact, rtol=0, atol=1e-12)
-
-
-# What a hand sees of the cloud in its own frame, and the network that scores it by that.
 
 
 def look(seed: int) -> HandBatch:

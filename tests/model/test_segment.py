@@ -451,12 +451,6 @@ def test_the_walls_of_a_bin_whose_inside_is_the_workspace_are_not_grasped() -> N
     assert_grasped(found, inside, np.eye(4))
 
 
-# What holds for every scene, however its objects are distinguished from the background.
-
-
-PANEL = box((0.0, 0.22, 0.06), (0.3, 0.015, 0.06))  # too long for an object, thin enough for a hand
-
-
 @pytest.mark.parametrize("roll", [0.5, np.pi])
 def test_a_camera_turned_about_its_axis_sees_the_same_objects(roll: float) -> None:
     scene, pose = [table(), *boxes_on_table(4)], camera(0.6, -1.2, 0.9)
@@ -485,13 +479,14 @@ def test_new_noise_leaves_the_number_of_objects_and_thinning_most_of_them() -> N
 
 
 def test_a_mask_of_the_caller_wins() -> None:
-    objects, pose = boxes_on_table(2), camera(0.75, -1.5, 0.9)
-    boxes = [PANEL, table(), *objects]
+    # Too long for an object, thin enough for a hand.
+    panel = box((0.0, 0.22, 0.06), (0.3, 0.015, 0.06))
+    boxes, pose = [panel, table(), *boxes_on_table(2)], camera(0.75, -1.5, 0.9)
     cloud = render(boxes, pose)
     mask = seen_box(boxes, pose) == 0
     assert detect(cloud).objects
-    (panel,) = detect(CloudInput(cloud, segment_ids=mask.astype(np.int32))).objects
-    assert panel.number == 1
+    (segment,) = detect(CloudInput(cloud, segment_ids=mask.astype(np.int32))).objects
+    assert segment.number == 1
     region = {"include": [{"kind": "mask", "mask": mask}]}
     held = detect(cloud, approach_region=region, contact_region=region, min_score=0.0)
     assert held.grasps

@@ -53,9 +53,6 @@ def test_functions_fit_on_a_screen() -> None:
     assert large == []
 
 
-# scripts/system_packages.sh on machines that lack something, played by stand-in programs.
-
-
 SCRIPT = ROOT / "scripts" / "system_packages.sh"
 VENV_CHECK = "import ensurepip, venv"
 
@@ -67,7 +64,7 @@ def stand_in(folder: Path, name: str, body: str) -> None:
 
 
 def machine(folder: Path, *, lacks: str, user: int = 0, apt: bool = True) -> dict[str, str]:
-    """A folder of stand-ins as PATH; the interpreter fails where a bash pattern matches."""
+    """A folder of stand-ins as PATH; what is lacking is what a bash pattern matches."""
     fails = f'case "$*" in {lacks}) exit 1;; *print*) echo python3.11-venv;; esac'
     stand_in(folder, "python3", fails)
     stand_in(folder, "id", f"echo {user}")

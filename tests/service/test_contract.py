@@ -132,9 +132,6 @@ def test_reflection(channel) -> None:
     assert {"edgegrasp.v1.GraspService", "grpc.health.v1.Health"} <= names
 
 
-# The one table of errors, walked on both transports.
-
-
 # Errors of starting up: no request ever meets them.
 START_UP = {"InvalidCheckpoint", "InvalidDevice", "InvalidGripper", "InvalidSettings"}
 START_UP |= {"AddressInUse"}

@@ -274,9 +274,6 @@ def test_scenes_and_views_do_not_depend_on_the_planner(engine, simulation) -> No
     assert np.array_equal(first_clouds[0], first_clouds[2])
 
 
-# Figures, folders of results and gates.
-
-
 OF_A_MUG = "mug", "mug", False, 0.5, 0.04, 0.03, False, 0, 1000, 0.25
 HELD = Attempt(None, *OF_A_MUG, [[0.0] * 4] * 4)
 MISSED = replace(HELD, cause=FailureCause.MISSED, object=None, planning_seconds=0.35)

@@ -176,9 +176,6 @@ def test_the_same_seed_gives_the_same_image(kind: str) -> None:
     assert np.nanmedian(np.abs(image - depth)) < 0.005
 
 
-# Object sets: built-in ones, folders of URDF files and plain meshes.
-
-
 MARGIN = {"pybullet": 0.006, "mujoco": 0.0}  # metres that an engine's boxes are wider
 
 

@@ -136,9 +136,6 @@ def test_a_grasp_that_stays_when_shaken_is_worth_a_little_more() -> None:
     assert 0.8 < unknown.max() < 1
 
 
-# Figures of scores, and weights compared on labelled views.
-
-
 def test_the_temperature_undoes_overconfidence() -> None:
     rng = np.random.default_rng(0)
     honest = rng.normal(size=20_000)

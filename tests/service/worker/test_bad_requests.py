@@ -194,9 +194,7 @@ def test_malformed(name: str, transport: str) -> None:
     assert case.fix in error.fix
 
 
-# What only one transport can get wrong.
-
-JSON_CASES = {
+JSON_CASES = {  # what gRPC cannot get wrong
     "no rows": ({"points": [0.0, 0.0, 0.0]}, "cloud", "shape (3,)", "(N, 3)"),
     "unknown field": ({"points": [], "pints": []}, "pints", "unknown", "points,"),
     "option beside the options": ({"points": [], "at": [1, 2]}, "at", "unknown", "`options`"),
