@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from tests.cloud_files import npy, npz, pcd, ply, xyz
 from tests.end_to_end.test_tracking import STEP, image
 from tests.programs import run
 
@@ -40,7 +42,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def open_page(browser) -> Iterator[Callable[..., Any]]:
-    """Open a server's front page; no page may complain, or ask anybody else for anything."""
+    """Open a server's front page, and wait; no page may complain, or ask others for anything."""
     pages, trouble = [], []
 
     def open_page(url: str, width: int = 1600, height: int = 900) -> Any:
@@ -52,6 +54,7 @@ def open_page(browser) -> Iterator[Callable[..., Any]]:
             "request", lambda sent: sent.url.startswith((url, "blob:")) or trouble.append(sent.url)
         )
         page.goto(url)
+        page.get_by_text(re.compile("detecting, by|needs a token")).wait_for()
         pages.append(page)
         return page
 
@@ -67,12 +70,13 @@ def shown(page: Any) -> list[Any]:
     return page.locator("#grasps li:visible").all()
 
 
-def open_touching(page: Any, url: str) -> None:
-    """Show the second sample, once the first one's grasps are there."""
+def answer_to(page: Any, act: Callable[..., Any], *given: Any) -> Any:
+    """The answer to the request that something makes a page send, once it is shown."""
+    with page.expect_response(lambda sent: "/v1/grasps" in sent.url) as answered:
+        act(*given)
+    assert answered.value.ok
     page.get_by_text("detecting, by").wait_for()
-    with page.expect_response(f"{url}/v1/grasps"):
-        page.locator("#sample").select_option("objects that touch")
-    page.get_by_text("detecting, by").wait_for()
+    return answered.value.json()
 
 
 def bright(page: Any) -> int:
@@ -87,7 +91,7 @@ def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(real_serv
     assert len(shown(page)) == 12
     assert page.inner_text("#summary").endswith("on 7 of 7 objects")
     save_screenshot(page)
-    open_touching(page, real_server.http_url)
+    answer_to(page, page.locator("#sample").select_option, "objects that touch")
     scores = [float(line.inner_text().split()[1]) for line in shown(page)]
     assert scores == sorted(scores, reverse=True)
     assert page.inner_text("#rank") == "1"
@@ -113,9 +117,7 @@ def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(real_serv
     center.fill(",".join(f"{float(part) + 0.005:.3f}" for part in drawn.split(",")))
     center.press("Tab")
     page.locator("#debug").check()
-    with page.expect_response(f"{real_server.http_url}/v1/grasps") as answered:
-        page.get_by_text("Find grasps").click()
-    answer = answered.value.json()
+    answer = answer_to(page, page.get_by_text("Find grasps").click)
     page.locator("#reasons button").first.click()
     reasons = page.locator("#reasons").bounding_box()
     assert reasons["y"] + reasons["height"] < 900
@@ -136,28 +138,22 @@ def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(real_serv
 
 def test_objects_and_points_are_asked_for_and_answers_saved(real_server, open_page) -> None:
     page = open_page(real_server.http_url)
-    open_touching(page, real_server.http_url)
+    answer_to(page, page.locator("#sample").select_option, "objects that touch")
     number = int(page.locator("#grasps small").first.inner_text().removeprefix("object "))
-    with page.expect_response(f"{real_server.http_url}/v1/grasps") as answered:
-        page.locator("#objects").get_by_text(str(number), exact=True).click()
-    assert {grasp["object"] for grasp in answered.value.json()["grasps"]} == {number}
+    answer = answer_to(page, page.locator("#objects").get_by_text(str(number), exact=True).click)
+    assert {grasp["object"] for grasp in answer["grasps"]} == {number}
     page.locator("#pick").click()
     stage = page.locator("#stage").bounding_box()
-    with page.expect_response(f"{real_server.http_url}/v1/grasps") as answered:
-        page.mouse.click(stage["x"] + stage["width"] / 2, stage["y"] + stage["height"] / 2)
-    assert answered.value.ok
+    middle = stage["x"] + stage["width"] / 2, stage["y"] + stage["height"] / 2
+    answer_to(page, page.mouse.click, *middle)
     assert '"at":[' in page.locator("#curl").text_content()
 
     page.locator("#more").fill('{"order": "clearance"}')
-    with page.expect_response(f"{real_server.http_url}/v1/grasps") as answered:
-        page.locator("#all").click()
-    page.get_by_text("detecting, by").wait_for()
-    scores = [f"{grasp['score']:.3f}" for grasp in answered.value.json()["grasps"][:12]]
+    answer = answer_to(page, page.locator("#all").click)
+    scores = [f"{grasp['score']:.3f}" for grasp in answer["grasps"][:12]]
     assert [line.inner_text().split()[1] for line in shown(page)] == scores
     page.locator("#more").fill("")
-    with page.expect_response(f"{real_server.http_url}/v1/grasps"):
-        page.locator("#all").click()
-    page.get_by_text("detecting, by").wait_for()
+    answer_to(page, page.locator("#all").click)
     saved = {}
     for kind in ("json", "isaac", "picture"):
         with page.expect_download() as download:
@@ -182,11 +178,8 @@ def test_objects_and_points_are_asked_for_and_answers_saved(real_server, open_pa
 def test_an_arm_is_drawn_and_moves(real_server, open_page) -> None:
     pytest.importorskip("roboplan", reason="the extra robot is not installed")
     page = open_page(real_server.http_url)
-    page.get_by_text("detecting, by").wait_for()
     without = page.locator("#stage").screenshot()
-    with page.expect_response(f"{real_server.http_url}/v1/grasps") as answered:
-        page.locator("#robot").select_option("fr3")
-    best = answered.value.json()["grasps"][0]
+    best = answer_to(page, page.locator("#robot").select_option, "fr3")["grasps"][0]
     page.locator("#play").wait_for()
     assert len(page.locator("#base").input_value().split(",")) == 16
     assert "within reach" in page.inner_text("#numbers")
@@ -211,7 +204,6 @@ def save_screenshot(page: Any) -> None:
 
 def test_the_button_covers_no_field(dummy_server, open_page) -> None:
     page = open_page(dummy_server.http_url, 1600, 500)  # lower than the form
-    shown(page)
     fields = page.locator("#ask input:visible, #ask select:visible").all()
     assert len(fields) > 5
     for field in fields:
@@ -225,16 +217,15 @@ def scenes(folder: Path) -> Iterator[tuple[int, list[Path]]]:
     rng = np.random.default_rng(0)
     points = rng.uniform(0.3, 0.5, (640, 3)).astype(np.float32)
     colors = rng.integers(0, 256, (640, 3), dtype=np.uint8)
-    np.save(folder / "cloud.npy", points[:601])
-    np.savez_compressed(folder / "cloud.npz", points=points[:602], colors=colors[:602])
-    np.savetxt(folder / "cloud.xyz", points[:603])
-    rows = [f"{x} {y} {z}\n" for x, y, z in points]
-    axes = "".join(f"property float {axis}\n" for axis in "xyz")
-    head = f"ply\nformat ascii 1.0\nelement vertex 604\n{axes}end_header\n"
-    (folder / "cloud.ply").write_text(head + "".join(rows[:604]))
-    head = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 605\nHEIGHT 1\n"
-    (folder / "cloud.pcd").write_text(f"{head}POINTS 605\nDATA ascii\n{''.join(rows[:605])}")
-    for number, name in enumerate(("npy", "npz", "xyz", "ply", "pcd"), start=601):
+    clouds = {
+        "npy": npy(points[:601]),
+        "npz": npz(points=points[:602], colors=colors[:602]),
+        "xyz": xyz(points[:603]),
+        "ply": ply(points[:604], "ascii"),
+        "pcd": pcd(points[:605], "ascii"),
+    }
+    for number, (name, content) in enumerate(clouds.items(), start=601):
+        (folder / f"cloud.{name}").write_bytes(content)
         yield number, [folder / f"cloud.{name}"]
     depth, camera = rng.integers(400, 600, (20, 30)).astype(np.uint16), (30.0, 30.0, 15.0, 10.0)
     rgb = colors[:600].reshape(20, 30, 3)
@@ -252,7 +243,6 @@ def scenes(folder: Path) -> Iterator[tuple[int, list[Path]]]:
 
 def test_files_of_every_kind_are_shown_and_sent(dummy_server, open_page, tmp_path: Path) -> None:
     page = open_page(dummy_server.http_url)
-    shown(page)
     for points, files in scenes(tmp_path):
         page.set_input_files("#files", files)
         if files[0].name == "depth.npy":  # the colours are seen: that they do not fit is
@@ -301,10 +291,7 @@ def test_files_of_every_kind_are_shown_and_sent(dummy_server, open_page, tmp_pat
 @pytest.mark.parametrize("name", ["mustard_bottle", "milk_clorox"])  # an image; a cloud
 def test_grasps_of_a_real_camera_are_seen(real_server, open_page, shared_dir, name) -> None:
     page = open_page(real_server.http_url)
-    shown(page)
-    with page.expect_response(f"{real_server.http_url}/v1/grasps*"):
-        page.set_input_files("#files", shared_dir / "real_scenes" / f"{name}.npz")
-    page.get_by_text("detecting, by").wait_for()
+    answer_to(page, page.set_input_files, "#files", shared_dir / "real_scenes" / f"{name}.npz")
     assert page.locator("#grasps li:visible").count() == 12
     with_hands = bright(page)
     page.locator("#min_score").fill("1")
@@ -319,14 +306,11 @@ def test_grasps_of_a_real_camera_are_seen(real_server, open_page, shared_dir, na
 
 def test_the_chosen_grasp_is_followed_in_the_next_image(real_server, open_page, tmp_path) -> None:
     page = open_page(real_server.http_url)
-    shown(page)
     for number in range(2):
         np.save(tmp_path / f"{number}.npy", image(number)["cloud"])
     page.set_input_files("#files", tmp_path / "0.npy")
     page.locator("#viewpoint").fill("0.35,0,0.55")
-    with page.expect_response(f"{real_server.http_url}/v1/grasps"):
-        page.locator("#follow").check()
-    page.get_by_text("detecting, by").wait_for()
+    answer_to(page, page.locator("#follow").check)
     page.locator("#grasps button").nth(2).click()
     before = json.loads(page.locator("#chosen_json").text_content())
     page.locator("#base").evaluate("base => base.value = 'its own'")  # hidden without an arm
@@ -353,7 +337,6 @@ def test_a_server_with_tokens_is_asked_with_one(start_dummy, open_page, tmp_path
 
 def test_a_narrow_page_has_all_and_the_keyboard_reaches_it(dummy_server, open_page) -> None:
     page = open_page(dummy_server.http_url, 400, 800)
-    shown(page)
     save_screenshot(page)
     controls = page.locator(
         "button:visible, input:visible, select:visible, textarea:visible, pre:visible"
