@@ -12,15 +12,15 @@ from benchmarks.soak import connect
 from edgegrasp_service.errors import InvalidSettings
 
 
-def test_pages_work_without_internet(dummy_server) -> None:
-    with httpx.Client(base_url=dummy_server.http_url, follow_redirects=True) as http:
-        for path in ("/", "/docs"):
-            page = http.get(path)
-            links = re.findall(r'(?:src|href)="([^"]+)"', page.text)
-            assert any(link.endswith(".js") for link in links)
-            for link in links:
-                assert not link.startswith(("http", "//")), "it would be fetched from elsewhere"
-                assert http.get(page.url.join(link)).status_code == 200
+def test_pages_work_without_internet(http) -> None:
+    http.follow_redirects = True
+    for path in ("/", "/docs"):
+        page = http.get(path)
+        links = re.findall(r'(?:src|href)="([^"]+)"', page.text)
+        assert any(link.endswith(".js") for link in links)
+        for link in links:
+            assert not link.startswith(("http", "//")), "it would be fetched from elsewhere"
+            assert http.get(page.url.join(link)).status_code == 200
 
 
 async def test_the_front_page_is_the_playground_or_that_of_the_api(serve, tmp_path) -> None:
@@ -35,25 +35,23 @@ async def test_the_front_page_is_the_playground_or_that_of_the_api(serve, tmp_pa
         await serve(samples=tmp_path / "none")
 
 
-def test_the_page_draws_grippers_by_fields_that_they_have(dummy_server) -> None:
-    with httpx.Client(base_url=f"{dummy_server.http_url}/playground/") as http:
-        drawn = set(re.findall(r"this\.gripper\.([\w.]*\w)", http.get("view.js").text))
-        assert len(drawn) >= 4
-        for gripper in http.get("grippers.json").json().values():
-            for path in (*drawn, "swing"):
-                reduce(dict.__getitem__, path.split("."), gripper)
+def test_the_page_draws_grippers_by_fields_that_they_have(http) -> None:
+    drawn = set(re.findall(r"this\.gripper\.([\w.]*\w)", http.get("/playground/view.js").text))
+    assert len(drawn) >= 4
+    for gripper in http.get("/playground/grippers.json").json().values():
+        for path in (*drawn, "swing"):
+            reduce(dict.__getitem__, path.split("."), gripper)
 
 
-def test_head_is_get_without_the_body_and_answers_say_what_a_browser_may_do(dummy_server) -> None:
-    with httpx.Client(base_url=dummy_server.http_url) as http:
-        for path in ("/health/live", "/health/ready", "/v1/models", "/docs", "/metrics"):
-            answer = http.head(path)
-            assert (answer.status_code, answer.content) == (200, b""), path
-        assert http.head("/v1/grasps").status_code == 405
-        for path in ("/docs", "/playground/", "/v1/models", "/none", "/openapi.json"):
-            headers = http.get(path).headers
-            assert "frame-ancestors 'none'" in headers["content-security-policy"]
-            assert headers["x-content-type-options"] == "nosniff"
+def test_head_is_get_without_the_body_and_answers_say_what_a_browser_may_do(http) -> None:
+    for path in ("/health/live", "/health/ready", "/v1/models", "/docs", "/metrics"):
+        answer = http.head(path)
+        assert (answer.status_code, answer.content) == (200, b""), path
+    assert http.head("/v1/grasps").status_code == 405
+    for path in ("/docs", "/playground/", "/v1/models", "/none", "/openapi.json"):
+        headers = http.get(path).headers
+        assert "frame-ancestors 'none'" in headers["content-security-policy"]
+        assert headers["x-content-type-options"] == "nosniff"
 
 
 def test_no_redirect_to_a_host_that_the_caller_names(dummy_server) -> None:
