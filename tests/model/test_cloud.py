@@ -101,9 +101,6 @@ def test_a_camera_at_the_origin_sees_what_lies_wholly_in_front_of_it() -> None:
     assert not seen_from_origin(seen + np.array([1.5, 0, 0]), None)
 
 
-SIZE = 0.01  # edge of a voxel, metres
-
-
 def rows(count: int = 40, seed: int = 0, **fields: object) -> CheckedCloud:
     points = np.random.default_rng(seed).uniform(0, 0.03, (count, 3)).astype(np.float32)
     return check_cloud(CloudInput(points, **fields))
@@ -111,7 +108,7 @@ def rows(count: int = 40, seed: int = 0, **fields: object) -> CheckedCloud:
 
 def inside(region: Region, cloud: CheckedCloud) -> tuple[np.ndarray, np.ndarray]:
     """Which voxels a region holds, and the voxel of each point."""
-    voxels = voxelise(cloud.points, SIZE)
+    voxels = voxelise(cloud.points, 0.01)  # metres
     return inside_region(region, voxels.mean(cloud.points), voxels, cloud), voxels.voxel
 
 

@@ -47,10 +47,6 @@ class Reply:
         return self.code in ("OK", "200")
 
 
-def bearer(token: str | None) -> dict[str, str]:
-    return {"authorization": f"Bearer {token}"} if token else {}
-
-
 class Raw:
     """A client that shows codes and errors as they are sent."""
 
@@ -61,7 +57,8 @@ class Raw:
         return await self.ask("ScoreGrasps", timeout, points=points, edges=[[0, 1]] * 3)
 
     async def reload(self, token: str | None = None) -> Reply:
-        return await self.ask("ReloadModels", None, bearer(token))
+        headers = {"authorization": f"Bearer {token}"} if token else {}
+        return await self.ask("ReloadModels", None, headers)
 
     ask: Callable[..., Awaitable[Reply]]  # a method, with a timeout, headers and fields
 
@@ -291,9 +288,7 @@ def serve(begin: Serve) -> Serve:
 
     async def start(**given: Any) -> Running:
         running, ready = await begin(**given)
-        waiting = asyncio.create_task(ready.wait())
-        await asyncio.wait({waiting, running.serving}, return_when=asyncio.FIRST_COMPLETED)
-        waiting.cancel()
+        await running.until(lambda: ready.is_set() or running.serving.done())
         if running.serving.done():
             running.serving.result()
         return running

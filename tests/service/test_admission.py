@@ -13,8 +13,6 @@ from edgegrasp_service.observability import Call
 
 from .conftest import PATIENCE, is_error
 
-FAR = 1000.0  # seconds
-
 
 class Inside:
     """Requests in an admission, each in a task of its own that stays until it is let go."""
@@ -25,7 +23,9 @@ class Inside:
         self.calls: list[Call] = []
         self._go = asyncio.Event()
 
-    async def enter(self, client: str, seconds: float = FAR, size: int = 1) -> "asyncio.Task[None]":
+    async def enter(
+        self, client: str, seconds: float = 1000.0, size: int = 1
+    ) -> "asyncio.Task[None]":
         async def stay() -> None:
             call = Call("http", "DetectGrasps", token=client)
             call.deadline = asyncio.get_running_loop().time() + seconds

@@ -59,16 +59,12 @@ def test_every_way_in_gives_the_same_grasps(cloud: np.ndarray, channel, http) ->
     files = {"npy": npy(cloud), "npz": npz(points=cloud), "xyz": xyz(cloud)}
     for file_format, data in files.items():
         media_type = f"application/x-{file_format}"
+        parts = {"cloud": ("cloud", data, media_type), "options": (None, text, "application/json")}
         messages.append({"encoded": {"format": file_format, "data": data}})
         posted += [
             {"content": data, "headers": {"content-type": media_type}, "params": OPTIONS},
             {"files": {"cloud": (f"cloud.{file_format}", data)}, "data": {"options": text}},
-            {
-                "files": {
-                    "cloud": ("cloud", data, media_type),
-                    "options": (None, text, "application/json"),
-                }
-            },
+            {"files": parts},
         ]
     requests = [grasp_pb2.DetectGraspsRequest(options=OPTIONS, **fields) for fields in messages]
     answers = [detect(request) for request in requests]

@@ -349,17 +349,18 @@ def test_results_of_two_engines_are_kept_apart(tmp_path: Path) -> None:
     run |= {"objects": {}, "constants": {}}
     folders = ResultFolder(tmp_path / "before"), ResultFolder(tmp_path / "after")
     amount = {"seeds": [0, 1], "rounds": 2}
-    folders[0].open({"run": run | {"engine": "pybullet"}, **amount})
-    folders[1].open({"run": run | {"engine": "mujoco"}, **amount})
-    for folder in folders:
+    before, after = ({"run": run | {"engine": name}, **amount} for name in ("pybullet", "mujoco"))
+    for folder, facts in zip(folders, (before, after), strict=True):
+        folder.open(facts)
         folder.add(ROUNDS[0])
-    with pytest.raises(ValueError, match=r"different engine"):
-        folders[0].open({"run": run | {"engine": "mujoco"}, **amount})
-    with pytest.raises(ValueError, match=r"different engine"):
-        folders[0].open({"run": run, **amount})
-    for less in ({"seeds": [2]}, {"rounds": 1}):
-        with pytest.raises(ValueError, match=f"different {next(iter(less))}"):
-            folders[0].open({"run": run | {"engine": "pybullet"}, **amount | less})
+    for other, name in (
+        (after, "engine"),
+        (before | {"run": run}, "engine"),
+        (before | {"seeds": [2]}, "seeds"),
+        (before | {"rounds": 1}, "rounds"),
+    ):
+        with pytest.raises(ValueError, match=f"different {name}"):
+            folders[0].open(other)
     with pytest.raises(ValueError, match=r"differ in engine"):
         compare(*folders)
     with pytest.raises(ValueError, match="engine 'pybullet', not 'mujoco'"):

@@ -19,6 +19,7 @@ from edgegrasp_sim.sensor import SENSORS, STRUCTURED_LIGHT
 from edgegrasp_sim.surroundings import OPEN_TABLE
 
 CUBE = ObjectModel("cube", Path(__file__).parent / "cube.urdf")  # 0.05 m
+CAMERA = Intrinsics()
 SHAPES = """<robot name="shapes"><link name="link">
 <inertial><origin xyz="0 0 0.01"/><mass value="1"/></inertial>
 <visual><geometry><sphere radius="0.03"/></geometry></visual>
@@ -98,27 +99,23 @@ def test_both_engines_see_the_same() -> None:
     assert differs.mean() < 0.002  # some pixels on edges
 
 
-CENTRE = np.array([0.15, 0.12, 0.10])
-HALF = np.array([0.03, 0.04, 0.05])
-CAMERA = Intrinsics()
-
-
 @pytest.mark.parametrize(("aside", "azimuth"), [(0.5, 0.0), (0.5, 1.0), (0.5, 4.0), (0.0, 0.0)])
 def test_a_box_appears_where_it_is(world: World, aside: float, azimuth: float) -> None:
+    centre, half = np.array([0.15, 0.12, 0.10]), np.array([0.03, 0.04, 0.05])
     target = np.array([0.15, 0.15, 0.1])
     away = [aside * np.cos(azimuth), aside * np.sin(azimuth), 0.5]  # or straight above
     eye = target + np.array(away)
-    world.add_box(2 * HALF, CENTRE, friction=0.5)
+    world.add_box(2 * half, centre, friction=0.5)
     T_world_camera = look_at(eye, target)
     points = points_of(world.render_depth(T_world_camera, CAMERA), T_world_camera, CAMERA)
     assert len(points) > 1000
-    outside = np.abs(points - CENTRE) - HALF
+    outside = np.abs(points - centre) - half
     apart = np.linalg.norm(np.maximum(outside, 0.0), axis=1)
     assert np.abs(apart + np.minimum(outside.max(axis=1), 0.0)).max() < 1e-4
     # The top is seen from edge to edge, so that no pixel is shifted sideways either.
-    top = points[points[:, 2] > CENTRE[2] + HALF[2] - 1e-4]
-    assert top[:, :2].min(axis=0) == pytest.approx(CENTRE[:2] - HALF[:2], abs=1.5e-3)
-    assert top[:, :2].max(axis=0) == pytest.approx(CENTRE[:2] + HALF[:2], abs=1.5e-3)
+    top = points[points[:, 2] > centre[2] + half[2] - 1e-4]
+    assert top[:, :2].min(axis=0) == pytest.approx(centre[:2] - half[:2], abs=1.5e-3)
+    assert top[:, :2].max(axis=0) == pytest.approx(centre[:2] + half[:2], abs=1.5e-3)
 
 
 FAULTLESS = replace(
@@ -176,14 +173,11 @@ def test_the_same_seed_gives_the_same_image(kind: str) -> None:
     assert np.nanmedian(np.abs(image - depth)) < 0.005
 
 
-MARGIN = {"pybullet": 0.006, "mujoco": 0.0}  # metres that an engine's boxes are wider
-
-
 def extents(world: World, model: ObjectModel, scale: float = 1.0) -> np.ndarray:
     item = load_object(world, model, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0), scale)
     found: np.ndarray = np.ptp(item.body.bounds, axis=0)
     item.body.remove()
-    return found - MARGIN[world.name]
+    return found - (0.006 if world.name == "pybullet" else 0.0)  # its boxes are wider
 
 
 @pytest.mark.parametrize("scene", [SceneKind.PACKED, SceneKind.PILE])  # others have theirs

@@ -183,12 +183,10 @@ def test_outcomes_agree_with_the_reference_simulator(shared_dir, engine, kind, t
     assert np.mean(agreed) >= LEAST_AGREEMENT[engine][kind]
 
 
-ABOVE = look_at(np.array([MIDDLE, MIDDLE, 0.9]), np.array([MIDDLE, MIDDLE, 0.1]))  # T_world_camera
-
-
 def seen_from_above(simulation: ClutterSimulation) -> np.ndarray:
+    T_world_camera = look_at(np.array([MIDDLE, MIDDLE, 0.9]), np.array([MIDDLE, MIDDLE, 0.1]))
     rng = np.random.default_rng(0)
-    return simulation.observe_from([ABOVE], rng, noise_std=0.0, table="around").cloud
+    return simulation.observe_from([T_world_camera], rng, noise_std=0.0, table="around").cloud
 
 
 @pytest.mark.parametrize("kind", [SceneKind.BIN, SceneKind.TABLE, SceneKind.SHELF])

@@ -15,7 +15,6 @@ from edgegrasp_client.over_grpc import fill
 from .conftest import ask, form, part, problem
 
 POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (60, 3)).astype(np.float32)
-NAN = float("nan")
 
 
 class Malformed:
@@ -75,7 +74,7 @@ def previous(**fields: Any) -> dict[str, Any]:
 CASES = {
     # The cloud.
     "no cloud": Malformed("", "nothing", "Se"),
-    "NaN": Malformed("cloud", "row 17", "finite", points=np.insert(POINTS, 17, NAN, axis=0)),
+    "NaN": Malformed("cloud", "row 17", "finite", points=np.insert(POINTS, 17, np.nan, axis=0)),
     # PointCloud2.
     "PointCloud2 of integers": Malformed(
         "point_cloud2.fields", "z of type 5", "float32",
