@@ -2,6 +2,7 @@
 
 import io
 import struct
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from PIL import Image
 from edgegrasp_camera.clouds import POINT_TYPES
 
 CODES = {kind: code for code, kind in POINT_TYPES.items()}
+ENCODINGS = {"<f8": "64FC1", "<f4": "32FC1", "<u2": "16UC1"}
 PLY = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -102,6 +104,24 @@ def point_cloud2(points: np.ndarray, padding: int = 0, big: bool = False) -> dic
     data = b"".join(row.astype(record).tobytes() + bytes(padding) for row in rows)
     layout = {"is_bigendian": big, "row_step": width * record.itemsize + padding, "data": data}
     return size | {"fields": fields} | layout
+
+
+def ros_message(points: np.ndarray, **changes: Any) -> SimpleNamespace:
+    """A message as ROS has it, of points as in `point_cloud2`."""
+    layout = point_cloud2(points)
+    fields = [SimpleNamespace(**field) for field in layout["fields"]]
+    layout |= {"fields": fields, "is_dense": True, "header": None}
+    return SimpleNamespace(**layout | changes)
+
+
+def depth_image(depth: np.ndarray, /, *camera: float, **changes: Any) -> dict[str, Any]:
+    """One of `depth_images`, of depths (H, W) in the type of an encoding and fx, fy, cx, cy."""
+    pixels = {"height": depth.shape[0], "width": depth.shape[1], "data": depth.tobytes()}
+    return {
+        "depth": pixels | {"encoding": ENCODINGS[depth.dtype.str]},
+        "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), camera, strict=True)),
+        "T_cloud_camera": np.eye(4).tolist(),
+    } | changes
 
 
 def block_obj(x: float, y: float, z: float) -> str:

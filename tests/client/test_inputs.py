@@ -2,27 +2,19 @@
 
 from array import array
 from collections import deque
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 from tests.checks import refusal
-from tests.cloud_files import point_cloud2
+from tests.cloud_files import ros_message
 
 from edgegrasp_results import Detection
 
 
 def contacts(detection: Detection) -> list[list[float]]:
     return [grasp.contact_point.tolist() for grasp in detection.grasps]
-
-
-def ros_message(cloud: np.ndarray, **changes: Any) -> SimpleNamespace:
-    layout = point_cloud2(cloud)
-    fields = [SimpleNamespace(**field) for field in layout["fields"]]
-    layout |= {"fields": fields, "is_dense": True, "header": None}
-    return SimpleNamespace(**layout | changes)
 
 
 def depth_image(**changes: Any) -> Any:

@@ -20,7 +20,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.checks import bounded_memory
-from tests.cloud_files import npy, npz, pcd, ply, png, point_cloud2, xyz
+from tests.cloud_files import depth_image, npy, npz, pcd, ply, png, point_cloud2, xyz
 from tests.many_options import MANY
 from tests.programs import run
 from tests.service.worker.conftest import ask as ask_worker
@@ -104,14 +104,9 @@ def test_images_of_arbitrary_chunks_decode_or_are_refused(chunks) -> None:
     decode(len(content), points=POINTS.tobytes(), colors=File("png", content))
 
 
-PIXELS = np.linspace(0.4, 0.5, 40, dtype="<f4").tobytes()
-DEPTH = {"height": 5, "width": 8, "encoding": "32FC1", "data": PIXELS}
-DEPTH_IMAGE = {
-    "depth": DEPTH,
-    "intrinsics": {"fx": 20.0, "fy": 20.0, "cx": 3.5, "cy": 2.0},
-    "T_cloud_camera": np.eye(4).tolist(),
-}
-DEPTH_ROWS = DEPTH_IMAGE | {"depth": np.full((5, 8), 0.4).tolist()}
+DEPTH = np.linspace(0.4, 0.5, 40, dtype="<f4").reshape(5, 8)
+DEPTH_IMAGE = depth_image(DEPTH, 20.0, 20.0, 3.5, 2.0)
+DEPTH_ROWS = DEPTH_IMAGE | {"depth": DEPTH.tolist()}
 POINT_CLOUD2 = point_cloud2(POINTS)
 MESSAGES = [
     grasp_pb2.DetectGraspsRequest(points=POINTS.tobytes(), options={"seed": 3, "top_k": 2}),
@@ -157,7 +152,7 @@ SETTINGS = Settings(max_points=MAX_POINTS)
 DOCUMENTS = {
     "points": POINTS.tolist(),
     "point_cloud2": in_base64(POINT_CLOUD2),
-    "depth_images": [DEPTH_IMAGE | {"depth": in_base64(DEPTH)}],
+    "depth_images": [DEPTH_IMAGE | {"depth": in_base64(DEPTH_IMAGE["depth"])}],
 }
 BESIDE = {"edges": [[0, 1], [2, 3]], "hand_poses": [np.eye(4).tolist()], "options": OPTIONS}
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from tests.checks import bounded_memory, refusal
-from tests.cloud_files import npz, point_cloud2
+from tests.cloud_files import depth_image, npz, point_cloud2, ros_message
 
 from edgegrasp_camera.clouds import CloudInput, read_point_cloud2
 from edgegrasp_model.options import DetectOptions, Indices, Mask, Region, Segments
@@ -189,14 +189,8 @@ def depth_of(shape: tuple[int, int] = (24, 32), seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0.3, 0.9, shape)
 
 
-def image(depth: np.ndarray, T_cloud_camera: np.ndarray, encoding: str = "64FC1") -> dict:
-    dtype = {"64FC1": "<f8", "32FC1": "<f4", "16UC1": "<u2"}[encoding]
-    pixels = {"height": depth.shape[0], "width": depth.shape[1], "encoding": encoding}
-    return {
-        "depth": pixels | {"data": depth.astype(dtype).tobytes()},
-        "intrinsics": {"fx": FX, "fy": FY, "cx": CX, "cy": CY},
-        "T_cloud_camera": T_cloud_camera.tolist(),
-    }
+def image(depth: np.ndarray, T_cloud_camera: np.ndarray) -> dict[str, Any]:
+    return depth_image(depth, FX, FY, CX, CY, T_cloud_camera=T_cloud_camera.tolist())
 
 
 def test_points_project_back_onto_their_pixels() -> None:
@@ -218,11 +212,11 @@ def test_points_project_back_onto_their_pixels() -> None:
     assert options.viewpoint == (0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("encoding", ["32FC1", "64FC1", "16UC1"])
-def test_encodings_give_the_same_depths(encoding: str) -> None:
+@pytest.mark.parametrize("kind", ["<f4", "<f8", "<u2"])
+def test_encodings_give_the_same_depths(kind: str) -> None:
     millimetres = np.round(depth_of() * 1000)
     expected = read_depth_images([image(millimetres / 1000, pose(2))], MANY)
-    sent = image(millimetres if encoding == "16UC1" else millimetres / 1000, pose(2), encoding)
+    sent = image((millimetres if kind == "<u2" else millimetres / 1000).astype(kind), pose(2))
     packed = read_depth_images([sent], MANY)
     np.testing.assert_allclose(packed.points, expected.points, atol=1e-6)
     sent["depth"]["data"] = base64.b64encode(sent["depth"]["data"]).decode()
@@ -331,9 +325,7 @@ def test_normals_and_colours(kind: str) -> None:
 
 def test_messages_of_other_programs_are_read_without_a_schema() -> None:
     rows = cloud_of((1, 4))
-    fields = point_cloud2(rows)
-    layout = [SimpleNamespace(**field) for field in fields.pop("fields")]
-    message = SimpleNamespace(**fields | {"data": list(fields["data"])}, fields=layout)
+    message = ros_message(rows, data=list(rows.tobytes()))
     np.testing.assert_array_equal(read_point_cloud2(message).points, xyz(rows)[0])
     message.fields.append(SimpleNamespace(name="rgb", offset=0, datatype=9, count=1))
     with refusal("point_cloud2.fields", "rgb of type 9"):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.checks import bounded_memory
-from tests.cloud_files import npy, point_cloud2
+from tests.cloud_files import depth_image, npy, point_cloud2
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client.over_grpc import fill
@@ -39,15 +39,9 @@ class Malformed:
         return message.SerializeToString()
 
 
-def image(**changes: Any) -> dict[str, Any]:
+def image(depths: float = 0.4, fx: float = 20.0, **changes: Any) -> dict[str, Any]:
     """A good depth image of 8 x 10 pixels, with changes."""
-    depth = np.linspace(0.4, 0.5, 80, dtype="<f4")
-    fields = {"height": 8, "width": 10, "encoding": "32FC1", "data": depth.tobytes()}
-    inner = {name: changes.pop(name) for name in list(changes) if name in fields}
-    camera = {"fx": 20.0, "fy": 20.0, "cx": 4.5, "cy": 3.5}
-    pinhole = {name: changes.pop(name) for name in list(changes) if name in camera}
-    pose = {"T_cloud_camera": np.eye(4).tolist()} | changes
-    return {"depth": fields | inner, "intrinsics": camera | pinhole} | pose
+    return depth_image(np.full((8, 10), depths, "<f4"), fx, 20.0, 4.5, 3.5, **changes)
 
 
 def ros(**changes: Any) -> dict[str, Any]:
@@ -90,14 +84,15 @@ CASES = {
     ),
     # Depth images.
     "depth image cut short": Malformed(
-        "depth_images.0.depth.data", "4 bytes", "whole image", depth_images=[image(data=bytes(4))]
+        "depth_images.0.depth.data", "4 bytes", "whole image",
+        depth_images=[image(depth=image()["depth"] | {"data": bytes(4)})],
     ),
     "depth image of negative depth": Malformed(
         "depth_images.0.depth", "-0.5 m", "0 or NaN",
-        depth_images=[image(data=np.full(80, -0.5, "<f4").tobytes())],
+        depth_images=[image(-0.5)],
     ),
     "depth images without a reading": Malformed(
-        "depth_images", "no reading", "above 0", depth_images=[image(data=bytes(320))] * 2
+        "depth_images", "no reading", "above 0", depth_images=[image(0.0)] * 2
     ),
     "no focal length": Malformed(
         "depth_images.0.intrinsics.fx", "0.0", "greater than 0", depth_images=[image(fx=0.0)]
