@@ -6,31 +6,27 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.model.rendered import box, render, table, to_world
 
 from edgegrasp_client import GraspClient, GraspTracker, InvalidRequestError
+from edgegrasp_sim.camera import look_at
 
 IMAGES = 6
 STEP = 0.003  # metres along y from one image to the next
+CAMERA = (0.35, 0.0, 0.55)
 
 
 def image(number: int) -> dict[str, Any]:
     """A box on a table, further along in each image."""
-    rng = np.random.default_rng(number)
-    surface = rng.uniform(-1.0, 1.0, (5000, 3))
-    axis = rng.integers(0, 3, 5000)
-    surface[axis == 0, 0] = 1.0  # the side toward the camera
-    surface[axis == 1, 1] = np.where(rng.random(np.sum(axis == 1)) < 0.5, -1.0, 1.0)
-    surface[axis == 2, 2] = 1.0
-    box = surface * (0.03, 0.02, 0.04) + (0.0, STEP * number, 0.04)
-    table = np.column_stack([rng.uniform(-0.3, 0.3, (20000, 2)), np.zeros(20000)])
-    hidden = np.abs(table[:, :2] - (-0.03, STEP * number)) < (0.06, 0.025)
-    points = np.concatenate([box, table[~hidden.all(axis=1)]])
-    noisy = points + rng.normal(0.0, 0.0004, points.shape)
-    return {"cloud": noisy.astype(np.float32), "view_ids": np.zeros(len(points), np.int32)}
+    boxes = [table(), box((0.0, STEP * number, 0.04), (0.03, 0.02, 0.04))]
+    T_world_camera = look_at(np.array(CAMERA), np.zeros(3))
+    cloud = to_world(T_world_camera, render(boxes, T_world_camera, seed=number))
+    points = cloud[np.isfinite(cloud).all(axis=2)].astype(np.float32)
+    return {"cloud": points, "view_ids": np.zeros(len(points), np.int32)}
 
 
 def test_a_grasp_keeps_its_id_and_moves_with_its_object(real_server, transport: str) -> None:
-    tracker = GraspTracker(search_every=3, viewpoint=(0.35, 0.0, 0.55), max_object_size=0.3)
+    tracker = GraspTracker(search_every=3, viewpoint=CAMERA, max_object_size=0.3)
     wanted = threading.Semaphore(1)
 
     def camera() -> Iterator[dict[str, Any]]:
@@ -55,16 +51,16 @@ def test_a_grasp_keeps_its_id_and_moves_with_its_object(real_server, transport: 
 
 def test_a_grasp_of_an_object_that_is_gone_is_lost_and_another_takes_its_place(real_server) -> None:
     with GraspClient(real_server.http_url) as client:
-        first = client.detect(**image(0), viewpoint=(0.35, 0.0, 0.55), previous={})
-        (box,), best = first.objects, first.grasps[0]
+        first = client.detect(**image(0), viewpoint=CAMERA, previous={})
+        (only,), best = first.objects, first.grasps[0]
         previous = {
             "gripper": first.gripper.name,
             "next_id": first.tracking.next_id,
             "grasps": [{"id": best.id, "T_cloud_hand": best.T_cloud_hand.ravel(), "object": 0}],
-            "objects": [{"number": box.number, "surface": box.surface}],
+            "objects": [{"number": only.number, "surface": only.surface}],
         }
         far = image(60)
-        again = client.detect(**far, viewpoint=(0.35, 0.0, 0.55), previous=previous)
+        again = client.detect(**far, viewpoint=CAMERA, previous=previous)
         assert again.tracking.first == "lost"
         assert again.grasps[0].id >= first.tracking.next_id
         assert again.objects[0].number >= first.tracking.next_id
