@@ -427,21 +427,6 @@ TOP = 0.3  # metres
 FIFTEEN_DEGREES = np.cos(np.radians(15.0))
 
 
-def level(width: float, length: float, turn: float) -> np.ndarray:
-    """A level rectangle seen from above: a point every 4 mm, sampled in its own axes."""
-    sides = [np.linspace(-side / 2, side / 2, round(side / 0.004) + 1) for side in (width, length)]
-    x, y = (grid.ravel() for grid in np.meshgrid(*sides))
-    points = Rotation.from_euler("z", turn).apply(np.stack([x, y, 0 * x + TOP], axis=1))
-    return points + np.random.default_rng(0).normal(0.0, 0.0003, points.shape)
-
-
-def ring(radius: float) -> np.ndarray:
-    """The rim of a bowl, two points wide."""
-    turn = np.linspace(0, 2 * np.pi, round(2 * np.pi * radius / 0.004), endpoint=False)
-    rows = [[r * np.cos(turn), r * np.sin(turn), 0 * turn + TOP] for r in (radius, radius + 0.004)]
-    return np.concatenate([np.transpose(row) for row in rows])
-
-
 def straight_down(points: np.ndarray) -> list[Grasp]:
     """The grasps of what is seen from straight above whose hand moves straight down."""
     floor = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.0)
@@ -453,7 +438,10 @@ def straight_down(points: np.ndarray) -> list[Grasp]:
 
 @pytest.mark.parametrize("turn", [0.0, 0.5])
 def test_a_box_is_grasped_across_its_edges(turn: float) -> None:
-    straight = straight_down(level(0.05, 0.12, turn))
+    sides = [np.linspace(-side / 2, side / 2, round(side / 0.004) + 1) for side in (0.05, 0.12)]
+    x, y = (grid.ravel() for grid in np.meshgrid(*sides))  # a point every 4 mm
+    top = Rotation.from_euler("z", turn).apply(np.stack([x, y, 0 * x + TOP], axis=1))
+    straight = straight_down(top + np.random.default_rng(0).normal(0.0, 0.0003, top.shape))
     assert len(straight) > 20
     assert all(grasp.collision_free for grasp in straight)
     assert all(grasp.T_cloud_hand[2, 1] == 0.0 for grasp in straight)  # closes level
@@ -466,7 +454,9 @@ def test_a_box_is_grasped_across_its_edges(turn: float) -> None:
 
 
 def test_a_rim_is_grasped_across_its_wall() -> None:
-    straight = straight_down(ring(0.07))
+    turn = np.linspace(0, 2 * np.pi, round(2 * np.pi * 0.07 / 0.004), endpoint=False)
+    rows = [[r * np.cos(turn), r * np.sin(turn), 0 * turn + TOP] for r in (0.07, 0.074)]
+    straight = straight_down(np.concatenate([np.transpose(row) for row in rows]))
     assert len(straight) > 20
     contact = np.array([grasp.contact_point for grasp in straight]) * (1, 1, 0)
     radial = contact / np.linalg.norm(contact, axis=1, keepdims=True)

@@ -124,12 +124,8 @@ FAULTLESS = replace(
 )  # fmt: skip
 
 
-def wall(depth: float) -> np.ndarray:
-    return np.full((240, 320), depth)
-
-
 def box_before_wall() -> np.ndarray:
-    depth = wall(1.0)
+    depth = np.full((240, 320), 1.0)
     depth[80:160, 120:200] = 0.8
     return depth
 
@@ -149,7 +145,7 @@ def test_a_camera_without_faults_sees_what_is_there_and_nothing_beyond_its_range
 @pytest.mark.parametrize("pixels", [1, 4])
 def test_noise_grows_with_the_square_of_the_depth(pixels: int) -> None:
     noisy = replace(FAULTLESS, noise_growth=0.002, noise_pixels=pixels)
-    spread = [seen(noisy, wall(depth)).std() for depth in (0.5, 1.0, 1.5)]
+    spread = [seen(noisy, np.full((240, 320), depth)).std() for depth in (0.5, 1.0, 1.5)]
     assert spread == pytest.approx([0.0005, 0.002, 0.0045], rel=0.15)
 
 

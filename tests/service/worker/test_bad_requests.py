@@ -178,7 +178,6 @@ CASES = {
 @pytest.mark.parametrize("transport", ["http", "grpc"])
 @pytest.mark.parametrize("name", CASES)
 def test_malformed(name: str, transport: str) -> None:
-    """Each over both transports: the same kind, field, value and fix."""
     case = CASES[name]
     body = case.as_json() if transport == "http" else case.as_message()
     error = problem(transport, body, "application/json", scores=case.scores)
