@@ -6,8 +6,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
+ROOT = Path(__file__).parents[1]
 EDGEGRASP = (sys.executable, "-c", "from edgegrasp_cli.main import main; main()")
 
 

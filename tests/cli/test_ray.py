@@ -15,7 +15,7 @@ import psutil
 import pytest
 from benchmarks.load import OPTIONS
 from benchmarks.load import cloud as table
-from tests.programs import EDGEGRASP, free_ports, started, until
+from tests.programs import EDGEGRASP, ROOT, free_ports, started, until
 
 from edgegrasp_client import GraspClient, GraspClientError, InvalidRequestError, UnknownModelError
 from edgegrasp_model.options import DetectOptions
@@ -25,7 +25,6 @@ from edgegrasp_training.generation import generate
 from edgegrasp_training.options import GenerationOptions
 from edgegrasp_training.views import find_views
 
-ROOT = Path(__file__).parents[2]
 DATA = ["generate-data", "--scenes=6", "--views-per-scene=1", "--grasps-per-view=8", "--seed=5"]
 PATIENCE = 240  # seconds, of a busy machine
 # Shells start jobs in the background with this signal ignored.

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from tests.cloud_files import ply
-from tests.programs import EDGEGRASP, run
+from tests.programs import EDGEGRASP, ROOT, run
 
 from edgegrasp_cli.flags import TOKEN_VARIABLE
 from edgegrasp_cli.main import load_command
@@ -28,7 +28,6 @@ from edgegrasp_model.options import DetectOptions
 from edgegrasp_service.errors import STATUS, kind_of
 from edgegrasp_service.settings import Settings
 
-ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = {page.name: page.read_text() for page in (*DOCS.glob("*.md"), *ROOT.glob("*.md"))}
 ALL_DOCS = "\n".join(PAGES[page.name] for page in DOCS.glob("*.md"))

@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.programs import run
-
-ROOT = Path(__file__).parents[2]
+from tests.programs import ROOT, run
 
 # Package indexes and absolute paths of somebody's machine; in pieces, or this file would match.
 HOSTS = ["pypi" + r"\.org", "python" + "hosted", "npm" + r"js\.org", r"deb\." + "debian"]

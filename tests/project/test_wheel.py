@@ -13,11 +13,10 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from tests.programs import run, started
+from tests.programs import ROOT, run, started
 
 from edgegrasp_client import GraspClient
 
-ROOT = Path(__file__).parents[2]
 VERSION = re.search(r'^version = "(.+)"$', (ROOT / "pyproject.toml").read_text(), re.M)
 
 

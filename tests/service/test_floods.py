@@ -26,7 +26,7 @@ from benchmarks.soak import CHECK, STREAM, connect, http2_frame, http2_headers, 
 from grpc import aio
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from tests.cloud_files import npy
-from tests.programs import run
+from tests.programs import ROOT, run
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client import DeadlineError, GraspClient, InvalidRequestError
@@ -36,7 +36,6 @@ from edgegrasp_service.server import HEALTH_PLACES
 from .conftest import PATIENCE
 from .test_stream import request
 
-ROOT = Path(__file__).parents[2]
 MIB = 2**20
 HEAD = "POST /v1/grasps HTTP/1.1\r\nHost: x\r\nContent-Type: application/x-npy\r\n"
 PAGE = b"GET /docs/assets/swagger-ui-bundle.js HTTP/1.1\r\nHost: x\r\n\r\n"
@@ -146,7 +145,6 @@ class Http2:
     def send_all(self, size: int) -> None:
         """Send every message but its last byte, as far as the server lets it."""
         left = {stream: size for stream in self._windows if stream}
-        started: set[int] = set()
         buffer = b""
         with contextlib.suppress(OSError):
             while not self.stop.is_set():
@@ -155,8 +153,7 @@ class Http2:
                     room = min(self._windows[0], self._windows[stream], 16384, rest - 1)
                     if room <= 5:
                         continue
-                    first = b"" if stream in started else b"\x00" + struct.pack(">I", size)
-                    started.add(stream)
+                    first = b"\x00" + struct.pack(">I", size) if rest == size else b""
                     payload = first + bytes(room - len(first))
                     self._socket.sendall(http2_frame(0, 0, stream, payload))
                     left[stream] -= room
