@@ -248,7 +248,6 @@ async def test_an_asynchronous_source(dummy_server, cloud, transport: str) -> No
 
 
 UP = [0.0, 0.0, 1.0]
-CLOUD = np.zeros((5, 3), np.float32)
 
 
 def answer(first: str = "kept", score: float = 0.9, grasps: int = 6) -> Detection:
@@ -325,7 +324,7 @@ def test_images_that_come_while_one_is_at_work_are_dropped_but_for_the_latest() 
 
     def camera() -> Iterator[dict[str, Any]]:
         for number in range(10):
-            yield {"cloud": CLOUD + number}
+            yield {"cloud": np.full((5, 3), number, np.float32)}
         read.set()
         raise OSError("unplugged")
 

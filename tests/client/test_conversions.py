@@ -22,8 +22,6 @@ from edgegrasp_client.conversions import (
     to_frame,
 )
 
-THUMB = FingerJoints(("thumb",), lambda opening: (0.8 - 9.0 * opening,))
-
 # The hand above the point (0.5, -0.1, 0), looking down, its fingers closing along the cloud's x.
 DOWN = np.array([[0, 1, 0, 0.5], [1, 0, 0, -0.1], [0, 0, -1, 0.3], [0, 0, 0, 1.0]])
 UP = np.array([[1, 0, 0, 0.25], [0, 1, 0, -0.5], [0, 0, 1, 1.0], [0, 0, 0, 1]])  # no turn at all
@@ -91,7 +89,7 @@ def test_isaac_grasps_round_trip(cases, T_object_cloud, T_hand_gripper) -> None:
         gripper_frame='/World/"hand"',
         T_object_cloud=T_object_cloud,
         T_hand_gripper=T_hand_gripper,
-        joints=THUMB,
+        joints=FingerJoints(("thumb",), lambda opening: (0.8 - 9.0 * opening,)),
     )
     read = read_isaac_grasps(text)
     assert [each.name for each in read] == [f"grasp_{i}" for i in range(len(cases))]

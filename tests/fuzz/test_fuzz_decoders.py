@@ -125,8 +125,6 @@ MESSAGES = [
         points=POINTS.tobytes(), edges=[{"approach_index": 1}], hand_poses=[{}]
     ),
 ]
-
-
 MASK = {"kind": "mask", "mask": []}
 OPTIONS = MANY | {"suppression": None, "contact_region": {"exclude": [MASK]}}
 FORM = form(

@@ -206,9 +206,8 @@ def test_labels_are_compared_object_by_object(answer, pixels, overlap, called, s
     assert (numbers[numbers != LABELS] > 3).all()
 
 
-def test_the_grasp_of_a_recorded_scene_stays_where_it_is(run, refused, tmp_path: Path) -> None:
-    np.savez(tmp_path / "box.npz", **seen_scene())
-    asked = ("benchmark-tracking", "--scenes", tmp_path, "--output", tmp_path / "out")
+def test_the_grasp_of_a_recorded_scene_stays_where_it_is(scene, run, refused, tmp_path) -> None:
+    asked = ("benchmark-tracking", "--scenes", scene.parent, "--output", tmp_path / "out")
     assert "box" in run(*asked, "--seconds", 0.2)
     assert "which stand still" in refused(*asked, "--motion", "still", "--motion", "pushed")
     figures = json.loads((tmp_path / "out" / "results.json").read_text())["box"]

@@ -219,7 +219,6 @@ class Running:
 
 Serve = Callable[..., Awaitable[Running]]
 
-
 # Asks for a nursery, and lives until that ends: see nursery.py.
 ASK = """
 import os, socket, sys

@@ -212,12 +212,10 @@ async def test_the_dashboard_names_metrics_that_exist(serve, cloud: np.ndarray) 
     exist = {name: "histogram" if kind == "histogram" else "" for name, kind in kinds}
     file = Path(__file__).parents[2] / "docker" / "grafana" / "edgegrasp.json"
     dashboard = json.loads(file.read_text())
-    queries = " ".join(
-        target["expr"] for panel in dashboard["panels"] for target in panel["targets"]
-    )
+    queries = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
     named = {
         name if name in exist else re.sub("_(bucket|sum|count)$", "", name)
-        for name in re.findall(r"\b(?:edgegrasp|process)_\w+", queries)
+        for name in re.findall(r"\b(?:edgegrasp|process)_\w+", " ".join(queries))
     }
     assert named <= set(exist), named - set(exist)
     ours = {name for name in exist if name.startswith("edgegrasp_")}

@@ -127,13 +127,10 @@ def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(real_serv
     half = [float(part) for part in page.locator("#region_half_extents").input_value().split(",")]
     assert np.linalg.norm(contacts - region, axis=1).max() < np.linalg.norm(half) + 0.002
 
-    for text, command in (("#curl", ["bash", "-c"]), ("#python", [sys.executable, "-c"])):
-        code = page.locator(text).text_content()
-        done = run(*command, code, cwd=SAMPLES)
-        if text == "#curl":
-            assert json.loads(done.stdout)["grasps"] == answer["grasps"]
-        else:
-            assert done.stdout.count("[[") == len(contacts)
+    curl, python = (page.locator(name).text_content() for name in ("#curl", "#python"))
+    printed = run("bash", "-c", curl, cwd=SAMPLES).stdout
+    assert json.loads(printed)["grasps"] == answer["grasps"]
+    assert run(sys.executable, "-c", python, cwd=SAMPLES).stdout.count("[[") == len(contacts)
 
 
 def test_objects_and_points_are_asked_for_and_answers_saved(real_server, open_page) -> None:

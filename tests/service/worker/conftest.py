@@ -9,14 +9,12 @@ from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer
 from edgegrasp_service.worker.process import Answer, Job
 
-SETTINGS = Settings()
 
-
-def ask(transport, body, media_type="", query="", scores=False, settings=SETTINGS) -> Answer:
+def ask(transport, body, media_type="", query="", scores=False, settings=None) -> Answer:
     """An answer, or an error that is the caller's and can be sent."""
     method: Any = "ScoreGrasps" if scores else "DetectGrasps"
     job = Job(method, transport, body, 60.0, media_type, query)
-    told = answer(job, DummyCatalogue(), settings)
+    told = answer(job, DummyCatalogue(), settings or Settings())
     assert bool(told.body) == (told.error is None)
     if told.error is not None:
         check_problem(told.error, told.facts.traceback)

@@ -15,6 +15,7 @@ from edgegrasp_client.over_grpc import fill
 from .conftest import ask, form, part, problem
 
 POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (60, 3)).astype(np.float32)
+ROS = point_cloud2(POINTS)
 
 
 class Malformed:
@@ -44,11 +45,6 @@ def image(depths: float = 0.4, fx: float = 20.0, **changes: Any) -> dict[str, An
     return depth_image(np.full((8, 10), depths, "<f4"), fx, 20.0, 4.5, 3.5, **changes)
 
 
-def ros(**changes: Any) -> dict[str, Any]:
-    """A good PointCloud2 of 60 points, with changes."""
-    return point_cloud2(POINTS) | changes
-
-
 def option(name: str, value: Any, at: str, got: str, fix: str) -> Malformed:
     return Malformed(f"options.{name}{at}", got, fix, {name: value}, points=POINTS)
 
@@ -72,15 +68,15 @@ CASES = {
     # PointCloud2.
     "PointCloud2 of integers": Malformed(
         "point_cloud2.fields", "z of type 5", "float32",
-        point_cloud2=ros(fields=[*ros()["fields"][:2], {**ros()["fields"][2], "datatype": 5}]),
+        point_cloud2=ROS | {"fields": [*ROS["fields"][:2], ROS["fields"][2] | {"datatype": 5}]},
     ),
     "PointCloud2 without z": Malformed(
         "point_cloud2.fields", "'x'", "Send at least 3 items.",
-        point_cloud2=ros(fields=ros()["fields"][:2]),
+        point_cloud2=ROS | {"fields": ROS["fields"][:2]},
     ),
     "PointCloud2 of too many points": Malformed(
         "point_cloud2", "2500001 points", "2500000", kind="payload-too-large",
-        point_cloud2=ros(width=2_500_001),
+        point_cloud2=ROS | {"width": 2_500_001},
     ),
     # Depth images.
     "depth image cut short": Malformed(
