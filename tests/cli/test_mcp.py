@@ -3,7 +3,9 @@
 import importlib.metadata
 import json
 import os
+import signal
 import socket
+import subprocess
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -160,6 +162,20 @@ async def test_what_is_wrong_reaches_the_agent(dummy_server, folder, tool, argum
     assert result.is_error
     assert told in result.content[0].text
     assert str(folder.parent) not in result.content[0].text
+
+
+def test_one_interrupt_ends_it(dummy_server, folder) -> None:
+    words = ["mcp", "--server", dummy_server.grpc_address, "--folder", str(folder)]
+    first = {"protocolVersion": "2025-06-18", "capabilities": {}}
+    first |= {"clientInfo": {"name": "me", "version": "1"}}
+    line = json.dumps({"jsonrpc": "2.0", "id": 1, "method": "initialize", "params": first})
+    pipes = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
+    with subprocess.Popen([*EDGEGRASP, *words], text=True, **pipes) as serving:
+        serving.stdin.write(line + "\n")
+        serving.stdin.flush()
+        assert "serverInfo" in serving.stdout.readline()
+        serving.send_signal(signal.SIGINT)
+        serving.wait(30)
 
 
 class Planning:

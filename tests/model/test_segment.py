@@ -392,6 +392,21 @@ def test_a_small_object_alone_on_a_table_is_found(place: tuple[float, float]) ->
     assert_grasped(found, [small], ABOVE)
 
 
+def test_small_objects_are_found_beside_a_large_one() -> None:
+    small = [box((x, 0.1, 0.015), (0.015, 0.012, 0.015), 0.5) for x in (-0.15, 0.0, 0.15)]
+    things = [table(), *small, box((0.0, -0.1, 0.06), (0.04, 0.04, 0.06))]
+    far = camera(0.8, -1.5, 1.2)
+    assert [len(detect(render(things, far, seed)).objects) for seed in range(3)] == [4, 4, 4]
+
+
+def test_hands_have_a_plane_to_stay_above_where_all_objects_are_outliers() -> None:
+    points = seen_in_world([table()], ABOVE)
+    request, seen = parse_options({"support": "ransac"}), ViewedPoints(points, ABOVE[:3, 3])
+    support = find_support(seen, np.ones(len(points), bool), None, request, [])
+    plane = support.under(np.empty((0, 3)), 0.001)
+    assert plane.offset == pytest.approx(support.plane.offset + 0.001)
+
+
 def test_a_plane_far_from_the_sent_up_is_no_support() -> None:
     T_world_camera = camera(0.6, -1.5, 0.7)
     cloud = render([table(), *boxes_on_table(1)], T_world_camera)
