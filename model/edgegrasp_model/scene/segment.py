@@ -35,6 +35,7 @@ POINT_REACH = 0.012  # metres from a point to an object, or to its pixel at a de
 MIN_RISE = 0.004  # metres above the support's margin, of points that are added to an object
 MIN_CLUSTER_CELLS, MIN_CELL_POINTS = 5, 4  # of cells POINT_REACH wide
 MIN_CONFIDENCE = 0.5  # of an object; below, it is background
+BESIDE_FACTOR = 0.65  # of a confidence; of 55 small parts beside objects 33 were objects
 CROPPED_CONFIDENCE = 0.95  # of clusters in a cloud that was cropped above its support
 
 
@@ -299,12 +300,14 @@ def objects_above(
     number[rows[near]] = number[held[np.asarray(nearest)[near]]]
     first = len(found.confidence)
     # Beside objects, background stays background: only points of parts too small to keep are left.
-    among = likely & ((number == UNDECIDED) | ~(number >= 0).any())
+    alone = not (number >= 0).any()
+    among = likely & ((number == UNDECIDED) | alone)
     number = with_clusters(number, plan, among | cut_off, first)
     new = np.flatnonzero(number >= first)
     which = number[new] - first
     mean = np.bincount(which, found.object[above[new]]) / np.bincount(which)
     certain = np.full(len(mean), CROPPED_CONFIDENCE) if cut_off else confidences(mean)
+    certain *= 1.0 if alone or cut_off else BESIDE_FACTOR
     number[new[certain[which] <= MIN_CONFIDENCE]] = BACKGROUND
     return number, np.concatenate([found.confidence, certain])
 
