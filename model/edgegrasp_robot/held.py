@@ -131,7 +131,7 @@ def places_for(
         if (around < half + VOXEL_SIZE / 2).all(axis=1).any():
             continue
         size = np.maximum(load.half - RELEASE_HEIGHT, 1e-6)
-        box = SolidBoxes(pose[None, :3, 3], (np.diag(size) @ pose[:3, :3].T)[None])
+        box = SolidBoxes.of_hands(pose[None].astype(np.float32), np.array([[-size, size]]))
         pairs = near_pairs(box, obstacles, 0.0)
         if not any(
             (separation(box.take(near), each, np.zeros(3)) < 0).any() for near, each in pairs

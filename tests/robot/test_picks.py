@@ -13,6 +13,7 @@ pytest.importorskip("roboplan", reason="the extra robot is not installed")
 from tests.checks import refusal
 from tests.robot.arms import BOXES, HALF, TURNED, grid, picks_of, scene_of, surface
 
+from edgegrasp_model.gripper import HALF_TURN
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.scene.cloud import CanonicalFrame
 from edgegrasp_results import Tracking
@@ -261,11 +262,13 @@ def test_no_time_gives_no_motion_and_says_so(fr3, monkeypatch):
 
 
 def test_a_hand_that_is_the_same_turned_comes_the_nearer_way(robot):
-    half = np.array([-1, -1, 1, 1], np.float32)
-
     def turned(scene, detection):
         grasps = [
-            replace(one, T_cloud_hand=one.T_cloud_hand * half, T_cloud_tcp=one.T_cloud_tcp * half)
+            replace(
+                one,
+                T_cloud_hand=one.T_cloud_hand * HALF_TURN,
+                T_cloud_tcp=one.T_cloud_tcp * HALF_TURN,
+            )
             for one in detection.grasps
         ]
         return scene, replace(detection, grasps=grasps)

@@ -244,7 +244,7 @@ def test_a_mask_is_of_the_image_it_was_made_of_and_grows_old() -> None:
     assert inbox.scene(1.5) == Scene(depth=first, camera=CAMERA, mask=of_first)
     assert not inbox.take("depth", second, 1.5)  # its mask is still to come
     assert inbox.take("depth", first, 1.5)  # that of the mask, which came before it
-    assert inbox.take("depth", third, 1.5)  # no mask comes any more: to be told
+    assert inbox.take("depth", third, 1.5)  # the masks have stopped: an error
     with pytest.raises(ValueError, match="mask is 8 s older than the newest image"):
         inbox.scene(2.0)
     assert inbox.scene(0.0) == Scene(depth=third, camera=CAMERA)
