@@ -16,8 +16,8 @@ from edgegrasp_model.errors import InvalidRequest, StartCollision
 from edgegrasp_model.options import Box, OrientedBox, RobotArm, SupportPlane
 from edgegrasp_model.scene.cloud import CanonicalFrame, pose_matrix, unit
 from edgegrasp_model.scene.obstacles import box_pose
-from edgegrasp_model.scene.scene import Scene, plane_in
-from edgegrasp_model.scene.support import heights_over
+from edgegrasp_model.scene.scene import Scene
+from edgegrasp_model.scene.support import heights_over, plane_in
 from edgegrasp_robot.robot import HAND, Robot, touching
 
 VOXEL_SIZE = 0.01  # metres, side of a voxel

@@ -57,6 +57,7 @@ from edgegrasp_model.scene.support import (
     correct_depth_scale,
     find_support,
     in_camera_frame,
+    plane_in,
     up_of_cropped,
 )
 from edgegrasp_model.unseen import DepthMap
@@ -259,15 +260,6 @@ def _seen_from_above(points: Float32, up: Float64 | None) -> tuple[Int64, Float6
     beside -= beside[np.linalg.norm(beside, axis=1).argmin()]  # there may be none at the median
     near = np.flatnonzero(np.linalg.norm(beside, axis=1) < USUAL_DISTANCE)
     return near, (points[near].mean(axis=0, dtype=np.float64) + USUAL_DISTANCE * over)[None]
-
-
-def plane_in(frame: CanonicalFrame, plane: SupportPlane) -> SupportPlane:
-    """A plane of the cloud's frame in another one."""
-    normal = np.asarray(plane.normal)
-    length = float(np.linalg.norm(normal))
-    foot = frame.points(normal * (plane.offset / length**2))
-    turned = frame.directions(normal) / length
-    return SupportPlane.model_construct(normal=tuple(turned.tolist()), offset=float(foot @ turned))
 
 
 def _up(

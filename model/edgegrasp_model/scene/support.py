@@ -78,11 +78,9 @@ class Support:
             offset = self.plane.offset + least * float(np.linalg.norm(self.plane.normal))
             return self.plane.model_copy(update={"offset": offset})
         height, *slope = np.linalg.lstsq(terms[:3].T, np.maximum(rise, least))[0]
-        normal, origin = np.array([-slope[0], -slope[1], 1.0]), self.frame.T_canonical_cloud[:3, 3]
-        return SupportPlane.model_construct(
-            normal=tuple(self.frame.directions_in_cloud(normal).tolist()),
-            offset=float(height - normal @ origin),
-        )
+        tilted = SupportPlane.model_construct(normal=(-slope[0], -slope[1], 1.0), offset=height)
+        T_cloud_plane = np.asarray(np.linalg.inv(self.frame.T_canonical_cloud), np.float64)
+        return plane_in(CanonicalFrame(T_cloud_plane), tilted)
 
     def heights(self, seen: "ViewedPoints") -> tuple[Float32, Float32]:
         """Heights (N,) over the support, which may be bowed, and up to which points belong to it.
@@ -112,6 +110,15 @@ class ViewedPoints(NamedTuple):
 def heights_over(plane: SupportPlane, points: Floats) -> Floats:
     """Heights (N,) of points (N, 3) over a plane, metres."""
     return np.asarray(points @ np.asarray(plane.normal) - plane.offset)
+
+
+def plane_in(frame: CanonicalFrame, plane: SupportPlane) -> SupportPlane:
+    """A plane of the cloud's frame in another one."""
+    normal = np.asarray(plane.normal)
+    length = float(np.linalg.norm(normal))
+    foot = frame.points(normal * (plane.offset / length**2))
+    turned = frame.directions(normal) / length
+    return SupportPlane.model_construct(normal=tuple(turned.tolist()), offset=float(foot @ turned))
 
 
 def find_support(
