@@ -50,8 +50,7 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
         address: "host:port" for gRPC, "http://host:port" or "https://..." for REST; or the socket
             of a server on this machine: "unix:/run/edgegrasp/grpc.sock" for gRPC,
             "http+unix:/run/edgegrasp/http.sock" for REST.
-        timeout: Seconds for one call with its retries, unless the call says otherwise; over REST
-            for each of connecting, sending and waiting.
+        timeout: Seconds for one call with its retries, unless the call says otherwise.
         retry: Whether to try again, after short random delays, if the server is away or busy or
             lost the request's worker. Requests of a stream are sent once.
         token: For a server that requires one; send it over TLS only.

@@ -1,5 +1,6 @@
 """The REST transport: requests, answers and errors as HTTP carries them."""
 
+import asyncio
 import base64
 import json
 import ssl
@@ -88,8 +89,9 @@ class RestTransport:
     async def ready(self, timeout: float) -> bool:
         """Whether the server answers requests."""
         try:
-            return (await self._http.get("/health/ready", timeout=timeout)).is_success
-        except httpx.HTTPError:
+            asking = self._http.get("/health/ready", timeout=timeout)
+            return (await asyncio.wait_for(asking, timeout)).is_success
+        except (httpx.HTTPError, asyncio.TimeoutError):
             return False
 
     async def close(self) -> None:
@@ -99,9 +101,10 @@ class RestTransport:
     async def _call(self, read: Callable[[Any], Answer], call: Call, timeout: float) -> Answer:
         """What is read of a call's answer; both sides give up after `timeout` seconds."""
         headers = {**call.get("headers", {}), "x-request-timeout": f"{timeout:.6g}"}
-        try:
-            response = await self._http.request(**call | {"headers": headers}, timeout=timeout)
-        except httpx.TimeoutException as error:
+        asking = self._http.request(**call | {"headers": headers}, timeout=timeout)
+        try:  # httpx counts connecting, sending and each part of an answer anew
+            response = await asyncio.wait_for(asking, timeout)
+        except (httpx.TimeoutException, asyncio.TimeoutError) as error:
             raise errors.DeadlineError(f"No answer in time ({type(error).__name__}).") from None
         except (httpx.HTTPError, RuntimeError) as error:  # the latter of a closed client
             raise unreachable(self._address, str(error) or type(error).__name__) from None

@@ -1,8 +1,11 @@
 """What goes wrong is the same exception over either transport, or is tried again."""
 
 import itertools
+import socket
+import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import grpc
@@ -296,3 +299,18 @@ def test_a_cloud_that_is_too_large_is_refused(size: int, client) -> None:
     with pytest.raises(PayloadTooLargeError):
         client.detect(np.zeros((size, 3), np.float32))
     assert client.ready()
+
+
+def test_a_rest_answer_that_trickles_in_does_not_outlast_the_timeout() -> None:
+    def trickle(listening: socket.socket) -> None:
+        with listening.accept()[0] as taken, suppress(OSError):
+            taken.sendall(b"HTTP/1.1 200 OK\r\ncontent-length: 100\r\n\r\n")
+            for _ in range(100):
+                taken.sendall(b" ")
+                time.sleep(0.1)
+
+    with socket.create_server(("127.0.0.1", 0)) as listening, ThreadPoolExecutor() as pool:
+        pool.submit(trickle, listening)
+        address = f"http://127.0.0.1:{listening.getsockname()[1]}"
+        with GraspClient(address, timeout=1.0) as client, pytest.raises(DeadlineError):
+            client.models()
