@@ -172,8 +172,11 @@ class LogQueue(logging.handlers.QueueHandler):
         super().close()
 
     def _write(self) -> None:
+        start = ""
         for line in iter(self._lines.get, None):
-            self.dropped += not write_line(self._stream, line)
+            written = write_line(self._stream, start + line)
+            start = "" if written else "\n"  # ends what was written of a line that is lost
+            self.dropped += not written
 
 
 def write_line(stream: TextIO | None, line: str) -> bool:

@@ -15,6 +15,7 @@ import httpx
 import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
+from tests.programs import until
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient, StreamRequest
@@ -123,6 +124,21 @@ def test_lines_not_written_are_counted(name: str) -> None:
         writer.handle(logging.makeLogRecord({"msg": "%d", "args": ("no number",)}))
         writer.close()
     assert writer.dropped == 4
+
+
+def test_a_line_after_a_lost_one_is_whole() -> None:
+    """The pipe takes only a part of the first, as a disk does that is nearly full."""
+    ends = os.pipe()
+    with os.fdopen(ends[0]) as log, os.fdopen(ends[1], "w") as stream:
+        os.set_blocking(stream.fileno(), False)
+        writer = LogQueue(stream)
+        writer.handle(logging.makeLogRecord({"msg": "lost" * 2**18}))
+        until(lambda: writer.dropped)
+        part = os.read(log.fileno(), 2**20).decode()
+        writer.handle(logging.makeLogRecord({"msg": "whole"}))
+        writer.close()
+        stream.close()
+        assert json.loads((part + log.read()).splitlines()[-1])["message"] == "whole"
 
 
 async def read(running: Any) -> dict[Any, float]:
