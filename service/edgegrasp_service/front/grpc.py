@@ -47,7 +47,6 @@ REFLECTION = tuple(f"grpc.reflection.{version}.ServerReflection" for version in 
 
 MAX_WATCHERS = 64  # of health, and readers of the interface by reflection
 WATCH_SECONDS = 1.0  # seconds between two looks at the health
-ABORT_SECONDS = 0.1  # seconds to send a client that reads slowly the end of its call
 STREAM_IDLE_SECONDS = 300.0  # for which a stream may stay open without a message
 STREAM_GRACE_SECONDS = 10.0  # seconds after which an idle stream yields its place to another one
 MAX_STREAM_FIELDS = 16  # in a message of a stream, which has three
@@ -150,7 +149,8 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         method, behave = self._behaviours.get(path, ("other", _unimplemented))
         # A peer is e.g. ipv4:127.0.0.1:5000, or ipv6:[::1]:5000 with encoded brackets.
         _, _, peer = urllib.parse.unquote(context.peer()).partition(":")
-        address = peer.rpartition(":")[0].strip("[]")
+        address, _, port = peer.rpartition(":")
+        address = address.strip("[]")
         call = Call("grpc", method, headers.get(REQUEST_ID_HEADER, ""), address)
         with self._service.observe(call):
             name = ((REQUEST_ID_HEADER, call.request_id),)
@@ -165,16 +165,23 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                     await context.send_initial_metadata(name)
                 await behave(call, context)
             except errors.Cancelled as error:
-                with contextlib.suppress(TimeoutError):  # the client may be gone
-                    async with asyncio.timeout(ABORT_SECONDS):
-                        await _abort(call, context, errors.report(error))
+                call.problem = errors.report(error)
+                # gRPC would keep the answer for as long as the connection.
+                _disconnect(self._port, network_of(address), port)
                 raise asyncio.CancelledError from None
             except aio.AbortError:
                 raise
+            except aio.InternalError:  # the connection broke while an answer was sent
+                raise asyncio.CancelledError from None
             except Exception as error:
                 if not isinstance(error, EdgeGraspError):
                     logger.exception("%s failed", method)
-                await _abort(call, context, errors.report(error))
+                try:
+                    await _abort(call, context, errors.report(error))
+                except aio.InternalError:  # an answer is being sent, and the deadline has passed
+                    if context.time_remaining() is None:
+                        _disconnect(self._port, network_of(address), port)
+                    raise asyncio.CancelledError from None
 
     async def _answer(self, method: Method, call: Call, context: Any) -> None:
         service, remaining = self._service, context.time_remaining()
@@ -418,21 +425,42 @@ def _bounds(settings: Settings) -> list[tuple[str, int]]:
     ]
 
 
-def _trim(port: int, most: int, duplicates: contextlib.ExitStack) -> None:
-    """Shut down the longest silent connections to a port of the clients that have most."""
-    found: defaultdict[str, list[tuple[int, socket.socket]]] = defaultdict(list)
+def _connections(
+    port: int, duplicates: contextlib.ExitStack
+) -> list[tuple[str, int, socket.socket]]:
+    """Duplicates of the connections to a port, each with its client's network and port."""
+    found = []
     for link in DESCRIPTORS.iterdir():
         with contextlib.suppress(OSError):
             if not link.is_socket():
                 continue
             one = duplicates.enter_context(socket.socket(fileno=os.dup(int(link.name))))
             if one.family != socket.AF_UNIX and one.getsockname()[1] == port:
-                owner = network_of(one.getpeername()[0])  # an OSError for the one that listens
-                info = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, LAST_RECEIVED.size)
-                found[owner].append((*LAST_RECEIVED.unpack(info), one))
+                host, its_port = one.getpeername()[:2]  # an OSError for the one that listens
+                found.append((network_of(host), its_port, one))
+    return found
+
+
+def _disconnect(port: int, owner: str, its_port: str) -> None:
+    """Shut down one client's connection to a port; one over a Unix socket cannot be told apart."""
+    with contextlib.ExitStack() as duplicates:
+        for network, number, one in _connections(port, duplicates):
+            if (network, str(number)) == (owner, its_port):
+                _shut_down(one)
+
+
+def _shut_down(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):  # it is closed already
+        connection.shutdown(socket.SHUT_RDWR)
+
+
+def _trim(port: int, most: int, duplicates: contextlib.ExitStack) -> None:
+    """Shut down the longest silent connections to a port of the clients that have most."""
+    found: defaultdict[str, list[tuple[int, socket.socket]]] = defaultdict(list)
+    for owner, _, one in _connections(port, duplicates):
+        info = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, LAST_RECEIVED.size)
+        found[owner].append((*LAST_RECEIVED.unpack(info), one))
     for rows in found.values():
         rows.sort(key=lambda row: row[0])
     for _ in range(sum(map(len, found.values())) - most):
-        _, longest = max(found.values(), key=len).pop()
-        with contextlib.suppress(OSError):
-            longest.shutdown(socket.SHUT_RDWR)
+        _shut_down(max(found.values(), key=len).pop()[1])
