@@ -59,21 +59,22 @@ def intrinsics_of(value: Any) -> Intrinsics:
 def metres(depth: Array, scale: float | None = None, field: str = "depth") -> Float32:
     """Depths of an image (H, W) or (H, W, 1) in metres, (H, W); NaN where there is no reading.
 
-    No reading is 0 or NaN. `scale` is metres for one unit; None: 0.001 of whole numbers, 1 of
-    floats. Raises InvalidRequest, which names `field`, for what is no image of depths, and for
+    No reading is 0, NaN or infinity. `scale` is metres for one unit; None: 0.001 of whole numbers,
+    1 of floats. Raises InvalidRequest, which names `field`, for what is no image of depths, and for
     negative ones.
     """
     if depth.shape[2:] == (1,):
         depth = depth[..., 0]
     whole = depth.dtype == np.uint16
     if depth.ndim != 2 or 0 in depth.shape or not (whole or depth.dtype.kind == "f"):
-        fix = "Send an image (H, W) of 16-bit whole numbers or of floats."
+        fix = "Send an image (H, W) of uint16 or of floats."
         raise InvalidRequest(field, f"shape {depth.shape}, dtype {depth.dtype}", fix)
     with np.errstate(over="ignore"):  # infinite is no reading
         found = depth.astype(np.float32)
         found *= scale or (MILLIMETRE if whole else 1.0)
-    if (found < 0).any():
-        worst = float(np.nanmin(found))
+    below = (found < 0) & (found > -np.inf)  # ROS and ZED have -inf where something is too near
+    if below.any():
+        worst = float(found[below].min())
         raise InvalidRequest(field, f"{worst:g} m", "Send 0 or NaN where there is no reading.")
     np.copyto(found, np.nan, where=~((found > 0) & (found < np.inf)))
     return found
