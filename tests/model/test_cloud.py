@@ -34,17 +34,20 @@ GOOD = np.random.default_rng(0).uniform(0.0, 0.3, (12, 3)).astype(np.float32)
 
 def test_holes_of_an_organised_cloud_are_dropped_with_all_that_belongs_to_them() -> None:
     organised = GOOD.reshape(3, 4, 3).copy()
-    organised[0, 1], organised[2, 3, 2] = np.nan, np.inf
+    organised[0, 1], organised[1, 2], organised[2, 3, 2] = np.nan, 0.0, np.inf
     ids = np.arange(12).reshape(3, 4)
     normals = np.where(np.isfinite(organised), ids[..., None], np.nan)
     beside = {"segment_ids": ids, "view_ids": ids.reshape(-1), "colors": normals}
     checked = check_cloud(CloudInput(organised, normals, **beside))
-    kept = [row for row in range(12) if row not in (1, 11)]
+    kept = [row for row in range(12) if row not in (1, 6, 11)]
     np.testing.assert_array_equal(checked.points, GOOD[kept])
     np.testing.assert_array_equal(checked.normals, np.repeat(kept, 3).reshape(-1, 3))
     for rows in (checked.row, checked.segment_ids, checked.view_ids):
         np.testing.assert_array_equal(rows, kept)
     assert checked.rows_sent == 12
+    flat = check_cloud(np.insert(GOOD, 5, 0.0, axis=0))
+    np.testing.assert_array_equal(flat.points, GOOD)
+    np.testing.assert_array_equal(flat.row, np.delete(np.arange(13), 5))
 
 
 @pytest.mark.parametrize(
@@ -161,6 +164,8 @@ def test_a_large_image_of_something_near_keeps_every_second_row(distance: float,
     kept = every[row // step * step, column // step * step]
     np.testing.assert_array_equal(labels_of_all_pixels(checked, every.ravel()), kept.ravel())
     assert len(check_cloud(image).points) == row.size - 1
+    image[9:] = 0.0  # most pixels are holes, which lie no distance apart
+    assert check_cloud(image, thin=True).step == step
 
 
 @pytest.mark.parametrize(

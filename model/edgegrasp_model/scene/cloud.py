@@ -71,7 +71,7 @@ class CheckedCloud:
 
 
 def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False) -> CheckedCloud:
-    """Check a caller's CloudInput or array of points, and drop the holes of an organised one.
+    """Check a caller's CloudInput or array of points, and drop holes: 0, 0, 0, or NaN in images.
 
     With `thin`, a large image whose pixels lie at most 1.25 mm apart loses every second row and
     column. InvalidRequest names `cloud`, `normals`, `colors`, `segment_ids` or `view_ids`.
@@ -84,22 +84,21 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
         raise wrong_array("cloud", points, fix)
     size, said, image_size, step = points.size // 3, sent.warnings, None, 1
     row = np.arange(size)
-    if points.ndim == 3:
+    if holes := points.ndim == 3:
         # A single row of points, such as fused images, is not an image.
         image_size = None if 1 in points.shape[:2] else points.shape[:2]
         large = image_size is not None and np.greater_equal(image_size, LARGE_IMAGE).all()
         step = 2 if thin and large and _pixel_spacing(points) <= 0.00125 else 1
         row = row.reshape(points.shape[:2])[::step, ::step].reshape(-1)
         points = points[::step, ::step].reshape(-1, 3)
-        x, y, z = points.T
-        kept = np.flatnonzero(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
+    if len(kept := _readings(points, holes)) < len(points):
         row, points = row[kept], points.take(kept, axis=0)
     if len(points) == 0:
-        value = "no points" if size == 0 else "no finite points"
+        value = "no points" if size == 0 else "no finite points beside 0, 0, 0"
         raise InvalidRequest("cloud", value, "Send an image or points in metres.")
     low, high = (np.array([end(axis) for axis in points.T]) for end in (np.min, np.max))
     if not np.isfinite([low, high]).all():
-        raise _not_finite(points)
+        raise _not_finite(points, row)
     if (high - low).max() > MAX_CLOUD_EXTENT:
         near = _without_far_points(points)
         said += (
@@ -129,11 +128,20 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
     )
 
 
+def _readings(points: Floats, holes: bool) -> Int64:
+    """Rows of the points (N, 3) that are readings; with `holes`, NaN and infinity are none."""
+    x, y, z = points.T
+    seen = (x != 0) | (y != 0) | (z != 0)  # many drivers send 0, 0, 0 where there is no reading
+    if holes:
+        seen &= np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
+    return np.flatnonzero(seen)
+
+
 def _pixel_spacing(image: Floats) -> float:
     """Median distance, metres, between neighbouring pixels of an image (H, W, 3); NaN: no two."""
     with np.errstate(invalid="ignore"):  # holes may be infinite
         apart = np.linalg.norm(image[::16, 1::8] - image[::16, :-1:8], axis=-1)
-    apart = apart[np.isfinite(apart)]
+    apart = apart[(apart > 0) & (apart < np.inf)]  # holes may be equal, too
     return float(np.median(apart)) if len(apart) else math.nan
 
 
@@ -349,9 +357,9 @@ def wrong_array(field: str, array: object, fix: str) -> InvalidRequest:
     return InvalidRequest(field, value, fix)
 
 
-def _not_finite(points: Floats) -> InvalidRequest:
+def _not_finite(points: Floats, row: Int64) -> InvalidRequest:
     finite = np.isfinite(points).all(axis=1)
-    bad = f"the first in row {int(np.argmin(finite))}"
+    bad = f"the first in row {row[np.argmin(finite)]}"
     value = f"{int((~finite).sum())} points with NaN or infinity, {bad}"
     return InvalidRequest("cloud", value, "Remove points without a finite x, y, z.")
 
