@@ -134,7 +134,7 @@ class GraspDetector:
                 f"uncalibrated for {gripper.name!r}; use them for ranking only."
             )
         if options.viewpoint is None:
-            eye = assumed_viewpoint(sent.points, options, warnings)
+            eye = assumed_viewpoint(sent, options, warnings)
             options = options.model_copy(update={"viewpoint": eye})
         previous, followed, choice = options.previous, None, options.objects
         if previous is not None:

@@ -23,7 +23,13 @@ from edgegrasp_model.request_cloud import (
     parse,
     read_depth_images,
 )
-from edgegrasp_model.scene.cloud import CheckedCloud, check_cloud, seen_from_origin, voxelise
+from edgegrasp_model.scene.cloud import (
+    CheckedCloud,
+    assumed_viewpoint,
+    check_cloud,
+    seen_from_origin,
+    voxelise,
+)
 from edgegrasp_model.scene.scene import check_region, inside_region, labels_of_all_pixels
 from edgegrasp_service.errors import PayloadTooLarge
 
@@ -102,6 +108,15 @@ def test_a_camera_at_the_origin_sees_what_lies_wholly_in_front_of_it() -> None:
     assert not seen_from_origin(seen, (0, 0, 1.0))  # it would look straight up
     assert not seen_from_origin(seen - (0, 0, 0.8), None)
     assert not seen_from_origin(seen + np.array([1.5, 0, 0]), None)
+
+
+def test_an_image_of_a_wide_angle_camera_is_seen_from_the_origin() -> None:
+    y, x = np.mgrid[-1:1:0.04, -1.2:1.2:0.04]
+    image = np.stack([x, y, np.full_like(x, 0.8)], axis=-1).astype(np.float32)
+    assert assumed_viewpoint(check_cloud(image), DetectOptions(), []) == (0.0, 0.0, 0.0)
+    mirrored = image * np.float32([1, -1, 1])  # a table above a robot's base, as a camera sees it
+    for cloud in (mirrored, image.reshape(-1, 3)):
+        assert assumed_viewpoint(check_cloud(cloud), DetectOptions(), []) != (0.0, 0.0, 0.0)
 
 
 def rows(count: int = 40, seed: int = 0, **fields: object) -> CheckedCloud:

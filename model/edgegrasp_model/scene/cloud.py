@@ -19,6 +19,7 @@ MAX_CLOUD_EXTENT = 20.0  # metres; if most of a cloud is wider, it is probably i
 MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 MAX_VIEW_TANGENT = 1.2  # of half a depth camera's field of view
+MAX_WIDE_TANGENT = 2.0  # of half a wide one's
 USUAL_DISTANCE = 0.8  # metres from a camera to objects and around them, if it is not known
 SUBSAMPLE_SIZE = 6000  # points that represent a cloud in fits, means and views
 LARGE_IMAGE = 704, 960  # pixels of an image of which every second row and column may be enough
@@ -50,6 +51,19 @@ class CheckedCloud:
         arrays = {name: array[place] for name, array in beside.items() if array is not None}
         points = self.points.take(place, axis=0)  # many times faster than indexing
         return replace(self, points=points, row=self.row[place], **arrays)
+
+    def looks_along_z(self) -> bool:
+        """Whether it is an image whose columns run along x and rows along y, seen from the origin.
+
+        From behind a surface, as from a robot's base below a table, an image looks mirrored.
+        """
+        if self.image_size is None:
+            return False
+        down, right = np.divmod(subsample(self.row), self.image_size[1])
+        x, y, z = subsample(self.points).T
+        with np.errstate(all="ignore"):  # NaN of a single column, which is false
+            along = np.corrcoef(right, x / z)[0, 1], np.corrcoef(down, y / z)[0, 1]
+        return bool(min(along) > 0.9)
 
     def projection(self, frame: "CanonicalFrame", eyes: Float64) -> Float64 | None:
         """The projection (3, 4) of canonical points into the image of one camera that was sent.
@@ -184,15 +198,16 @@ def pose_matrix(turn: Floats, place: ArrayLike) -> Float64:
 
 
 def assumed_viewpoint(
-    points: Float32, options: DetectOptions, warnings: list[str]
+    sent: CheckedCloud, options: DetectOptions, warnings: list[str]
 ) -> tuple[float, float, float] | None:
-    """Where the camera is assumed to be that saw points (N, 3), if a request does not say it.
+    """Where the camera is assumed to be that saw a cloud, if a request does not say it.
 
     None: several cameras saw them.
 
     InvalidRequest: the place is needed to the millimetre.
     """
-    if seen_from_origin(points, options.known_up):
+    points, wide = sent.points, sent.looks_along_z()
+    if seen_from_origin(points, options.known_up, MAX_WIDE_TANGENT if wide else MAX_VIEW_TANGENT):
         warnings.append(
             "viewpoint is not given: the camera is assumed at the origin, as the whole cloud "
             "lies in front of it; if the camera is elsewhere, send its position."
@@ -221,13 +236,15 @@ def assumed_viewpoint(
     return x, y, z
 
 
-def seen_from_origin(points: Float32, up: ArrayLike | None) -> bool:
+def seen_from_origin(
+    points: Float32, up: ArrayLike | None, max_tangent: float = MAX_VIEW_TANGENT
+) -> bool:
     """Whether points (N, 3) look as if seen by a camera at the origin along +z.
 
     If `up` (3,) is known, such a camera looks at most 30 degrees upward.
     """
     x, y, z = points.T
-    if len(points) == 0 or z.min() <= 0 or np.quantile(np.hypot(x, y) / z, 0.99) > MAX_VIEW_TANGENT:
+    if len(points) == 0 or z.min() <= 0 or np.quantile(np.hypot(x, y) / z, 0.99) > max_tangent:
         return False
     middle = points.mean(axis=0, dtype=np.float64)
     upward = 0.0 if up is None else np.dot(up, middle) / np.linalg.norm(up)
