@@ -56,6 +56,12 @@ def test_holes_of_an_organised_cloud_are_dropped_with_all_that_belongs_to_them()
     np.testing.assert_array_equal(flat.row, np.delete(np.arange(13), 5))
 
 
+def test_metres_taken_for_millimetres_get_a_warning() -> None:
+    assert check_cloud(GOOD).warnings == ()
+    (warning,) = check_cloud(GOOD / 1000).warnings
+    assert "m wide: send metres, or another depth_scale" in warning
+
+
 @pytest.mark.parametrize(
     ("sent", "field", "value"),
     [

@@ -16,6 +16,7 @@ from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import DetectOptions, SupportPlane, Workspace
 
 MAX_CLOUD_EXTENT = 20.0  # metres; if most of a cloud is wider, it is probably in millimetres
+MIN_CLOUD_EXTENT = 0.01  # metres; a narrower cloud is probably in kilometres
 MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 MAX_VIEW_TANGENT = 1.2  # of half a depth camera's field of view
@@ -113,7 +114,9 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
     low, high = (np.array([end(axis) for axis in points.T]) for end in (np.min, np.max))
     if not np.isfinite([low, high]).all():
         raise _not_finite(points, row)
-    if (high - low).max() > MAX_CLOUD_EXTENT:
+    if (extent := float((high - low).max())) < MIN_CLOUD_EXTENT:
+        said += (f"the cloud is {extent:.2g} m wide: send metres, or another depth_scale.",)
+    if extent > MAX_CLOUD_EXTENT:
         near = _without_far_points(points)
         said += (
             f"{len(points) - len(near)} points are left out that lie more than "
