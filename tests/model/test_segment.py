@@ -629,6 +629,11 @@ def test_parts_of_a_table_that_was_cut_off_show_the_scale_and_one_cut_away_is_mi
     assert "options.support.max_depth_error (0.12)" in warnings[0]
 
 
+def test_depths_are_scaled_by_no_more_than_is_allowed() -> None:
+    _, warnings = built(seen_wrong(table_with_box(np.random.default_rng(4)), 0.88))
+    assert "are used as sent" in warnings[0]
+
+
 def test_the_flat_top_of_an_object_is_no_table_by_which_depths_are_scaled() -> None:
     top = np.random.default_rng(8).uniform((-0.07, -0.07, 0.07), (0.07, 0.07, 0.07), (2000, 3))
     left, warnings = built(top)

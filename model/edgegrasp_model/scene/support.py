@@ -435,7 +435,7 @@ def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> floa
         window = held[start : start + width]
         if window.max() >= enough:
             scale = _median_scale(factors, float(tried[start + int(window.argmax())]), reach)
-            if scale is not None:
+            if scale is not None and abs(scale - 1.0) <= plane.max_depth_error:
                 scaled = viewpoint + scale * (subsample(points) - viewpoint)
                 inliers = scaled[np.abs(heights_over(plane, scaled)) < INLIER_DISTANCE]
                 if _wider_than_object(inliers, plane):
