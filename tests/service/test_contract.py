@@ -81,7 +81,7 @@ def test_a_form_of_camera_files(http) -> None:
     image = {"depth": (depth / 10000).tolist(), "intrinsics": camera}
     expected = http.post("/v1/grasps", json={"depth_images": [image]}).json()
     labels = (depth > 5000).astype(np.uint8)
-    images = {"depth": ("depth.png", png(depth)), "segment_ids": ("labels.png", png(labels))}
+    images = {"depth": ("depth.png", png(depth)), "segment_ids": ("blob", png(labels), "image/png")}
     array = {"depth": ("depth.npy", npy(depth))}
     for files, text in ((images, "60,50,15.5,11.5"), (array, json.dumps(nested))):
         parts = {"intrinsics": text, "depth_scale": "0.0001"}

@@ -60,6 +60,7 @@ ENCODE_SHARE = 0.1  # share of a request's time that is kept for writing its ans
 
 JSON, FORM = "application/json", "multipart/form-data"
 FILE_TYPES = {f"application/x-{name}": name for name in FILE_FORMATS}
+PART_TYPES = FILE_TYPES | {"image/png": "png"}
 FIELDS = ("point_cloud2", "depth_images", *PER_POINT, "options")
 MAX_QUERY_FIELDS = 64
 MAX_CAMERA_TEXT = 1000  # most bytes of a part like 615,615,320,240; a longer one must be JSON
@@ -390,7 +391,7 @@ def _parts(body: bytes, boundary: str, most: int) -> Iterator[tuple[str, str | N
         yield str(name), None, text.encode()
     for name, file in files.items(multi=True):
         suffix = PurePath((file.filename or "").replace("\0", "")).suffix
-        yield str(name), FILE_TYPES.get(file.mimetype) or suffix[1:].lower(), file.read()
+        yield str(name), PART_TYPES.get(file.mimetype) or suffix[1:].lower(), file.read()
 
 
 # Messages
