@@ -95,7 +95,7 @@ def run_grasp(
     if any(each.other_uid in obstacles for each in _cut_into(gripper)):
         return result(FailureCause.START_COLLISION)
     collided = False
-    for _ in gripper.approach(T_world_hand):
+    for _ in gripper.go(T_world_hand, away=False):
         cut = _cut_into(gripper)
         if gripper.on_the_way:
             touched += [each.position for each in cut]
@@ -107,7 +107,7 @@ def run_grasp(
     caught = _touched(gripper, objects)
     if not missed or to_the_end:
         clear = _is_clear(gripper, objects, gripper.body.opening)
-        for _ in gripper.retreat(T_world_hand):
+        for _ in gripper.go(T_world_hand, away=True):
             if not to_the_end and next(clear):
                 break
         held = next(iter(_touched(gripper, objects)), None)
@@ -160,20 +160,16 @@ class Gripper:
         """Place the open hand a little behind the grasp."""
         self.place(T_world_hand @ translation(0.0, 0.0, -PREGRASP_DISTANCE))
 
-    def approach(self, T_world_hand: Float64) -> Iterator[None]:
-        """Move straight to the grasp."""
-        return self.steps_to(T_world_hand, step_length=STEP_LENGTH)
-
-    def retreat(self, T_world_hand: Float64) -> Iterator[None]:
-        """Go to `retreat_pose`."""
-        return self.steps_to(retreat_pose(T_world_hand), step_length=STEP_LENGTH)
+    def go(self, T_world_hand: Float64, *, away: bool) -> Iterator[None]:
+        """Move straight to the grasp, or from it to `retreat_pose`; yields after each time step."""
+        return self.steps_to(retreat_pose(T_world_hand) if away else T_world_hand, STEP_LENGTH)
 
     def place(self, T_world_hand: Float64) -> None:
         """Place the open hand there at once, at rest."""
         T_world_com = T_world_hand @ self._T_hand_com
         self.body.set_pose(T_world_com[:3, 3], quaternion_xyzw(T_world_com))
 
-    def steps_to(self, T_world_hand: Float64, *, step_length: float) -> Iterator[None]:
+    def steps_to(self, T_world_hand: Float64, step_length: float) -> Iterator[None]:
         """Drag the hand straight there, `step_length` metres a time step; yields after each."""
         T_world_com = T_world_hand @ self._T_hand_com
         quaternion = quaternion_xyzw(T_world_com)
@@ -203,15 +199,7 @@ class ArmGripper(Gripper):
         """Start at home, wherever the grasp is."""
         self.park()
 
-    def approach(self, T_world_hand: Float64) -> Iterator[None]:
-        """Follow the motion to the grasp."""
-        return self._follow(away=False)
-
-    def retreat(self, T_world_hand: Float64) -> Iterator[None]:
-        """Follow the motion away from the grasp."""
-        return self._follow(away=True)
-
-    def _follow(self, *, away: bool) -> Iterator[None]:
+    def go(self, T_world_hand: Float64, *, away: bool) -> Iterator[None]:
         """Follow the motion to the grasp, or away from it; yields after each time step."""
         motion, substeps = self.motion, self._arm.substeps
         if motion is None:
@@ -334,7 +322,7 @@ def _holds_when_shaken(
         for way in (world.shake_distance, -world.shake_distance, 0.0):
             moves.append((T_world_lifted @ translation(*(way * along)), world.shake_step))
     for T_world_next, step_length in moves:
-        for _ in gripper.steps_to(T_world_next, step_length=step_length):
+        for _ in gripper.steps_to(T_world_next, step_length):
             pass
     return not gripper.is_shut and held in _touched(gripper, objects)
 

@@ -60,7 +60,7 @@ def test_an_arm_lifts_a_cube_and_touches_nothing_before(cell):
 
 
 def test_the_hand_arrives_where_the_grasp_is(cell):
-    for _ in cell.gripper.approach(cell.T_world_hand):
+    for _ in cell.gripper.go(cell.T_world_hand, away=False):
         pass
     palm = cell.T_world_hand[:3, :3] @ cell.gripper.model.centre + cell.T_world_hand[:3, 3]
     np.testing.assert_allclose(cell.gripper.body.position, palm, atol=0.002)
