@@ -275,8 +275,7 @@ def summary(done: list[Followed]) -> dict[str, Any]:
 def simulated(objects: Path | None, motion: Motion, rounds: int) -> Iterator[SimulatedScene]:
     """Simulated scenes; each is valid until the next one."""
     kind = SceneKind.PACKED
-    sets = {kind: ObjectSet.from_folder(objects, kind)}
-    with ClutterSimulation(sets, engine="mujoco") as simulation:
+    with ClutterSimulation(ObjectSet.from_folder(objects, kind), engine="mujoco") as simulation:
         for number in range(rounds):
             rng = np.random.default_rng(number)
             if simulation.reset(kind, rng, num_objects=OBJECTS):

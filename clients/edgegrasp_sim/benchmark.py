@@ -54,7 +54,7 @@ class BenchmarkConfig:
         objects = self.object_set()
         objects.check_same(digest)
         return ClutterSimulation(
-            {self.scene: objects},
+            objects,
             engine=self.engine,
             gripper=self.gripper,
             arm=self.arm,
@@ -154,6 +154,6 @@ class RoundRunner:
 
     def close(self) -> None:
         """Release what simulation and planner hold."""
-        self.simulation.close()
+        self.simulation.world.close()
         if close := getattr(self.planner, "close", None):
             close()

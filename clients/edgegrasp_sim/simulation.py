@@ -48,7 +48,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
 
     def __init__(
         self,
-        objects: Mapping[SceneKind, ObjectSet] | None = None,
+        objects: ObjectSet | None = None,  # to make scenes of; None: each kind's built-in ones
         *,
         engine: str | None = None,
         gripper: Mapping[str, Any] | None = None,
@@ -57,10 +57,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
     ) -> None:
         self.gripper, self.arm, self.min_opening = gripper, arm, min_opening
         self.hand = hand.panda() if gripper is None else hand.hand_of(gripper)
-        if objects is None:
-            objects = {kind: ObjectSet.builtin(kind) for kind in SceneKind}
-        self.object_sets = dict(objects)
-        self.surroundings = OPEN_TABLE
+        self.object_set, self.surroundings = objects, OPEN_TABLE
         self.world = make_world(engine)
         self._objects: list[SceneObject] = []
         self._obstacles: frozenset[int] = frozenset()
@@ -68,10 +65,6 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         self._rest_state: Any = None
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close its world. Safe to call twice."""
         self.world.close()
 
     @property
@@ -87,7 +80,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
     @property
     def too_wide(self) -> list[ObjectModel]:
         """Models of the objects that are wider at their narrowest than the hand opens."""
-        opening, there = self._hand.model.max_opening, self._objects
+        opening, there = self.hand.max_opening, self._objects
         return [one.model for one in there if least_width(one.model.urdf) * one.scale > opening]
 
     @property
@@ -114,9 +107,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
     ) -> int:
         """Make a new scene at rest; returns how many objects are there."""
         kind = SceneKind(scene)
-        objects = self.object_sets.get(kind)
-        if objects is None:
-            raise ValueError(f"no object set for scene {kind.value!r}; pass one in `objects`")
+        objects = self.object_set or ObjectSet.builtin(kind)
         surround, make = STANDING_IN[kind]
         around = self._clear(table if surround is None else surround(rng))
         scales = scales or SCALES[kind.objects]

@@ -182,8 +182,7 @@ def generate_scene(
             seen_from = SIDE_VIEWS if kind in (PACKED, PILE, TABLE) else seen_from
         elif drawn is not None and shape.random() < VARIED_SHARE:
             drawn = varied_objects(drawn, Path(folder), shape)
-        made_of = None if drawn is None else {kind: drawn}
-        with ClutterSimulation(made_of, engine=options.engine, gripper=gripper) as simulation:
+        with ClutterSimulation(drawn, engine=options.engine, gripper=gripper) as simulation:
             return list(_views(simulation, kind, sizes, seen_from, options, scene, of_views))
 
 

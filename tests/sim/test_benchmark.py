@@ -239,7 +239,7 @@ def test_cubes_are_cleared_though_the_first_view_shows_nothing(engine: str, monk
         return views[-1] if len(views) > 1 else replace(views[0], cloud=views[0].cloud[:0])
 
     monkeypatch.setattr(ClutterSimulation, "observe_from", hidden_at_first)
-    with ClutterSimulation({PACKED: ObjectSet("cubes", (cube,))}, engine=engine) as cubes:
+    with ClutterSimulation(ObjectSet("cubes", (cube,)), engine=engine) as cubes:
         done = RoundDriver(cubes, PACKED, paper_with(3), seed=0, index=0).run(plan)
     assert (done.end, done.no_grasp, done.successes) == (RoundEnd.CLEARED, 1, 3)
     for attempt in done.attempts:
