@@ -8,15 +8,15 @@ for evaluation only, and seen by depth cameras with their faults; with `--robots
 are named by kind.
 """
 
-import argparse
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import pybullet_data
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from typer import Option, run
 
 from edgegrasp_camera.arrays import Float64
 from edgegrasp_sim.camera import FARTHEST, look_at, points_of
@@ -242,29 +242,28 @@ def on_the_surface(label: NDArray[np.uint8], true: Float64, depth: Float64) -> N
     return np.where(best <= TOUCHED, found, 0).astype(np.uint8)
 
 
-def main() -> None:
+def main(
+    objects: Annotated[Path, Option()],
+    output: Annotated[Path, Option()],
+    seed: int = 0,
+    each: Annotated[int, Option(help="Scenes of each kind.")] = 12,
+    robots: Annotated[bool, Option(help="One or two in each; no shelves.")] = False,
+) -> None:
     """Make the scenes."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--objects", type=Path, required=True)
-    parser.add_argument("--output", type=Path, required=True)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--each", type=int, default=12, help="scenes of each kind")
-    parser.add_argument("--robots", action="store_true", help="one or two in each; no shelves")
-    asked = parser.parse_args()
-    asked.output.mkdir(parents=True, exist_ok=True)
-    for number, index in np.ndindex(len(KINDS) - asked.robots, asked.each):
-        rng = np.random.default_rng([asked.seed, number, index])
+    output.mkdir(parents=True, exist_ok=True)
+    for number, index in np.ndindex(len(KINDS) - robots, each):
+        rng = np.random.default_rng([seed, number, index])
         labels = np.zeros((1, 1))
         while labels.max() < FIRST or (labels == 1).mean() < SUPPORT:
-            maker = Maker(asked.objects, rng)
+            maker = Maker(objects, rng)
             made = getattr(maker, KINDS[number])()
-            for _ in range(int(rng.integers(1, 3)) if asked.robots else 0):
+            for _ in range(int(rng.integers(1, 3)) if robots else 0):
                 maker.robot()
             arrays = picture(maker, made)
             labels = arrays["labels"]
             maker.world.close()
-        np.savez_compressed(asked.output / f"{KINDS[number]}_{index:02d}.npz", **arrays)
+        np.savez_compressed(output / f"{KINDS[number]}_{index:02d}.npz", **arrays)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

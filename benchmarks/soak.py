@@ -9,7 +9,6 @@ an outcome of its own, health is never refused, each attack is answered with an 
 not grow and the server stops.
 """
 
-import argparse
 import asyncio
 import base64
 import contextlib
@@ -29,11 +28,12 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import httpx
 import numpy as np
 import psutil
+import typer
 from benchmarks import serve_dummy
 from benchmarks.measuring import RESULTS, memory, write_results
 
@@ -62,23 +62,22 @@ CHECK, STREAM = "/grpc.health.v1.Health/Check", "/edgegrasp.v1.GraspService/Dete
 FLAGS = ("--max-queue-length", "512", "--max-streams", "64", "--log-level", "error")
 
 
-def main() -> None:
+def main(
+    output: Path = RESULTS,
+    minutes: float = 10.0,
+    clients: Annotated[int, typer.Option(help="At a time, over all three ways.")] = 32,
+    seed: int = 0,
+) -> None:
     """Run the clients and the attacks, write soak.json, and exit with 1 if anything is wrong."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.soak")
-    parser.add_argument("--output", type=Path, default=RESULTS)
-    parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--clients", type=int, default=32, help="at a time, over all three ways")
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
     os.environ["DUMMY_SECONDS"] = "0.002"
     with local_server(*FLAGS, program=[sys.executable, "-P", serve_dummy.__file__]) as server:
-        results = run(server, given.clients, given.minutes * 60, given.seed)
+        results = run(server, clients, minutes * 60, seed)
         process = psutil.Process(server.pid)
         process.terminate()
         results["exit_code"] = int(process.wait(STOP_SECONDS))
     # In a shorter time the attacks themselves have only begun.
-    results["faults"] = faults(results, grows=given.minutes >= 2)
-    write_results(given.output, "soak", results)
+    results["faults"] = faults(results, grows=minutes >= 2)
+    write_results(output, "soak", results)
     print(json.dumps(results, indent=1))
     sys.exit(1 if results["faults"] else 0)
 
@@ -302,4 +301,4 @@ def faults(results: dict[str, Any], grows: bool) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -4,7 +4,6 @@ Most times are processor seconds on one thread, medians of interleaved runs: the
 machine too.
 """
 
-import argparse
 import itertools
 import re
 import statistics
@@ -12,10 +11,11 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+import typer
 from benchmarks.measuring import RESULTS, interleaved, machine, memory, write_results
 from examples.your_planner import plan
 
@@ -47,22 +47,19 @@ SECONDS, RATES = ("seconds_1", "seconds_2"), ("labels_per_second", "rounds_per_m
 BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"  # around the README's table
 
 
-def main() -> None:
+def main(
+    output: Path = RESULTS,
+    pages: Annotated[bool, typer.Option(help="Rewrite the tables of README and speed.md.")] = False,
+) -> None:
     """Measure everything, write the results and the pages' tables."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.speed")
-    parser.add_argument("--output", type=Path, default=RESULTS)
-    parser.add_argument(
-        "--pages", action="store_true", help="rewrite the tables of README.md and docs/speed.md"
-    )
-    given = parser.parse_args()
     torch.set_num_threads(1)
     results: dict[str, Any] = {"machine": machine()}
     for part in (camera, shipped, simulator, server):
         name = part.__name__
         results[name] = part()
         print(name, results[name], flush=True)
-    write_results(given.output, "speed", results)
-    if given.pages:
+    write_results(output, "speed", results)
+    if pages:
         write_table(ROOT / "README.md", camera_table(results))
         write_table(ROOT / "docs" / "speed.md", table(results))
 
@@ -210,4 +207,4 @@ def table(results: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)
