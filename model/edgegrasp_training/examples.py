@@ -120,8 +120,7 @@ class Teacher:
     def __init__(self, weights: Path, crop_radius: float) -> None:
         """Load a `hand` checkpoint; candidates are drawn from balls of `crop_radius` metres."""
         self.network, self.metadata = load_checkpoint(weights)
-        if self.metadata.network.architecture != "hand":
-            found = self.metadata.network.architecture
+        if (found := self.metadata.network.architecture) != "hand":
             raise ValueError(f"teacher: got a network of architecture {found!r}. Use a `hand` one.")
         self.crop_radius = crop_radius
 

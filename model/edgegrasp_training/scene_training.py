@@ -18,7 +18,7 @@ from torch.nn import functional
 from torch.optim import swa_utils
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
-from edgegrasp_camera.depth import Intrinsics, unproject
+from edgegrasp_camera.depth import Intrinsics, metres, unproject
 from edgegrasp_model.scene.network import VOTE_UNIT, SceneNet, SceneOutput, scene_features
 from edgegrasp_model.scene.segment import group_pixels, run_network
 from edgegrasp_training.scene_images import DEPTH_UNIT, SceneImage
@@ -63,8 +63,7 @@ def read_images(files: Iterable[Path]) -> list[SceneImage]:
 
 def image_points(image: SceneImage) -> Float32:
     """(H, W, 3) camera frame, metres; NaN without a reading."""
-    depth = np.where(image.depth > 0, image.depth * np.float32(DEPTH_UNIT), np.float32(np.nan))
-    return unproject(depth, Intrinsics(*image.camera.tolist()))
+    return unproject(metres(image.depth, DEPTH_UNIT), Intrinsics(*image.camera.tolist()))
 
 
 def make_batch(

@@ -131,7 +131,7 @@ class Trainer:
         """Calibrate the best network on all validation views; write it and its card."""
         path = self.folder / f"{self.metadata.name}.safetensors"
         best, saved = load_checkpoint(path)
-        self.average.load_state_dict(recipes.rescaled(best, recipes.LENGTH_UNIT).state_dict())
+        recipes.start_from(self.average, best)
         # Mixed once with where it started (Wortsman et al., CVPR 2022).
         if self.start is not None and not saved.training:
             first = deepcopy(self.average)
