@@ -16,7 +16,7 @@ from edgegrasp_results import ArmTrajectory
 from edgegrasp_sim.camera import Observation, crop
 from edgegrasp_sim.hand import FailureCause, seconds_of
 from edgegrasp_sim.objects import SceneKind
-from edgegrasp_sim.protocol import Protocol as BenchmarkProtocol
+from edgegrasp_sim.protocol import Protocol
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.surroundings import open_table
 
@@ -108,7 +108,7 @@ class RoundDriver:
         self,
         simulation: ClutterSimulation,
         scene: SceneKind,
-        protocol: BenchmarkProtocol,
+        protocol: Protocol,
         *,
         seed: int,
         index: int,
