@@ -17,22 +17,8 @@ import pytest
 from tests.cloud_files import ply
 from tests.many_options import MANY, OWN_GRIPPER
 
-import edgegrasp_client
-from edgegrasp_client import (
-    AsyncGraspClient,
-    DetectedObject,
-    Detection,
-    Grasp,
-    GraspClient,
-    GraspClientError,
-    GraspTracker,
-    GripperOutline,
-    InvalidRequestError,
-    StreamRequest,
-    Tracking,
-    object_in_scene,
-    on_mask,
-)
+import edgegrasp_client as api
+from edgegrasp_client import AsyncGraspClient, Detection, GraspClient, GraspTracker, StreamRequest
 from edgegrasp_results import FoundSupport
 
 
@@ -70,15 +56,11 @@ def test_files_and_arrays_give_the_same(client, cloud, tmp_path: Path) -> None:
 
 
 # As arrays and numbers of NumPy too.
+OWN = OWN_GRIPPER | {"name": "mine", "max_opening": np.float32(0.07), "swing": None}
+OWN["finger"] = {"boxes": np.array(OWN_GRIPPER["finger"]["boxes"])}
 ALL_OPTIONS: dict[str, Any] = MANY | {
     "model": "dummy",
-    "gripper": OWN_GRIPPER
-    | {
-        "name": "mine",
-        "max_opening": np.float32(0.07),
-        "finger": {"boxes": np.array(OWN_GRIPPER["finger"]["boxes"])},
-        "swing": None,
-    },
+    "gripper": OWN,
     "num_approach_points": np.int64(12),
     "viewpoint": np.array([0.1, 0.2, 0.7], np.float32),
     "objects": {"include": np.array([0, 2]), "exclude": range(1, 2)},
@@ -98,7 +80,7 @@ ALL_OPTIONS: dict[str, Any] = MANY | {
 
 
 def test_every_option_goes_through_and_none_is_its_default(client, cloud) -> None:
-    known = edgegrasp_client.DetectOptions.__annotations__.keys()
+    known = api.DetectOptions.__annotations__.keys()
     assert ALL_OPTIONS.keys() == known - {"robot"}  # which this server has none of: tests/robot
     detection = client.detect(cloud, **ALL_OPTIONS)
     assert len(detection.grasps) == 3
@@ -136,10 +118,10 @@ def test_a_forked_process_asks_over_rest_alone(dummy_server, cloud) -> None:
                 found = bool(of_child.detect(cloud).grasps)
             try:
                 GraspClient(dummy_server.grpc_address)
-            except InvalidRequestError:
+            except api.InvalidRequestError:
                 try:
                     client.detect(cloud)  # its connection is its parent's
-                except GraspClientError as error:
+                except api.GraspClientError as error:
                     os._exit(0 if found and "another process" in str(error) else 2)
             os._exit(1)
         assert os.waitpid(child, 0)[1] == 0
@@ -166,14 +148,14 @@ def test_a_mask_narrows_the_regions_that_are_asked_for() -> None:
     mask = np.zeros((2, 3, 4), np.uint8)
     mask[0, 1, 2] = 255  # red, green, blue
     mask[1, 2, 3] = 255  # transparency says nothing
-    options = on_mask(mask, asked)
+    options = api.on_mask(mask, asked)
     assert options["top_k"] == 3
     assert options["contact_region"]["include"] == [ball]
     for name in ("approach_region", "contact_region"):
         (outside,) = options[name]["exclude"]
         np.testing.assert_array_equal(outside["mask"], [[True, False, True], [True] * 3])
     grey = np.dstack([mask.any(axis=2), np.ones((2, 3))])  # which cannot be seen through
-    (outside,) = on_mask(grey)["approach_region"]["exclude"]
+    (outside,) = api.on_mask(grey)["approach_region"]["exclude"]
     np.testing.assert_array_equal(outside["mask"], [[True, False, True], [True, True, False]])
     assert "exclude" not in asked["contact_region"]
 
@@ -184,7 +166,7 @@ def test_an_object_is_cut_out_of_the_scene_that_repeats_it() -> None:
     wanted = np.linalg.norm(scene - 0.1, axis=1) < 0.08
     holed = np.concatenate([scene, [[np.nan] * 3]])
     for around in (holed, scene[~wanted]):
-        cloud, segment_ids = object_in_scene(scene[wanted], around)
+        cloud, segment_ids = api.object_in_scene(scene[wanted], around)
         np.testing.assert_array_equal(cloud[segment_ids == 1], scene[wanted].astype(np.float32))
         far = np.linalg.norm(cloud[segment_ids == 0] - 0.1, axis=1)
         assert far.min() > 0.07
@@ -208,11 +190,11 @@ def test_what_cannot_be_sent_is_an_error_and_the_stream_goes_on(client, cloud) -
         [StreamRequest(each, request_id="a") for each in clouds]  # as who needs no names sends it
     )
     assert_same(first.result(), last.result())
-    with pytest.raises(InvalidRequestError, match="cloud"):
+    with pytest.raises(api.InvalidRequestError, match="cloud"):
         empty.result()
-    with pytest.raises(InvalidRequestError, match="nowhere"):
+    with pytest.raises(api.InvalidRequestError, match="nowhere"):
         missing.result()
-    with pytest.raises(InvalidRequestError, match="Give a cloud"):
+    with pytest.raises(api.InvalidRequestError, match="Give a cloud"):
         StreamRequest()
 
 
@@ -246,22 +228,21 @@ async def test_an_asynchronous_source(dummy_server, cloud, transport: str) -> No
 
 # What the tracker sends: the latest image, and what the last answer said.
 
-
 UP = [0.0, 0.0, 1.0]
 
 
 def answer(first: str = "kept", score: float = 0.9, grasps: int = 6) -> Detection:
     pose, place = np.eye(4, dtype=np.float32), np.zeros(3, np.float32)
     found = [
-        Grasp(score, pose, pose, 0.08, place, place, place, True, 0.0, row // 5, None, row)
+        api.Grasp(score, pose, pose, 0.08, place, place, place, True, 0.0, row // 5, None, row)
         for row in range(grasps)
     ]
     objects = [
-        DetectedObject(n, 9, place, place, np.zeros(4, np.float32), None, 0.9, None, np.ones(6))
+        api.DetectedObject(n, 9, place, place, np.zeros(4, np.float32), None, 0.9, None, np.ones(6))
         for n in range(2)
     ]
-    gripper, up = GripperOutline("panda", 0.06, 0.11), np.float32([0, 0, 1])
-    tracking = Tracking(first, 20)
+    gripper, up = api.GripperOutline("panda", 0.06, 0.11), np.float32([0, 0, 1])
+    tracking = api.Tracking(first, 20)
     return Detection(found, {}, {}, "m", gripper, [], None, None, up, objects, tracking)
 
 

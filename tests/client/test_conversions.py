@@ -7,24 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from edgegrasp_client import Grasp
-from edgegrasp_client.conversions import (
-    CONTACT_GRASPNET,
-    PANDA_LINK8,
-    VGN,
-    FingerJoints,
-    HandFrame,
-    graspnet_frame,
-    isaac_grasps,
-    matrix_from_quaternion,
-    quaternion_from_matrix,
-    read_isaac_grasps,
-    to_frame,
-)
+from edgegrasp_client import Grasp, conversions
+from edgegrasp_client.conversions import CONTACT_GRASPNET, PANDA_LINK8, VGN, FingerJoints, HandFrame
 
 # The hand above the point (0.5, -0.1, 0), looking down, its fingers closing along the cloud's x.
 DOWN = np.array([[0, 1, 0, 0.5], [1, 0, 0, -0.1], [0, 0, -1, 0.3], [0, 0, 0, 1.0]])
 UP = np.array([[1, 0, 0, 0.25], [0, 1, 0, -0.5], [0, 0, 1, 1.0], [0, 0, 0, 1]])  # no turn at all
+GRASPNET = conversions.graspnet_frame(0.1122, 0.02)
 
 finite = st.floats(-2.0, 2.0)
 places = st.tuples(finite, finite, finite)
@@ -44,9 +33,10 @@ def grasp(pose: np.ndarray, score: float = 0.9, width: float = 0.06) -> Grasp:
 @given(quaternion=quaternions)
 def test_quaternions_and_matrices_are_those_of_scipy(quaternion: tuple[float, ...]) -> None:
     rotation = Rotation.from_quat(quaternion)
-    np.testing.assert_allclose(matrix_from_quaternion(quaternion), rotation.as_matrix(), atol=1e-12)
-    found = quaternion_from_matrix(rotation.as_matrix())
-    np.testing.assert_allclose(matrix_from_quaternion(found), rotation.as_matrix(), atol=1e-12)
+    found = conversions.quaternion_from_matrix(rotation.as_matrix())
+    for one in (quaternion, found):
+        matrix = conversions.matrix_from_quaternion(one)
+        np.testing.assert_allclose(matrix, rotation.as_matrix(), atol=1e-12)
     assert found[3] >= 0
     assert np.linalg.norm(found) == pytest.approx(1.0)
 
@@ -56,12 +46,12 @@ def test_quaternions_and_matrices_are_those_of_scipy(quaternion: tuple[float, ..
     [
         (CONTACT_GRASPNET, [[1, 0, 0, 0.5], [0, -1, 0, -0.1], [0, 0, -1, 0.3]]),
         # Tips at height 0.3 - 0.1122; the origin 0.02 above them.
-        (graspnet_frame(0.1122, 0.02), [[0, 1, 0, 0.5], [0, 0, -1, -0.1], [-1, 0, 0, 0.2078]]),
+        (GRASPNET, [[0, 1, 0, 0.5], [0, 0, -1, -0.1], [-1, 0, 0, 0.2078]]),
         (VGN, [[0, 1, 0, 0.5], [1, 0, 0, -0.1], [0, 0, -1, 0.238]]),
     ],
 )
 def test_the_frames_of_others(frame: HandFrame, expected: list[list[float]]) -> None:
-    np.testing.assert_allclose(to_frame(DOWN, frame)[:3], expected, atol=1e-12)
+    np.testing.assert_allclose(conversions.to_frame(DOWN, frame)[:3], expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("axes", [("x", "-x"), ("up", "x"), ("x", "")])
@@ -83,7 +73,7 @@ def test_the_pandas_parent_link_is_turned_by_45_degrees_at_the_same_place() -> N
 )
 def test_isaac_grasps_round_trip(cases, T_object_cloud, T_hand_gripper) -> None:
     grasps = [grasp(*case) for case in cases]
-    text = isaac_grasps(
+    text = conversions.isaac_grasps(
         grasps,
         object_frame="/World/mug #1",
         gripper_frame='/World/"hand"',
@@ -91,7 +81,7 @@ def test_isaac_grasps_round_trip(cases, T_object_cloud, T_hand_gripper) -> None:
         T_hand_gripper=T_hand_gripper,
         joints=FingerJoints(("thumb",), lambda opening: (0.8 - 9.0 * opening,)),
     )
-    read = read_isaac_grasps(text)
+    read = conversions.read_isaac_grasps(text)
     assert [each.name for each in read] == [f"grasp_{i}" for i in range(len(cases))]
     for each, (pose, score, width) in zip(read, cases, strict=True):
         back = np.linalg.inv(T_object_cloud) @ each.T_object_gripper @ np.linalg.inv(T_hand_gripper)
@@ -102,7 +92,8 @@ def test_isaac_grasps_round_trip(cases, T_object_cloud, T_hand_gripper) -> None:
 
 
 def file() -> str:
-    return isaac_grasps([grasp(UP, 0.5)], object_frame="/World/mug #1", gripper_frame='"hand"')
+    frames = {"object_frame": "/World/mug #1", "gripper_frame": '"hand"'}
+    return conversions.isaac_grasps([grasp(UP, 0.5)], **frames)
 
 
 def test_an_isaac_file_says_what_the_format_asks_for() -> None:
@@ -124,7 +115,7 @@ def test_an_isaac_file_says_what_the_format_asks_for() -> None:
 
 
 def test_an_isaac_file_of_the_grasp_editor_is_read_with_the_extra(monkeypatch) -> None:
-    (read,) = read_isaac_grasps(
+    (read,) = conversions.read_isaac_grasps(
         """
 format: isaac_grasp
 format_version: 1.0
@@ -142,7 +133,7 @@ grasps:
     np.testing.assert_allclose(read.T_object_gripper[:3, 3], [1, 2.5, -0.3])
     monkeypatch.setitem(sys.modules, "yaml", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'edgegrasp\[yaml\]'"):
-        read_isaac_grasps("format: isaac_grasp")
+        conversions.read_isaac_grasps("format: isaac_grasp")
 
 
 @pytest.mark.parametrize(
@@ -163,4 +154,4 @@ def test_what_is_no_isaac_file_is_refused(edit: tuple[str, str], message: str) -
     text = file()
     assert edit[0] in text
     with pytest.raises(ValueError, match=message):
-        read_isaac_grasps(text.replace(*edit, 1))
+        conversions.read_isaac_grasps(text.replace(*edit, 1))

@@ -14,25 +14,9 @@ import numpy as np
 import pytest
 from tests.programs import free_ports
 
+import edgegrasp_client as api
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_client import (
-    AccessDeniedError,
-    DeadlineError,
-    GraspClient,
-    GraspClientError,
-    InvalidRequestError,
-    OverloadedError,
-    PayloadTooLargeError,
-    ProtocolError,
-    ServerFailedError,
-    ServerUnavailableError,
-    StartCollisionError,
-    StreamRequest,
-    Tls,
-    UnknownModelError,
-    WorkerLostError,
-    connection,
-)
+from edgegrasp_client import GraspClient, StreamRequest, Tls, connection
 
 
 class Problem(NamedTuple):
@@ -117,21 +101,21 @@ LOST = Problem("worker-lost", Code.UNAVAILABLE, 503)
 INVALID = Problem("invalid-request", Code.INVALID_ARGUMENT, 400)
 
 DESCRIBED = [
-    (INVALID, InvalidRequestError),
-    (Problem("unsupported-media-type", Code.INVALID_ARGUMENT, 415), InvalidRequestError),
-    (Problem("headers-too-large", Code.RESOURCE_EXHAUSTED, 431), InvalidRequestError),
-    (Problem("start-collision", Code.INVALID_ARGUMENT, 400), StartCollisionError),
-    (Problem("unknown-model", Code.NOT_FOUND, 404), UnknownModelError),
-    (Problem("payload-too-large", Code.RESOURCE_EXHAUSTED, 413), PayloadTooLargeError),
-    (Problem("unauthenticated", Code.UNAUTHENTICATED, 401), AccessDeniedError),
-    (Problem("permission-denied", Code.PERMISSION_DENIED, 403), AccessDeniedError),
-    (Problem("detector-failed", Code.INTERNAL, 500), ServerFailedError),
-    (AWAY, ServerUnavailableError),
-    (BUSY, OverloadedError),
-    (LOST, WorkerLostError),
-    (Problem("harmful-request", Code.INVALID_ARGUMENT, 422), InvalidRequestError),
-    (Problem("deadline-exceeded", Code.DEADLINE_EXCEEDED, 504), DeadlineError),
-    (Problem("teapot", Code.UNKNOWN, 418), ProtocolError),
+    (INVALID, api.InvalidRequestError),
+    (Problem("unsupported-media-type", Code.INVALID_ARGUMENT, 415), api.InvalidRequestError),
+    (Problem("headers-too-large", Code.RESOURCE_EXHAUSTED, 431), api.InvalidRequestError),
+    (Problem("start-collision", Code.INVALID_ARGUMENT, 400), api.StartCollisionError),
+    (Problem("unknown-model", Code.NOT_FOUND, 404), api.UnknownModelError),
+    (Problem("payload-too-large", Code.RESOURCE_EXHAUSTED, 413), api.PayloadTooLargeError),
+    (Problem("unauthenticated", Code.UNAUTHENTICATED, 401), api.AccessDeniedError),
+    (Problem("permission-denied", Code.PERMISSION_DENIED, 403), api.AccessDeniedError),
+    (Problem("detector-failed", Code.INTERNAL, 500), api.ServerFailedError),
+    (AWAY, api.ServerUnavailableError),
+    (BUSY, api.OverloadedError),
+    (LOST, api.WorkerLostError),
+    (Problem("harmful-request", Code.INVALID_ARGUMENT, 422), api.InvalidRequestError),
+    (Problem("deadline-exceeded", Code.DEADLINE_EXCEEDED, 504), api.DeadlineError),
+    (Problem("teapot", Code.UNKNOWN, 418), api.ProtocolError),
 ]
 
 
@@ -142,32 +126,32 @@ def test_described_errors_are_the_same_exception(problem, expected, failing, clo
         client.detect(cloud)
     assert type(caught.value) is expected
     assert server.calls == 1
-    if isinstance(caught.value, InvalidRequestError):
+    if isinstance(caught.value, api.InvalidRequestError):
         assert vars(caught.value) == {"field": "f", "value": "v", "fix": "x"}
-    if isinstance(caught.value, OverloadedError):
+    if isinstance(caught.value, api.OverloadedError):
         assert caught.value.retry_after == BUSY.retry_after
 
 
 @pytest.mark.parametrize(
     ("transport", "code", "expected"),
     [
-        ("grpc", Code.UNIMPLEMENTED, ProtocolError),
-        ("grpc", Code.RESOURCE_EXHAUSTED, PayloadTooLargeError),
-        ("grpc", Code.UNAVAILABLE, ServerUnavailableError),
-        ("grpc", Code.DEADLINE_EXCEEDED, DeadlineError),
-        ("grpc", Code.INTERNAL, ServerUnavailableError),
-        ("grpc", Code.UNKNOWN, ServerFailedError),
-        ("rest", 200, ProtocolError),
-        ("rest", 404, ProtocolError),
-        ("rest", 413, PayloadTooLargeError),
-        ("rest", 429, OverloadedError),
-        ("rest", 500, ServerUnavailableError),
-        ("rest", 502, ServerUnavailableError),
+        ("grpc", Code.UNIMPLEMENTED, api.ProtocolError),
+        ("grpc", Code.RESOURCE_EXHAUSTED, api.PayloadTooLargeError),
+        ("grpc", Code.UNAVAILABLE, api.ServerUnavailableError),
+        ("grpc", Code.DEADLINE_EXCEEDED, api.DeadlineError),
+        ("grpc", Code.INTERNAL, api.ServerUnavailableError),
+        ("grpc", Code.UNKNOWN, api.ServerFailedError),
+        ("rest", 200, api.ProtocolError),
+        ("rest", 404, api.ProtocolError),
+        ("rest", 413, api.PayloadTooLargeError),
+        ("rest", 429, api.OverloadedError),
+        ("rest", 500, api.ServerUnavailableError),
+        ("rest", 502, api.ServerUnavailableError),
     ],
 )
 def test_errors_of_proxies_and_other_servers_are_classified(code, expected, failing, cloud) -> None:
     client, _ = failing(itertools.repeat(Problem("", code, code)), retry=False)
-    with pytest.raises(GraspClientError) as caught:
+    with pytest.raises(api.GraspClientError) as caught:
         client.detect(cloud)
     assert type(caught.value) is expected
     assert not client.ready() or code == 200
@@ -177,12 +161,12 @@ def test_answers_of_another_server_and_of_a_busy_proxy(make_client, monkeypatch,
     answers = [httpx.Response(503, headers={"retry-after": "7"})]
     put_in_place_of_http(monkeypatch, lambda request: answers[-1])
     client = make_client("http://elsewhere", timeout=5)
-    with pytest.raises(OverloadedError) as caught:
+    with pytest.raises(api.OverloadedError) as caught:
         client.detect(cloud)
     assert caught.value.retry_after == 7
     for body in ([], {"grasps": [{}]}, {"grasps": [3]}, {"grasps": 3}, {"detail": "Not Found"}):
         answers.append(httpx.Response(200, json=body))
-        with pytest.raises(ProtocolError, match="not the answer of a grasp service"):
+        with pytest.raises(api.ProtocolError, match="not the answer of a grasp service"):
             client.detect(cloud)
 
 
@@ -217,14 +201,14 @@ def test_a_server_that_is_away_or_busy_is_asked_again(problems: Any, failing, cl
 )
 def test_a_call_is_tried_as_often_as_it_can_help(problem, arguments, calls, failing, cloud) -> None:
     client, server = failing(itertools.repeat(problem), **arguments)
-    with pytest.raises(dict(DESCRIBED).get(problem, GraspClientError)):
+    with pytest.raises(dict(DESCRIBED).get(problem, api.GraspClientError)):
         client.detect(cloud)
     assert server.calls == calls
 
 
 def test_requests_of_a_stream_are_sent_once(failing, cloud) -> None:
     client, server = failing([AWAY])
-    with pytest.raises(ServerUnavailableError):
+    with pytest.raises(api.ServerUnavailableError):
         [answer.result() for answer in client.detect_stream([StreamRequest(cloud)])]
     assert server.calls == 1
 
@@ -234,10 +218,10 @@ def test_without_a_server_calls_fail_and_waiting_ends(scheme: str, make_client, 
     address = f"{scheme}127.0.0.1:{free_ports(1)[0]}"
     client = make_client(address)
     for call in (client.models, lambda: client.detect(cloud)):
-        with pytest.raises(ServerUnavailableError, match=f"{address} .*`edgegrasp serve`"):
+        with pytest.raises(api.ServerUnavailableError, match=f"{address} .*`edgegrasp serve`"):
             call()
     assert not client.ready()
-    with pytest.raises(DeadlineError, match=r"not ready within 0\.2 s"):
+    with pytest.raises(api.DeadlineError, match=r"not ready within 0\.2 s"):
         client.wait_until_ready(0.2)
 
 
@@ -245,21 +229,21 @@ def test_a_deadline_ends_a_call_or_one_request_of_a_stream(start_dummy, make_cli
     with start_dummy(seconds=0.5) as server:
         for address in (server.grpc_address, server.http_url):
             client = make_client(address, timeout=0.1)
-            with pytest.raises(DeadlineError):
+            with pytest.raises(api.DeadlineError):
                 client.detect(cloud)
             assert client.detect(cloud, timeout=20).grasps
             requests = [StreamRequest(cloud, timeout=0.1), StreamRequest(cloud)]
             hasty, patient = client.detect_stream(requests, timeout=20.0)
-            assert isinstance(hasty.error, DeadlineError)
+            assert isinstance(hasty.error, api.DeadlineError)
             assert patient.error is None
 
 
 def test_an_address_that_is_none_or_without_tls_is_refused() -> None:
     for address in ("http://[::1", "http://host:port", "http://host:99999"):
-        with pytest.raises(InvalidRequestError, match="address: got "):
+        with pytest.raises(api.InvalidRequestError, match="address: got "):
             GraspClient(address)
     for address in ("http://127.0.0.1:8000", "http+unix:/run/http.sock"):
-        with pytest.raises(InvalidRequestError, match="tls: got a Tls for http"):
+        with pytest.raises(api.InvalidRequestError, match="tls: got a Tls for http"):
             GraspClient(address, tls=Tls(), token="secret")
 
 
@@ -267,11 +251,11 @@ def test_a_closed_client_says_so(client, cloud) -> None:
     begun = client.detect_stream(itertools.repeat(StreamRequest(cloud)))
     next(begun)
     client.close()
-    with pytest.raises(GraspClientError, match="closed"):
+    with pytest.raises(api.GraspClientError, match="closed"):
         all(answer.result() for answer in begun)
     stream = client.detect_stream([StreamRequest(cloud)])
     for call in (client.models, client.ready, client.wait_until_ready, lambda: next(stream)):
-        with pytest.raises(GraspClientError, match="closed"):
+        with pytest.raises(api.GraspClientError, match="closed"):
             call()
     client.close()
 
@@ -284,7 +268,7 @@ def test_a_timeout_may_be_endless_but_is_a_number(client, cloud) -> None:
     assert client.ready(timeout=endless)
     for call in (client.detect, StreamRequest):
         for none in (float("nan"), 0.0, -1.0):
-            with pytest.raises(InvalidRequestError, match=f"timeout: got {none}"):
+            with pytest.raises(api.InvalidRequestError, match=f"timeout: got {none}"):
                 call(cloud, timeout=none)
 
 
@@ -296,7 +280,7 @@ def test_a_proxy_is_not_asked_for_this_machine(dummy_server, transport, monkeypa
 
 @pytest.mark.parametrize("size", [4_200_000, 9_000_000])  # the latter is over what gRPC reads
 def test_a_cloud_that_is_too_large_is_refused(size: int, client) -> None:
-    with pytest.raises(PayloadTooLargeError):
+    with pytest.raises(api.PayloadTooLargeError):
         client.detect(np.zeros((size, 3), np.float32))
     assert client.ready()
 
@@ -312,5 +296,5 @@ def test_a_rest_answer_that_trickles_in_does_not_outlast_the_timeout() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening, ThreadPoolExecutor() as pool:
         pool.submit(trickle, listening)
         address = f"http://127.0.0.1:{listening.getsockname()[1]}"
-        with GraspClient(address, timeout=1.0) as client, pytest.raises(DeadlineError):
+        with GraspClient(address, timeout=1.0) as client, pytest.raises(api.DeadlineError):
             client.models()

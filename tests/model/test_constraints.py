@@ -368,33 +368,22 @@ def plane(moved: RigidTransform, normal: list[float], offset: float) -> dict[str
 
 def constraints(moved: RigidTransform) -> dict[str, object]:
     """Every kind of constraint that is not bound to the frame's axes."""
-    box = {
-        "kind": "oriented_box",
-        "center": moved.apply([0.0, 0.0, 0.05]).tolist(),
-        "half_extents": [0.05, 0.05, 0.045],
-        "quaternion": moved.rotation.as_quat().tolist(),
-    }
+    box = {"kind": "oriented_box", "center": moved.apply([0.0, 0.0, 0.05]).tolist()}
+    box |= {"half_extents": [0.05] * 2 + [0.045], "quaternion": moved.rotation.as_quat().tolist()}
     hole = {"kind": "sphere", "center": moved.apply([0.02, 0.0, 0.08]).tolist(), "radius": 0.01}
     far = {"kind": "half_space", **plane(moved, [0.0, 1.0, 0.0], -0.02)}
     aside = moved.apply([-0.2, 0.0, 0.1]).tolist()
     wall = {**box, "center": aside, "half_extents": [0.02, 0.2, 0.1]}
-    down = moved.rotation.apply([-0.2, 0.1, -1.0]).tolist()
+    down = {"direction": moved.rotation.apply([-0.2, 0.1, -1.0]).tolist(), "max_angle": 0.9}
+    lift = {"retreat_length": 0.06, "retreat_direction": "up"}
     return {
         "viewpoint": moved.apply(VIEW).tolist(),
         "up": moved.rotation.apply([0.0, 0.0, 2.0]).tolist(),
         "support": plane(moved, [0.0, 0.0, 1.0], 0.0),
         "approach_region": {"include": [box], "exclude": [hole]},
         "contact_region": {"include": [far]},
-        "approach_direction": {
-            "cones": [{"direction": down, "max_angle": 0.9}],
-            "preset": "top-down",
-        },
-        "collision": {
-            "obstacles": [wall],
-            "margin": 0.001,
-            "retreat_length": 0.06,
-            "retreat_direction": "up",
-        },
+        "approach_direction": {"cones": [down], "preset": "top-down"},
+        "collision": {"obstacles": [wall], "margin": 0.001, **lift},
         "num_approach_points": 16,
     }
 

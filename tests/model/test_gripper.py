@@ -8,39 +8,27 @@ import pytest
 from tests.checks import refusal
 from tests.many_options import OWN_GRIPPER
 
-from edgegrasp_model.candidates.edge_grasps import (
-    CLOSING_ALLOWANCE,
-    FIT_MARGIN,
-    MAX_INSERTION,
-    support_clearance,
-)
+from edgegrasp_model import gripper as grippers
+from edgegrasp_model.candidates import edge_grasps as edges
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.errors import InvalidGripper
-from edgegrasp_model.gripper import (
-    GRIPPER_FOLDER,
-    Gripper,
-    choose_gripper,
-    gripper_from_fields,
-    gripper_names,
-    load_gripper,
-)
 from edgegrasp_model.options import DetectOptions, GripperGeometry, SupportPlane
 
 from .scenes import PANDA, VIEW, box_on_table, detector
 
-PANDA_FILE = (GRIPPER_FOLDER / "panda.toml").read_text()
-GRIPPERS = [load_gripper(name) for name in gripper_names()]
+PANDA_FILE = (grippers.GRIPPER_FOLDER / "panda.toml").read_text()
+GRIPPERS = [grippers.load_gripper(name) for name in grippers.gripper_names()]
 by_name = pytest.mark.parametrize("gripper", GRIPPERS, ids=lambda gripper: gripper.name)
 
 
 @by_name
-def test_a_gripper_stays_clear_of_the_support_as_it_closes(gripper: Gripper) -> None:
+def test_a_gripper_stays_clear_of_the_support_as_it_closes(gripper: grippers.Gripper) -> None:
     down = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)[None]
     down[0, 2, 3] = 0.5
     floor = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.0)
     for opening in (0.0, 0.03, 0.06, 0.085):
-        clearance = support_clearance(down, np.float32([opening]), floor, gripper)[0]
-        closed = np.linspace(max(opening - CLOSING_ALLOWANCE, 0.0), gripper.max_opening, 80)
+        clearance = edges.support_clearance(down, np.float32([opening]), floor, gripper)[0]
+        closed = np.linspace(max(opening - edges.CLOSING_ALLOWANCE, 0.0), gripper.max_opening, 80)
         lowest = min(0.5 - gripper.boxes(w)[:, 1, 2].max() for w in closed)
         assert clearance == pytest.approx(lowest, abs=2e-5)
 
@@ -87,32 +75,33 @@ def test_contradictory_fields_of_a_gripper_are_refused_by_name(path, value, mess
     if value is None:
         del part[path[-1]]
     with pytest.raises(InvalidGripper, match=message):
-        gripper_from_fields(fields)
+        grippers.gripper_from_fields(fields)
 
 
 def test_a_file_and_a_request_make_the_same_gripper_and_a_broken_file_is_refused(tmp_path) -> None:
-    assert gripper_from_fields(GripperGeometry.model_validate(tomllib.loads(PANDA_FILE))) == PANDA
+    asked = GripperGeometry.model_validate(tomllib.loads(PANDA_FILE))
+    assert grippers.gripper_from_fields(asked) == PANDA
     path = tmp_path / "mine.toml"
     path.write_text(PANDA_FILE)
-    assert load_gripper(path) == PANDA
+    assert grippers.load_gripper(path) == PANDA
     for old, new, message in (
         ("max_opening = 0.08", "", "mine.toml: gripper.max_opening"),
         ("[hand]", "[hand", "mine.toml"),
     ):
         path.write_text(PANDA_FILE.replace(old, new))
         with pytest.raises(InvalidGripper, match=message):
-            load_gripper(path)
+            grippers.load_gripper(path)
     with pytest.raises(InvalidGripper, match="'panda', 'robotiq-2f-140'"):
-        load_gripper("claw")
+        grippers.load_gripper("claw")
 
 
 def choose(own: dict[str, object] | None = None, **fields: object) -> object:
-    return choose_gripper(DetectOptions.model_validate(fields), PANDA, own or {})
+    return grippers.choose_gripper(DetectOptions.model_validate(fields), PANDA, own or {})
 
 
 def test_a_gripper_is_chosen_by_nothing_a_known_name_or_fields() -> None:
     assert choose() is PANDA
-    mine = load_gripper("wsg-50")
+    mine = grippers.load_gripper("wsg-50")
     assert choose(gripper="wsg-50") == mine
     assert choose({"panda": mine}, gripper="panda") is mine
     custom = choose(gripper=OWN_GRIPPER)
@@ -127,7 +116,7 @@ def test_a_gripper_is_chosen_by_nothing_a_known_name_or_fields() -> None:
 
 
 @by_name
-def test_grasps_fit_the_gripper_that_was_asked_for(gripper: Gripper) -> None:
+def test_grasps_fit_the_gripper_that_was_asked_for(gripper: grippers.Gripper) -> None:
     whole = {"viewpoint": VIEW, "support": None, "suppression": None}
     options = DetectOptions(gripper=gripper.name, num_approach_points=12, **whole)
     found = detector().detect(box_on_table(), options)
@@ -137,8 +126,8 @@ def test_grasps_fit_the_gripper_that_was_asked_for(gripper: Gripper) -> None:
         np.testing.assert_allclose(T_hand_tcp, gripper.T_hand_tcp, atol=1e-5)
         contact = (grasp.contact_point - grasp.T_cloud_hand[:3, 3]) @ grasp.T_cloud_hand[:3, :3]
         further_in = gripper.contact_z_at(2 * abs(contact[1])) - contact[2]
-        shallowest = gripper.contact_z - gripper.tip_z + FIT_MARGIN
-        assert shallowest - 1e-3 < further_in < MAX_INSERTION + 2e-3
+        shallowest = gripper.contact_z - gripper.tip_z + edges.FIT_MARGIN
+        assert shallowest - 1e-3 < further_in < edges.MAX_INSERTION + 2e-3
         assert grasp.width <= np.float32(gripper.max_opening)
     warned = any("trained for the gripper 'panda'" in warning for warning in found.warnings)
     assert warned == (gripper.name != "panda")

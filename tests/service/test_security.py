@@ -12,13 +12,8 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_client import (
-    AccessDeniedError,
-    AsyncGraspClient,
-    ServerUnavailableError,
-    StreamRequest,
-    Tls,
-)
+from edgegrasp_client import AsyncGraspClient, StreamRequest, Tls
+from edgegrasp_client.errors import AccessDeniedError, ServerUnavailableError
 from edgegrasp_service.errors import InvalidSettings, ReloadFailed
 from edgegrasp_service.probe import is_ready, read_settings
 from edgegrasp_service.security import ServerTls, Tokens

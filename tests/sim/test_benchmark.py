@@ -15,29 +15,14 @@ import numpy as np
 import pytest
 from examples.your_planner import plan
 
+from edgegrasp_sim import results, trial
 from edgegrasp_sim.benchmark import BenchmarkConfig, RoundRunner, manifest, run_benchmark
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.hand import FailureCause, GraspResult
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.protocol import FOLDER, Protocol, load_protocol, protocol_from, protocol_names
-from edgegrasp_sim.results import (
-    ResultFolder,
-    attempts_digest,
-    below_gate,
-    compare,
-    summarise,
-    wilson,
-)
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.trial import (
-    Attempt,
-    PlannedGrasp,
-    Planner,
-    Round,
-    RoundDriver,
-    RoundEnd,
-    StartCollides,
-)
+from edgegrasp_sim.trial import PlannedGrasp, Planner, Round, RoundDriver, RoundEnd
 from edgegrasp_sim.workers import run_tasks
 
 
@@ -71,7 +56,7 @@ class Planner:
 
 def run_in(path: Path, config: BenchmarkConfig, planner=make_planner, **limits) -> list[Round]:
     """The rounds of a benchmark that runs, or goes on, in a folder."""
-    folder = ResultFolder(path)
+    folder = results.ResultFolder(path)
     folder.open(manifest(config, {"name": "top-down"}))
     list(run_benchmark(config, planner, folder, **limits))
     return folder.rounds()
@@ -82,7 +67,7 @@ def alone(tmp_path_factory) -> tuple[BenchmarkConfig, str]:
     config = BenchmarkConfig(SceneKind.PACKED, 2, (0, 3), TWO_OBJECTS)
     rounds = run_in(tmp_path_factory.mktemp("alone"), config)
     assert [(done.seed, done.index) for done in rounds] == [(0, 0), (0, 1), (3, 0), (3, 1)]
-    return config, attempts_digest(rounds)
+    return config, results.attempts_digest(rounds)
 
 
 def test_rounds_of_a_crashed_worker_are_run_again_and_workers_change_nothing(
@@ -95,7 +80,7 @@ def test_rounds_of_a_crashed_worker_are_run_again_and_workers_change_nothing(
     rounds = run_in(tmp_path / "rounds", config, planner, workers=2)
     assert (tmp_path / "dies_once.died").exists()
     assert (tmp_path / "dies_once.closed").exists()
-    assert attempts_digest(rounds) == digest
+    assert results.attempts_digest(rounds) == digest
     made = run_tasks(partial(partial, time.sleep), (0, 600), workers=2)
     assert next(made) == (0, None)
     made.close()  # which does not wait for the other
@@ -133,7 +118,7 @@ def test_wrong_settings_are_refused(tmp_path: Path) -> None:
 
 def test_a_killed_run_goes_on_and_changes_nothing(alone, tmp_path) -> None:
     config, digest = alone
-    folder = ResultFolder(tmp_path)
+    folder = results.ResultFolder(tmp_path)
     process = multiprocessing.get_context("spawn").Process(target=run_in, args=(tmp_path, config))
     process.start()
     while not list(folder.path.glob("rounds/*.json")):
@@ -144,7 +129,7 @@ def test_a_killed_run_goes_on_and_changes_nothing(alone, tmp_path) -> None:
     kept = len(folder.rounds())
     assert 1 <= kept <= 4
     assert len(list(run_benchmark(config, make_planner, folder))) == 4 - kept
-    assert attempts_digest(folder.rounds()) == digest
+    assert results.attempts_digest(folder.rounds()) == digest
     with pytest.raises(ValueError, match="different planner"):
         folder.open(manifest(config, {"name": "other"}))
 
@@ -258,9 +243,9 @@ def test_a_touch_is_of_something_seen_next_to_a_point_that_was_seen(simulation, 
 
 
 def test_an_arm_that_cannot_start_in_a_view_takes_another_one(simulation) -> None:
-    done = run(simulation, Mock(side_effect=StartCollides), PACKED, 2)
+    done = run(simulation, Mock(side_effect=trial.StartCollides), PACKED, 2)
     assert (done.end, done.no_grasp, done.start_collisions) == (RoundEnd.NO_GRASP, 3, 3)
-    failures = summarise([done])["failures"]
+    failures = results.summarise([done])["failures"]
     assert (failures["start in collision"], failures["no candidate"]) == (3, 0)
 
 
@@ -275,7 +260,7 @@ def test_scenes_and_views_do_not_depend_on_the_planner(engine, simulation) -> No
 
 
 OF_A_MUG = "mug", "mug", False, 0.5, 0.04, 0.03, False, 0, 1000, 0.25
-HELD = Attempt(None, *OF_A_MUG, [[0.0] * 4] * 4)
+HELD = trial.Attempt(None, *OF_A_MUG, [[0.0] * 4] * 4)
 MISSED = replace(HELD, cause=FailureCause.MISSED, object=None, planning_seconds=0.35)
 WRONG = replace(HELD, object="cube", wrong_object=True, start_contact=True)
 ROUNDS = [
@@ -286,7 +271,7 @@ ROUNDS = [
 
 
 def test_figures_count_as_the_reference_does() -> None:
-    summary = summarise(ROUNDS)
+    summary = results.summarise(ROUNDS)
     assert (summary["successes"], summary["attempts"], summary["objects"]) == (3, 6, 8)
     gsr, dr = summary["grasp_success_rate"], summary["declutter_rate"]
     assert gsr["value"] == pytest.approx(0.5)
@@ -308,25 +293,25 @@ def test_figures_count_as_the_reference_does() -> None:
 def test_an_arm_s_figures_are_those_of_its_motions() -> None:
     held = replace(HELD, motion_seconds=3.75)
     missed = replace(held, object=None, cause=FailureCause.MISSED, touched_on_the_way=True)
-    assert summarise([replace(ROUNDS[0], attempts=(held, missed))])["arm"] == {
+    assert results.summarise([replace(ROUNDS[0], attempts=(held, missed))])["arm"] == {
         "picks_per_hour": pytest.approx(3600 / 8.0),
         "motion_seconds": 3.75,
         "touched_on_the_way": 1,
         "touched_seen": 0,
         "scenes_with_a_reachable_grasp": 1,
     }
-    assert summarise(ROUNDS)["arm"] is None
+    assert results.summarise(ROUNDS)["arm"] is None
 
 
 def test_times_do_not_change_the_digest_and_outcomes_do() -> None:
     slower = replace(ROUNDS[1], attempts=(replace(HELD, planning_seconds=9.0),))
-    assert attempts_digest([slower, ROUNDS[0]]) == attempts_digest(ROUNDS)
+    assert results.attempts_digest([slower, ROUNDS[0]]) == results.attempts_digest(ROUNDS)
     failed = replace(ROUNDS[1], attempts=(MISSED,))
-    assert attempts_digest([ROUNDS[0], failed]) != attempts_digest(ROUNDS)
+    assert results.attempts_digest([ROUNDS[0], failed]) != results.attempts_digest(ROUNDS)
 
 
 def test_the_folder_holds_a_row_for_every_attempt(tmp_path: Path) -> None:
-    folder = ResultFolder(tmp_path / "new")
+    folder = results.ResultFolder(tmp_path / "new")
     with pytest.raises(FileNotFoundError, match="contains no benchmark"):
         folder.rounds()
     protocol = {"name": "edgegrasp", "version": 1}
@@ -347,7 +332,7 @@ def test_the_folder_holds_a_row_for_every_attempt(tmp_path: Path) -> None:
 def test_results_of_two_engines_are_kept_apart(tmp_path: Path) -> None:
     run = {"scene": "pile", "protocol": {"name": "edgegrasp", "version": 2}, "planner": {}}
     run |= {"objects": {}, "constants": {}}
-    folders = ResultFolder(tmp_path / "before"), ResultFolder(tmp_path / "after")
+    folders = results.ResultFolder(tmp_path / "before"), results.ResultFolder(tmp_path / "after")
     amount = {"seeds": [0, 1], "rounds": 2}
     before, after = ({"run": run | {"engine": name}, **amount} for name in ("pybullet", "mujoco"))
     for folder, facts in zip(folders, (before, after), strict=True):
@@ -362,15 +347,15 @@ def test_results_of_two_engines_are_kept_apart(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=f"different {name}"):
             folders[0].open(other)
     with pytest.raises(ValueError, match=r"differ in engine"):
-        compare(*folders)
+        results.compare(*folders)
     with pytest.raises(ValueError, match="engine 'pybullet', not 'mujoco'"):
-        below_gate(folders[1].finish(), gate_file(tmp_path))
+        results.below_gate(folders[1].finish(), gate_file(tmp_path))
 
 
 def gate_file(path: Path) -> Path:
     """Nine of ten grasps hold."""
     file = path / "gate.json"
-    file.write_text(json.dumps(summary_with({"value": 0.9, "wilson_95": wilson(90, 100)})))
+    file.write_text(json.dumps(summary_with({"value": 0.9, "wilson_95": results.wilson(90, 100)})))
     return file
 
 
@@ -381,12 +366,12 @@ def summary_with(rate: dict[str, object]) -> dict[str, object]:
 
 def test_the_gate_lets_chance_pass_and_stops_a_fall(tmp_path: Path) -> None:
     gate = gate_file(tmp_path)
-    assert below_gate(summary_with({"value": 0.85}), gate) == []
-    below = below_gate(summary_with({"value": 0.80}), gate)
+    assert results.below_gate(summary_with({"value": 0.85}), gate) == []
+    below = results.below_gate(summary_with({"value": 0.80}), gate)
     assert [text.split()[0] for text in below] == ["GSR", "DR"]
-    assert below_gate(summary_with({"value": None}), gate)
+    assert results.below_gate(summary_with({"value": None}), gate)
     with pytest.raises(ValueError, match="scene 'pile', not 'packed'"):
-        below_gate(summary_with({"value": 0.9}) | {"scene": "packed"}, gate)
+        results.below_gate(summary_with({"value": 0.9}) | {"scene": "packed"}, gate)
     gate.write_text("{}")
     with pytest.raises(ValueError, match=r"not a summary\.json"):
-        below_gate(summary_with({"value": 0.9}), gate)
+        results.below_gate(summary_with({"value": 0.9}), gate)

@@ -14,18 +14,11 @@ from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.scene.scene import Surroundings, near_workspace_side
 from edgegrasp_sim.objects import CLUTTER, ObjectSet
+from edgegrasp_training import views
 from edgegrasp_training.evaluation import evaluate_scores, reliability, score_views
 from edgegrasp_training.examples import pack_balls, pack_hands, tried_grasps
 from edgegrasp_training.recipes import LENGTH_UNIT, build_network
-from edgegrasp_training.views import (
-    TABLE,
-    UP,
-    WORKSPACE,
-    find_views,
-    load_view,
-    scene_of,
-    split_by_scene,
-)
+from edgegrasp_training.views import TABLE, UP, WORKSPACE, scene_of
 
 from .conftest import NETWORKS, SAMPLE, made_up_view
 
@@ -33,7 +26,7 @@ from .conftest import NETWORKS, SAMPLE, made_up_view
 def test_a_view_comes_back_with_the_hand_that_tried_its_grasps_other_files_do_not(tmp_path) -> None:
     file, view = tmp_path / "pile_1-000001_0.npz", made_up_view(0)
     view.save(file)
-    read = load_view(file)
+    read = views.load_view(file)
     np.testing.assert_array_equal(read.points, view.points)
     np.testing.assert_allclose(read.normals, view.normals, atol=1e-3)
     np.testing.assert_array_equal(read.success, view.success)
@@ -41,30 +34,30 @@ def test_a_view_comes_back_with_the_hand_that_tried_its_grasps_other_files_do_no
     hands = np.arange(len(view.success) * 16, dtype=np.float32).reshape(-1, 4, 4)
     tried = replace(view, T_world_hand=hands, gripper=json.dumps(gripper_fields("robotiq-2f-140")))
     tried.save(file)
-    np.testing.assert_array_equal(load_view(file).T_world_hand, hands)
-    assert load_view(file).hand == load_gripper("robotiq-2f-140")
+    np.testing.assert_array_equal(views.load_view(file).T_world_hand, hands)
+    assert views.load_view(file).hand == load_gripper("robotiq-2f-140")
     np.savez(file, depth=np.zeros(3))
     for content in (file.read_bytes(), file.read_bytes()[:99]):
         file.write_bytes(content)
         with pytest.raises(ValueError, match="is not a view"):
-            load_view(file)
+            views.load_view(file)
 
 
 def test_scenes_never_fall_on_both_sides_and_keep_theirs_as_data_grows() -> None:
     paths = [Path(f"pile_{scene}_{view}.npz") for scene in range(200) for view in range(2)]
-    train, validation = split_by_scene(paths, 0.2, seed=0)
+    train, validation = views.split_by_scene(paths, 0.2, seed=0)
     assert {scene_of(path) for path in train}.isdisjoint(map(scene_of, validation))
     assert len(train) + len(validation) == len(paths)
     assert 0.1 < len(validation) / len(paths) < 0.3
-    _, fewer = split_by_scene(paths[:100], 0.2, seed=0)
+    _, fewer = views.split_by_scene(paths[:100], 0.2, seed=0)
     assert set(fewer) <= set(validation)
-    _, others = split_by_scene(paths, 0.2, seed=1)
+    _, others = views.split_by_scene(paths, 0.2, seed=1)
     assert set(others) != set(validation)
 
 
 def test_every_view_says_which_objects_it_shows() -> None:
-    for path in find_views([SAMPLE]):
-        view = load_view(path)
+    for path in views.find_views([SAMPLE]):
+        view = views.load_view(path)
         assert len(view.objects) == len(view.object_digests) > 0
         assert (view.firm <= view.success).all()
 
@@ -77,8 +70,8 @@ def test_no_test_object_is_in_a_training_view_or_the_data_of_the_shipped_weights
     names, digests = {model.name for model in kept_apart}, {model.digest for model in kept_apart}
     # A generator's own folder, where there is one, is held to the same.
     generated = [path for path in (SAMPLE.parents[1] / "data").glob("*") if any(path.glob("*.npz"))]
-    for path in find_views([SAMPLE, *generated]):
-        view = load_view(path)
+    for path in views.find_views([SAMPLE, *generated]):
+        view = views.load_view(path)
         assert not names & set(view.objects), path
         assert not digests & set(view.object_digests), path
     with (SAMPLE.parents[1] / "docs" / "training_objects.csv").open(newline="") as opened:
