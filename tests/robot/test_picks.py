@@ -15,7 +15,7 @@ from tests.robot.arms import BOXES, HALF, TURNED, grid, picks_of, scene_of, surf
 
 from edgegrasp_model.gripper import HALF_TURN
 from edgegrasp_model.options import parse_options
-from edgegrasp_model.scene.cloud import CanonicalFrame
+from edgegrasp_model.scene.cloud import CanonicalFrame, pose_matrix
 from edgegrasp_results import Tracking
 from edgegrasp_robot import load_robot
 from edgegrasp_robot.surroundings import _near_robot, surrounded
@@ -142,18 +142,29 @@ def test_searches_without_a_path_end(fr3, monkeypatch):
     assert sum(searched) < 0.11
 
 
+def voxels_around(fr3, shift=0.0, raised=0.0, more=()):
+    """Voxels that the arm avoids; metres by which the scene's origin and the table are moved."""
+    scene, cloud, _ = scene_of(fr3, more=more)
+    T, T_base_cloud = scene.frame.T_canonical_cloud.copy(), TURNED.copy()
+    T[:2, 3] += shift
+    T_base_cloud[2, 3] += raised
+    asked = {"name": "fr3", "T_base_cloud": T_base_cloud.tolist(), "joints": fr3.home.tolist()}
+    robot = parse_options({"robot": asked}).robot
+    with surrounded(fr3, replace(scene, frame=CanonicalFrame(T)), cloud, robot, []) as around:
+        return around.voxels
+
+
 def test_which_part_of_the_cloud_was_selected_changes_no_voxel(fr3):
-    scene, cloud, _ = scene_of(fr3)
-    asked = {"name": "fr3", "T_base_cloud": TURNED.tolist(), "joints": fr3.home.tolist()}
-    voxels = []
-    for shift in (0.0, 0.004):  # of the origin, the mean of what was selected
-        T = scene.frame.T_canonical_cloud.copy()
-        T[:2, 3] += shift
-        part = replace(scene, frame=CanonicalFrame(T))
-        robot = parse_options({"robot": asked}).robot
-        with surrounded(fr3, part, cloud, robot, []) as around:
-            voxels.append(around.voxels)
-    np.testing.assert_allclose(*voxels, atol=1e-9)
+    # The origin is the mean of what was selected.
+    np.testing.assert_allclose(voxels_around(fr3), voxels_around(fr3, shift=0.004), atol=1e-9)
+
+
+@pytest.mark.parametrize(("raised", "seen"), [(0.0, False), (0.3, True)])
+def test_what_is_below_the_table_is_in_the_way_of_an_arm_that_stands_lower(fr3, raised, seen):
+    leg, wall = grid([0.605], [0.005], [-0.2]), grid([2.5], [0.0], [0.5])  # out of reach
+    voxels = voxels_around(fr3, raised=raised, more=[leg, wall])
+    assert (voxels[:, 2] < raised - 0.1).any() == seen
+    assert voxels[:, 0].max() < 1.0
 
 
 def test_what_is_out_of_reach_is_counted_and_comes_last(fr3):
@@ -161,10 +172,11 @@ def test_what_is_out_of_reach_is_counted_and_comes_last(fr3):
     assert detection.counts["out_of_reach"] == 1
     assert [grasp.arm.reachable for grasp in detection.grasps] == [True, False]
     assert detection.grasps[0].object == 1  # of a lower score
+    assert [one.best_score for one in detection.objects] == pytest.approx([0.9, 0.8])
 
 
 def test_a_lid_over_an_object_and_a_hand_that_touches_something_are_collisions(fr3):
-    lid = {"kind": "box", "min": (0.4, -0.1, 0.2), "max": (0.6, 0.1, 0.22)}
+    lid = {"kind": "box", "min": (0.4, -1.0, 0.2), "max": (0.6, 0.1, 0.22)}
     under = {"collision": {"obstacles": [lid]}}
     detection = picks_of(fr3, np.eye(4), boxes=BOXES[:1], options=under)
     assert detection.counts["arm_collision"] == 1
@@ -263,19 +275,14 @@ def test_no_time_gives_no_motion_and_says_so(fr3, monkeypatch):
 
 def test_a_hand_that_is_the_same_turned_comes_the_nearer_way(robot):
     def turned(scene, detection):
-        grasps = [
-            replace(
-                one,
-                T_cloud_hand=one.T_cloud_hand * HALF_TURN,
-                T_cloud_tcp=one.T_cloud_tcp * HALF_TURN,
-            )
-            for one in detection.grasps
-        ]
+        poses = ((one, one.T_cloud_hand * HALF_TURN) for one in detection.grasps)
+        grasps = [replace(one, T_cloud_hand=pose, T_cloud_tcp=pose) for one, pose in poses]
         return scene, replace(detection, grasps=grasps)
 
     (grasp, plan), *_ = plans_of(picks_of(robot))
     (other, same), *_ = plans_of(picks_of(robot, changed=turned))
-    np.testing.assert_allclose(other.T_cloud_hand, grasp.T_cloud_hand, atol=1e-6)
+    for name in ("T_cloud_hand", "T_cloud_tcp"):
+        np.testing.assert_allclose(getattr(other, name), getattr(grasp, name), atol=1e-6)
     np.testing.assert_array_equal(same.grasp_joints, plan.grasp_joints)
 
 
@@ -358,17 +365,21 @@ def test_obstacles_of_the_request_are_not_put_into_either(fr3):
 
 def test_joints_may_be_a_hair_beyond_a_limit(fr3):
     joints = np.where(np.arange(7) == 3, fr3.upper + 1e-4, fr3.home)
+    joints[0] = fr3.lower[0] - 1e-4
     (_, plan), *_ = plans_of(picks_of(fr3, joints=joints))
     np.testing.assert_allclose(plan.trajectory.positions[0], joints, atol=1e-3)
 
 
+def put_at(z):
+    """A place that an upright object's middle is put at, in the tray."""
+    return {"T_base_object": pose_matrix(np.eye(3), (0.4, -0.35, z)).tolist()}
+
+
 def test_an_object_is_put_in_a_pose(fr3):
-    pose = np.eye(4)
-    pose[:3, 3] = 0.4, -0.35, 0.08
-    place = {"T_base_object": pose.tolist()}
+    place = put_at(0.08)
     ((grasp, plan),) = plans_of(picks_of(fr3, boxes=BOXES[:1], place=place, plan="reach"))
     middle = (placed(grasp, plan).min(axis=0) + placed(grasp, plan).max(axis=0)) / 2
-    np.testing.assert_allclose(middle, pose[:3, 3], atol=0.002)
+    np.testing.assert_allclose(middle, (0.4, -0.35, 0.08), atol=0.002)
     assert plan.trajectory is None
 
 
@@ -378,10 +389,26 @@ def test_an_object_is_not_pressed_into_the_support(fr3, below, lowest):
     found = picks_of(fr3, boxes=BOXES[:1], place={"region": region}, plan="reach")
     points = [placed(grasp, plan)[:, 2].min() for grasp, plan in plans_of(found)]
     assert points == ([] if lowest is None else [pytest.approx(lowest, abs=0.004)])
-    pose = np.eye(4)
-    pose[:3, 3] = 0.4, -0.35, BOXES[0][2] - below  # given to the millimetre: it stays there
-    pressed = picks_of(fr3, boxes=BOXES[:1], place={"T_base_object": pose.tolist()}, plan="reach")
+    there = put_at(BOXES[0][2] - below)  # given to the millimetre: it stays there
+    pressed = picks_of(fr3, boxes=BOXES[:1], place=there, plan="reach")
     assert pressed.counts["no_place"] == 1
+
+
+def test_a_foot_that_no_camera_saw_is_not_pressed_into_the_support(fr3):
+    def from_above(scene, detection):
+        (one,), up = detection.objects, TURNED[2, :3]
+        high = scene.points_in_cloud @ up + TURNED[2, 3] > 0.02
+        half = one.half_extents - np.float32([0.0, 0.0, 0.01])
+        seen = replace(one, center=one.center + 0.01 * up, half_extents=half)
+        parts = {"points_in_cloud": scene.points_in_cloud[high]}
+        parts["object_of_point"] = scene.object_of_point[high]
+        return replace(scene, **parts), replace(detection, objects=[seen])
+
+    asked = {"place": {"region": TRAY}, "plan": "reach", "changed": from_above}
+    ((grasp, plan),) = plans_of(picks_of(fr3, boxes=BOXES[:1], **asked))
+    assert placed(grasp, plan)[:, 2].min() > -0.002
+    asked["place"] = put_at(0.04)  # where what was seen of it would stand
+    assert picks_of(fr3, boxes=BOXES[:1], **asked).counts["no_place"] == 1
 
 
 def test_an_arm_may_stand_lower_than_the_table(fr3):

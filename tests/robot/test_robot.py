@@ -65,7 +65,7 @@ def test_a_file_that_is_wrong_says_how(tmp_path, lines, word):
 URDF = """<robot name="r"><link name="base"/><link name="tip"><collision><geometry>
     <mesh filename="tip.obj"/></geometry></collision></link>
     <joint name="turn" type="revolute"><parent link="base"/><child link="tip"/>
-    <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+    <axis xyz="0 0 2"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
     <link name="flange"/><joint name="end" type="fixed"><parent link="tip"/>
     <child link="flange"/></joint></robot>"""
 ARM = {
@@ -79,7 +79,8 @@ def test_meshes_lie_beside_their_urdf_and_one_that_is_wrong_says_how(tmp_path, m
     (tmp_path / "arm" / "r.urdf").write_text(URDF)
     (tmp_path / "arm" / "tip.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n")
     monkeypatch.chdir(changed(tmp_path, **ARM).parent)
-    assert load_robot("mine.toml").joint_names == ["turn"]
+    mine = load_robot("mine.toml")
+    assert (mine.joint_names, mine.describe()["axes"]) == (["turn"], [0.0, 0.0, 1.0])
     for known, now, said in (
         ("tip.obj", "package://lost/a.stl", r"mesh of tip: there is no 'package://lost/a\.stl'"),
         ('<parent link="tip"/>', "", "joint end has no parent"),
@@ -87,7 +88,7 @@ def test_meshes_lie_beside_their_urdf_and_one_that_is_wrong_says_how(tmp_path, m
         ('lower="-1" upper="1"', "", "joint turn: got limits none and none"),
         ('lower="-1" upper="1"', 'lower="-180" upper="180"', "got limits -180 and 180.*radians"),
         ("<axis", '<mimic joint="other"/><axis', "joint turn follows another one"),
-        ('xyz="0 0 1"', 'xyz="0 0 0"', "joint turn: got axis 0 0 0"),
+        ('xyz="0 0 2"', 'xyz="0 0 0"', "joint turn: got axis 0 0 0"),
         ('"revolute"', '"planar"', "joint turn is planar"),
         ('<mesh filename="tip.obj"/>', '<box size="-1 1 1"/>', "a <collision> of tip is wrong"),
         ("<link", "<<link", "urdf: r.urdf is not XML"),
