@@ -150,6 +150,12 @@ BAD_FILES = [  # and what is said of their value, and of what to send
         )
     ),
     ("pcd", pcd(POINTS).replace(b"VIEWPOINT 0", b"VIEWPOINT nan"), "", ""),
+    (
+        "pcd",
+        pcd(POINTS).replace(b"VIEWPOINT 0 0 0 1 0 0 0", b"VIEWPOINT 1 2"),
+        "VIEWPOINT 1.0 2.0",
+        "",
+    ),
     ("xyz", b"", "no line of numbers", ""),
     ("xyz", b"# only\n", "no line of numbers", ""),
     ("xyz", b"0 0 0\n0 0\n", "from 3 to 2 at row 2", ""),

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from edgegrasp_camera.clouds import CloudInput
-from edgegrasp_camera.picture import Picture, View, draw_detection
+from edgegrasp_camera.picture import Picture, View, draw_detection, fork
 
 
 def pixels(written: io.BytesIO) -> np.ndarray:
@@ -24,6 +24,15 @@ def test_an_image_whose_points_lie_in_a_line_has_no_camera() -> None:
     line = np.ones((24, 32, 3)) * (0.0, 1.0, 1.0)
     line[..., 1] *= np.arange(24)[:, None] / 30
     assert View.of_image(line) is None
+
+
+def test_a_camera_straight_above_a_cloud_sees_it() -> None:
+    view = View.of(np.zeros((9, 3)), (0.0, 0.0, 1.0))
+    np.testing.assert_allclose(view.project((0.0, 0.0, 0.0))[0], (view.cx, view.cy))
+
+
+def test_the_stem_of_a_fork_ends_at_its_palm() -> None:
+    assert fork(np.eye(4), 0.08, (0.06, 0.11))[0, :, 2].max() == 0.06
 
 
 @pytest.mark.parametrize("behind", [False, True])

@@ -178,6 +178,7 @@ OPTIONS: list[tuple[dict[str, Any], str]] = [
         (image(depth=np.zeros((3, 4), int)), "depth_images.0.depth", ""),
         ({"cloud": "depth.png"}, "cloud", "'depth.png'"),
         ({"cloud": np.zeros((48, 64, 1), np.float32)}, "cloud", "shape (48, 64, 1)"),
+        (image(depth=np.full((20, 30), -0.5)), "depth_images.0.depth", "-0.5 m"),
         (image(depth="absent.png"), "depth_images.0.depth", "absent.png"),
         (image(depth="depth.tif"), "depth_images.0.depth", "depth.tif (neither .png nor .npy)"),
         (image(intrinsics={"fx": 1.0}), "depth_images.0.intrinsics", ""),

@@ -13,16 +13,8 @@ from tests.checks import bounded_memory, refusal
 from tests.cloud_files import depth_image, npz, point_cloud2, ros_message
 
 from edgegrasp_camera.clouds import CloudInput, read_point_cloud2
+from edgegrasp_model import request_cloud as wire
 from edgegrasp_model.options import DetectOptions, Indices, Mask, Region, Segments
-from edgegrasp_model.request_cloud import (
-    File,
-    PointCloud2,
-    decode_array,
-    decode_cloud,
-    decode_points,
-    parse,
-    read_depth_images,
-)
 from edgegrasp_model.scene.cloud import (
     CheckedCloud,
     assumed_viewpoint,
@@ -86,6 +78,7 @@ def test_metres_taken_for_millimetres_get_a_warning() -> None:
         (CloudInput(GOOD, segment_ids=np.zeros(11, int)), "segment_ids", "shape (11,)"),
         (CloudInput(GOOD, segment_ids=np.zeros(12)), "segment_ids", "dtype float64"),
         (CloudInput(GOOD, segment_ids=np.full(12, 2**40)), "segment_ids", "1099511627776"),
+        (CloudInput(GOOD, view_ids=np.full(12, -(2**40))), "view_ids", "-1099511627776"),
         (CloudInput(GOOD, view_ids=[0] * 12), "view_ids", "a list"),
     ],
 )
@@ -221,7 +214,7 @@ def image(depth: np.ndarray, T_cloud_camera: np.ndarray) -> dict[str, Any]:
 
 def test_points_project_back_onto_their_pixels() -> None:
     depth, T_cloud_camera = depth_of(), pose(1)
-    cloud = read_depth_images([image(depth, T_cloud_camera)], MANY)
+    cloud = wire.read_depth_images([image(depth, T_cloud_camera)], MANY)
     assert cloud.points.shape == (24, 32, 3)
     homogeneous = np.concatenate([cloud.points, np.ones((24, 32, 1))], axis=-1)
     x, y, z = np.moveaxis((homogeneous @ np.linalg.inv(T_cloud_camera).T)[..., :3], -1, 0)
@@ -231,30 +224,30 @@ def test_points_project_back_onto_their_pixels() -> None:
     np.testing.assert_allclose(FY * y / z + CY, row, atol=1e-4)
     np.testing.assert_array_equal(cloud.viewpoint, T_cloud_camera[:3, 3])
     sent = {"depth_images": [image(depth, T_cloud_camera)]}
-    _, options = decode_cloud(sent, DetectOptions(), MANY)
+    _, options = wire.decode_cloud(sent, DetectOptions(), MANY)
     assert options.viewpoint == tuple(T_cloud_camera[:3, 3].tolist())
-    archive = File("npz", npz(depth=depth, intrinsics=np.array([FX, FY, CX, CY])))
-    _, options = decode_cloud({"cloud": archive}, DetectOptions(), MANY)
+    archive = wire.File("npz", npz(depth=depth, intrinsics=np.array([FX, FY, CX, CY])))
+    _, options = wire.decode_cloud({"cloud": archive}, DetectOptions(), MANY)
     assert options.viewpoint == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("kind", ["<f4", "<f8", "<u2"])
 def test_encodings_give_the_same_depths(kind: str) -> None:
     millimetres = np.round(depth_of() * 1000)
-    expected = read_depth_images([image(millimetres / 1000, pose(2))], MANY)
+    expected = wire.read_depth_images([image(millimetres / 1000, pose(2))], MANY)
     sent = image((millimetres if kind == "<u2" else millimetres / 1000).astype(kind), pose(2))
-    packed = read_depth_images([sent], MANY)
+    packed = wire.read_depth_images([sent], MANY)
     np.testing.assert_allclose(packed.points, expected.points, atol=1e-6)
     sent["depth"]["data"] = base64.b64encode(sent["depth"]["data"]).decode()
-    in_json = read_depth_images([sent], MANY)
+    in_json = wire.read_depth_images([sent], MANY)
     np.testing.assert_array_equal(in_json.points, packed.points)
     rows = (millimetres / 1000).tolist()
     rows[1][2], rows[1][3] = None, -np.inf  # as ROS and ZED have what is too near
-    listed = read_depth_images([sent | {"depth": rows}], MANY)
+    listed = wire.read_depth_images([sent | {"depth": rows}], MANY)
     assert np.isnan(listed.points[1, 2:4]).all()
     np.testing.assert_allclose(listed.points[2:], expected.points[2:], atol=1e-6)
     with refusal("depth_images", kind=PayloadTooLarge):
-        read_depth_images([sent] * 3, 2 * 24 * 32)  # the pixels of all images
+        wire.read_depth_images([sent] * 3, 2 * 24 * 32)  # the pixels of all images
 
 
 @pytest.mark.parametrize(
@@ -265,13 +258,14 @@ def test_encodings_give_the_same_depths(kind: str) -> None:
         ([1.0, FY, CX, CY], ".fx", "1 for an image of 32 x 24 pixels"),
         ([FX, 600.0, CX, CY], ".fy", "600 for"),
         ([FX, 20.0, CX, CY], "", "fx 60 and fy 20"),
+        ([20.0, 60.0, CX, CY], "", "fx 20 and fy 60"),
         ([FX, FY, CX], "", "[60.0, 50.0, 15.5]"),
         ([[FX, 0, 0], [0, FY, 0], [CX, CY, 1]], "", "[[60.0, 0, 0]"),
     ],
 )
 def test_intrinsics_that_do_not_fit_the_image_are_refused(intrinsics, field, value) -> None:
     with refusal(f"depth_images.0.intrinsics{field}", value):
-        read_depth_images([image(depth_of(), pose(0)) | {"intrinsics": intrinsics}], MANY)
+        wire.read_depth_images([image(depth_of(), pose(0)) | {"intrinsics": intrinsics}], MANY)
 
 
 def test_views_are_fused_and_doubtful_intrinsics_get_a_warning() -> None:
@@ -280,26 +274,26 @@ def test_views_are_fused_and_doubtful_intrinsics_get_a_warning() -> None:
     depths[0][0, 0] = np.nan
     images = [image(depth, at) for depth, at in zip(depths, poses, strict=True)]
     sent = {"depth_images": images, "segment_ids": list(range(3 * 24 * 32))}
-    cloud, options = decode_cloud(sent, DetectOptions(), MANY)
+    cloud, options = wire.decode_cloud(sent, DetectOptions(), MANY)
     np.testing.assert_allclose(options.viewpoint, [at[:3, 3] for at in poses])
     assert DetectOptions.model_validate(options.model_dump()) == options
     checked = check_cloud(cloud)
     np.testing.assert_array_equal(checked.segment_ids, np.arange(1, 3 * 24 * 32))
     for view, single in enumerate(images):
-        alone = read_depth_images([single], MANY)
+        alone = wire.read_depth_images([single], MANY)
         seen = checked.points[checked.view_ids == view]
         np.testing.assert_array_equal(seen, check_cloud(alone).points)
         assert alone.warnings == ()
     images[1]["intrinsics"] |= {"cx": 8.0}
     for some in (images[1:2], images[:2]):
-        (warning,) = read_depth_images(some, MANY).warnings
+        (warning,) = wire.read_depth_images(some, MANY).warnings
         assert f"depth_images.{len(some) - 1}.intrinsics: cx 8 lies far from the" in warning
-    (warning,) = read_depth_images(images[2:] * 2, MANY).warnings
+    (warning,) = wire.read_depth_images(images[2:] * 2, MANY).warnings
     assert "two have the same camera position" in warning
 
 
 def read(fields: dict[str, Any]) -> CloudInput:
-    return read_point_cloud2(parse(PointCloud2, fields, "point_cloud2"), MANY)
+    return read_point_cloud2(wire.parse(wire.PointCloud2, fields, "point_cloud2"), MANY)
 
 
 def cloud_of(shape: tuple[int, int], kind: str = "f4", extra: tuple[Any, ...] = ()) -> np.ndarray:
@@ -389,6 +383,6 @@ def test_bad_layouts_are_refused_by_field(changes: dict[str, Any], field: str) -
 def test_a_long_text_in_a_list_takes_its_memory_once() -> None:
     rows = [["x" * 100_000, "", ""]] + [["", "", ""]] * 2000
     with bounded_memory(5_000_000), refusal("points", "['xxx"):
-        decode_points(rows, MANY)
+        wire.decode_points(rows, MANY)
     with bounded_memory(5_000_000), refusal("normals", "['xxx"):
-        decode_array("normals", rows, MANY)
+        wire.decode_array("normals", rows, MANY)
