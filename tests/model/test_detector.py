@@ -24,18 +24,8 @@ from edgegrasp_model.scene.cloud import CloudInput, pose_matrix
 from edgegrasp_results import Detection, Grasp
 from edgegrasp_training.recipes import build_network
 
-from .rendered import (
-    FOCAL_LENGTH,
-    HEIGHT,
-    SCENE,
-    WIDTH,
-    box,
-    boxes_on_table,
-    camera,
-    render,
-    table,
-    to_world,
-)
+from . import rendered
+from .rendered import FOCAL_LENGTH, HEIGHT, WIDTH, box, boxes_on_table, camera, render, table
 from .scenes import PANDA, TINY, box_on_table, detector, scene_of
 
 CLOUD = box_on_table()
@@ -135,10 +125,11 @@ def test_each_camera_orients_the_normals_of_what_it_saw() -> None:
     upper = found.debug.points[:, 2] > 0.25
     assert (found.debug.normals[upper, 2] > 0.99).all()
     assert (found.debug.normals[~upper, 2] < -0.99).all()
-    of_a_third = np.repeat([0, 2], 3000)
-    for views, value in ((None, "nothing, for 2 viewpoints"), (of_a_third, "values from 0 to 2")):
+    with refusal("view_ids", "nothing, for 2 viewpoints"):
+        detect(sheets, **asked)
+    for views, value in (([0, 2], "values from 0 to 2"), ([-1, 1], "values from -1 to 1")):
         with refusal("view_ids", value):
-            detect(CloudInput(sheets, view_ids=views), **asked)
+            detect(CloudInput(sheets, view_ids=np.repeat(views, 3000)), **asked)
 
 
 def test_a_raw_cloud_is_seen_from_its_origin_and_the_answer_says_so(catalogue) -> None:
@@ -151,7 +142,7 @@ def test_a_raw_cloud_is_seen_from_its_origin_and_the_answer_says_so(catalogue) -
     assert len(assumed.grasps) > 0
     assert any("the camera is assumed at the origin" in each for each in assumed.warnings)
     # Not below a table that is given.
-    above = to_world(camera(0.7, 0.0, 0.9), cloud) + np.array([0.0, 0.0, 1.0])
+    above = rendered.to_world(camera(0.7, 0.0, 0.9), cloud) + np.array([0.0, 0.0, 1.0])
     support = {"normal": (0.0, 0.0, 1.0), "offset": 1.0}
     found = network.detect(above, DetectOptions.model_validate({"support": support}))
     assert found.grasps[0].score > 0.8
@@ -178,7 +169,7 @@ def test_one_of_the_objects_by_number_by_pixel_or_by_place(catalogue) -> None:
     assert objects(objects={"include": [99]}) == set()
     place = next(each.center for each in every.objects if each.number == one)
     assert objects(near=place.tolist()) == {one}
-    assert objects(near=(0.0, 0.0, 5.0)) == set()
+    assert objects(near=(0.75 * place).tolist()) == set()
     u, v = FOCAL_LENGTH * place[:2] / place[2] + (WIDTH / 2, HEIGHT / 2)
     assert objects(at=(u, v)) == {one}
     assert objects(at=(0, 0)) == set()
@@ -259,6 +250,7 @@ def test_an_unknown_viewpoint_gets_a_warning_and_too_many_voxels_are_refused() -
     found = detector().detect(CLOUD)
     assert found.grasps
     assert any("viewpoint" in warning for warning in found.warnings)
+    assert "below the support plane" in detect(viewpoint=(0.3, 0.0, -0.5)).warnings[-1]
     with refusal("options.workspace"):
         detector().prepare(CLOUD, DetectOptions(), 100)
 
@@ -345,27 +337,24 @@ def test_a_device_is_chosen_only_where_it_is(monkeypatch, gpus, name, device) ->
 
 
 @pytest.mark.parametrize(
-    ("camera", "edge", "blocked"),
+    ("cameras", "edge", "blocked"),
     [
-        ((-0.6, 0.0, 0.0), -0.2, True),
-        ((-0.6, 0.0, 0.0), 0.06, True),
-        ((-0.6, 0.0, 0.0), 0.1, False),
-        ((0.6, 0.0, 0.0), -0.2, False),
-        (None, -0.2, False),
+        *(([-0.6], edge, blocked) for edge, blocked in ((-0.2, True), (0.06, True), (0.1, False))),
+        *((places, -0.2, False) for places in ([0.6], [-0.6, 0.6], [])),
     ],
-    ids=["behind a plate", "an end of it", "beside a plate", "before a plate", "unknown"],
+    ids=["behind a plate", "an end of it", "beside it", "before it", "on both sides", "unknown"],
 )
-def test_a_palm_in_space_that_no_camera_saw_counts_as_colliding(camera, edge, blocked) -> None:
+def test_a_palm_in_space_that_no_camera_saw_counts_as_colliding(cameras, edge, blocked) -> None:
     y, z = np.meshgrid(np.arange(edge, 0.2, 0.004), np.arange(-0.2, 0.3, 0.004))
     plate = np.stack([np.full_like(y, -0.1), y, z], axis=-1).reshape(-1, 3).astype(np.float32)
-    viewpoints = np.empty((0, 3)) if camera is None else np.array([camera], dtype=np.float32)
+    viewpoints = np.array([(x, 0.0, 0.0) for x in cameras], np.float32).reshape(-1, 3)
     behind, hand = scene_of(plate, viewpoints=viewpoints), np.eye(4, dtype=np.float32)[None]
     assert collides(behind, hand, np.float32([0.04]), PANDA, Collision()).tolist() == [blocked]
 
 
 def test_hands_that_reach_out_of_the_image_come_last() -> None:
     left, right, top, bottom = 80, 250, 60, 200  # through the objects' surroundings
-    image = SCENE[top:bottom, left:right]
+    image = rendered.SCENE[top:bottom, left:right]
     found = convinced(50.0).detect(image, DetectOptions(viewpoint=(0.0, 0.0, 0.0)))
     assert len(found.objects) == 4
     for grasp in found.grasps[:4]:
@@ -478,8 +467,10 @@ def test_a_network_of_edges_gets_edge_grasps_where_they_are_good(catalogue) -> N
 def test_the_offset_of_the_support_is_along_its_unit_normal() -> None:
     cloud = box_on_table(table=True) + np.float32([0.0, 0.0, 50.0])
     plane = {"normal": [0.0, 0.0, 1.0009], "offset": 1.0009 * 50.0}
-    found = detector().detect(cloud, parse_options({"support": plane, "objects": "off"})).support
-    assert found.offset == pytest.approx(50.0, abs=1e-4)
+    asked = {"support": plane, "objects": "off", "debug": True}
+    found = detector().detect(cloud, parse_options(asked))
+    assert found.support.offset == pytest.approx(50.0, abs=1e-4)
+    assert found.debug.support_plane[3] == pytest.approx(50.0, abs=5e-3)
     plane = {"normal": [0.0, 0.0, 1.0], "offset": 0.0}
     far = detector().detect(cloud, parse_options({"support": plane, "objects": "off"})).warnings
     assert any("plane lies 50 m below everything" in warning for warning in far)

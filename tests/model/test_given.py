@@ -1,12 +1,14 @@
 """Edges and hand poses that a caller gives."""
 
 import numpy as np
+from tests.checks import refusal
 from tests.many_options import OWN_GRIPPER
 
 from edgegrasp_model.gripper import HALF_TURN, gripper_fields
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import NoGrasp
 from edgegrasp_model.scene.cloud import CloudInput
+from edgegrasp_results import Grasp
 
 from .scenes import PANDA, box_on_table, detector
 
@@ -28,19 +30,23 @@ def row_of(cloud: np.ndarray, point: np.ndarray) -> int:
     return int(np.linalg.norm(cloud - point, axis=1).argmin())
 
 
+def edge_of(cloud: np.ndarray, found: Grasp) -> list[int]:
+    return [row_of(cloud, found.approach_point), row_of(cloud, found.contact_point)]
+
+
+def same_pose(one: Grasp | None, other: Grasp) -> bool:
+    return one is not None and np.allclose(one.T_cloud_hand, other.T_cloud_hand, atol=1e-5)
+
+
 def test_edges_of_detected_grasps_are_the_grasps_that_were_detected() -> None:
     cloud = box_on_table()
     found = detector().detect(cloud, ask())
-    edges = np.array(
-        [[row_of(cloud, g.approach_point), row_of(cloud, g.contact_point)] for g in found.grasps]
-    )
+    edges = np.array([edge_of(cloud, grasp) for grasp in found.grasps])
     scored = detector().score(cloud, ask(), edges=edges)
     assert len(scored.evaluations) == len(found.grasps)
     same = 0
     for mine, theirs in zip(scored.evaluations, found.grasps, strict=True):
-        if mine.grasp is None or not np.allclose(
-            mine.grasp.T_cloud_hand, theirs.T_cloud_hand, atol=1e-5
-        ):
+        if not same_pose(mine.grasp, theirs):
             continue  # a top-down grasp, or a row that went into a neighbouring voxel
         same += 1
         np.testing.assert_allclose(mine.grasp.clearance, theirs.clearance, atol=1e-6)
@@ -51,11 +57,9 @@ def test_edges_of_detected_grasps_are_the_grasps_that_were_detected() -> None:
     same = 0
     for seed in range(12):  # without others like it, the score is that of the edge
         (found,) = detector().detect(cloud, ask(num_candidates=1, min_score=0.0, seed=seed)).grasps
-        edge = [row_of(cloud, found.approach_point), row_of(cloud, found.contact_point)]
-        (mine,) = detector().score(cloud, ask(), edges=np.array([edge])).evaluations
-        if mine.grasp is not None and np.allclose(
-            mine.grasp.T_cloud_hand, found.T_cloud_hand, atol=1e-5
-        ):
+        edge = np.array([edge_of(cloud, found)])
+        (mine,) = detector().score(cloud, ask(), edges=edge).evaluations
+        if same_pose(mine.grasp, found):
             same += 1
             np.testing.assert_allclose(mine.grasp.score, found.score, atol=1e-5)
     assert same
@@ -84,6 +88,9 @@ def test_answers_keep_the_order_of_the_edges_and_say_why_there_is_no_grasp() -> 
     np.testing.assert_array_equal(one.approach_point, other.contact_point)
     assert answer.counts["given"] == 5
     assert answer.counts["scored"] == 2
+    for wrong, value in (([[-1, 0]], "row -1"), ([[0, 4002]], "4002"), ([[0, 1]] * 16_001, "")):
+        with refusal("edges", value):
+            detector().score(cloud, ask(), edges=np.array(wrong))
     nowhere = ask(workspace={"min": (5, 5, 5), "max": (6, 6, 6)})  # all of it is cropped away
     answer = detector().score(cloud, nowhere, edges=np.array([[0, 1], [2, 3]]))
     assert [each.reason for each in answer.evaluations] == [NoGrasp.NO_POINT] * 2
