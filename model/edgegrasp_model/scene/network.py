@@ -6,6 +6,7 @@ A U-Net on depth alone, as networks that segment unseen objects from simulated d
 et al., T-RO 2021): its input has twice the resolution of its output.
 """
 
+import math
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -15,13 +16,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from edgegrasp_camera.arrays import Float32, Float64
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.scene.cloud import (
     LARGE_IMAGE,
     MAX_VIEW_TANGENT,
     OUTLIER_PERCENT,
     SUBSAMPLE_SIZE,
+    CheckedCloud,
     subsample,
     unit,
     usual_up,
@@ -114,6 +116,8 @@ MIN_FILLED = 0.93  # of the pixels between two that show something; else pixels 
 # Metres at the median depth: larger pixels are divided, and those of less than half show noise.
 MAX_PIXEL_SIZE = 0.003
 SURFACE_DEPTH = 0.02  # metres; a point nearer by this much hides another of the same pixel
+VEIL_ANGLE = math.radians(70)  # from a slope's normal to the camera; short steeper ones are veils
+MAX_VEIL_PIXELS = 20  # of an image, along a row or column
 
 
 class RangeImage(NamedTuple):
@@ -271,6 +275,67 @@ def _fill_holes(image: Float32) -> Float32:
             if count >= 4 and high - low < SURFACE_DEPTH + 0.01 * high:
                 out[i, j, 0], out[i, j, 1], out[i, j, 2] = x / count, y / count, z / count
     return out
+
+
+def veils(cloud: CheckedCloud, viewpoints: Float64) -> Bools:
+    """Which points (N,) of images lie between an edge and what is behind it, where nothing is.
+
+    Cameras that compare or smooth windows of pixels interpolate there. `viewpoints` (W, 3) are of
+    the images, cloud frame; none of a cloud that is no image.
+    """
+    veiled, first = np.zeros(len(cloud.points), dtype=np.bool_), 0
+    images = cloud.image_sizes if len(cloud.image_sizes) == len(viewpoints) else ()
+    for (height, width), viewpoint in zip(images, viewpoints.astype(np.float32), strict=False):
+        last = first + height * width
+        rows = slice(*np.searchsorted(cloud.row, (first, last)))
+        pixel = cloud.row[rows] - first
+        veiled[rows] = _veils(cloud.points[rows], pixel, (height, width), cloud.step, viewpoint)
+        first = last
+    return veiled
+
+
+@compiled("contract")
+def _veils(
+    points: Float32, pixel: Int64, size: tuple[int, int], step: int, viewpoint: Float32
+) -> Bools:
+    """Which points (N,) are in short runs of a row or column that go steeply away or back.
+
+    The ends of a run are on the surfaces beside the veil, but for those beside a hole.
+    """
+    (height, width), limit = size, np.float32(np.sin(VEIL_ANGLE) ** 2)
+    index, distance = np.full(height * width, -1, np.int32), np.empty(len(points), np.float32)
+    for n in range(len(points)):
+        index[pixel[n]] = n
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        distance[n] = np.sqrt(
+            (x - viewpoint[0]) ** 2 + (y - viewpoint[1]) ** 2 + (z - viewpoint[2]) ** 2
+        )
+    veiled = np.zeros(len(points), np.bool_)
+    rows = (0, height, width), (0, width, 1)
+    for (_, lines, next_line), (_, length, ahead) in (rows, rows[::-1]):
+        for line in range(0, lines, step):
+            run, first, last = 0, -1, -1
+            for at in range(0, length + step, step):
+                place = line * next_line + at * ahead
+                n = index[place] if at < length else -1
+                slope = 0
+                if n >= 0 and last >= 0:
+                    rise = distance[n] - distance[last]
+                    x = points[n, 0] - points[last, 0]
+                    y = points[n, 1] - points[last, 1]
+                    z = points[n, 2] - points[last, 2]
+                    if rise * rise > limit * (x * x + y * y + z * z):
+                        slope = 1 if rise > 0 else -1
+                if slope != run:
+                    if run != 0 and at - first <= MAX_VEIL_PIXELS:
+                        end = at - step if n >= 0 else at
+                        for k in range(first, end, step):
+                            veiled[index[line * next_line + k * ahead]] = True
+                    run, before = slope, place - 2 * step * ahead
+                    beside_hole = at < 2 * step or index[before] < 0
+                    first = at - step if beside_hole else at
+                last = n
+    return veiled
 
 
 def scene_features(
