@@ -123,8 +123,8 @@ def test_edges_that_a_camera_smooths_do_not_make_objects_larger(views: int) -> N
         halves = sorted((one.half_extents for one in found.objects), key=lambda half: half[2])
         return np.array([[*sorted(half[:2]), half[2]] for half in halves])
 
-    smooth = sizes([ndimage.uniform_filter(depth, 5) for depth in sharp])
-    np.testing.assert_allclose(smooth, sizes(sharp), atol=0.0125)
+    smooth = sizes([ndimage.uniform_filter(depth, 2) for depth in sharp])
+    np.testing.assert_allclose(smooth, sizes(sharp), atol=0.008)
 
 
 def test_normals_that_contradict_each_other_are_estimated() -> None:

@@ -116,8 +116,7 @@ MIN_FILLED = 0.93  # of the pixels between two that show something; else pixels 
 # Metres at the median depth: larger pixels are divided, and those of less than half show noise.
 MAX_PIXEL_SIZE = 0.003
 SURFACE_DEPTH = 0.02  # metres; a point nearer by this much hides another of the same pixel
-VEIL_ANGLE = math.radians(70)  # from a slope's normal to the camera; short steeper ones are veils
-MAX_VEIL_PIXELS = 20  # of an image, along a row or column
+VEIL_ANGLE = math.radians(80)  # from a slope's normal to the camera; surfaces are hardly seen so
 
 
 class RangeImage(NamedTuple):
@@ -298,9 +297,9 @@ def veils(cloud: CheckedCloud, viewpoints: Float64) -> Bools:
 def _veils(
     points: Float32, pixel: Int64, size: tuple[int, int], step: int, viewpoint: Float32
 ) -> Bools:
-    """Which points (N,) are in short runs of a row or column that go steeply away or back.
+    """Which points (N,) lie, with both neighbours in a row or column, on one grazing slope.
 
-    The ends of a run are on the surfaces beside the veil, but for those beside a hole.
+    One neighbour is enough beside a hole.
     """
     (height, width), limit = size, np.float32(np.sin(VEIL_ANGLE) ** 2)
     index, distance = np.full(height * width, -1, np.int32), np.empty(len(points), np.float32)
@@ -311,30 +310,25 @@ def _veils(
             (x - viewpoint[0]) ** 2 + (y - viewpoint[1]) ** 2 + (z - viewpoint[2]) ** 2
         )
     veiled = np.zeros(len(points), np.bool_)
-    rows = (0, height, width), (0, width, 1)
-    for (_, lines, next_line), (_, length, ahead) in (rows, rows[::-1]):
-        for line in range(0, lines, step):
-            run, first, last = 0, -1, -1
-            for at in range(0, length + step, step):
-                place = line * next_line + at * ahead
-                n = index[place] if at < length else -1
-                slope = 0
-                if n >= 0 and last >= 0:
-                    rise = distance[n] - distance[last]
-                    x = points[n, 0] - points[last, 0]
-                    y = points[n, 1] - points[last, 1]
-                    z = points[n, 2] - points[last, 2]
-                    if rise * rise > limit * (x * x + y * y + z * z):
-                        slope = 1 if rise > 0 else -1
-                if slope != run:
-                    if run != 0 and at - first <= MAX_VEIL_PIXELS:
-                        end = at - step if n >= 0 else at
-                        for k in range(first, end, step):
-                            veiled[index[line * next_line + k * ahead]] = True
-                    run, before = slope, place - 2 * step * ahead
-                    beside_hole = at < 2 * step or index[before] < 0
-                    first = at - step if beside_hole else at
-                last = n
+    for n in range(len(points)):
+        place = pixel[n]
+        row = place - place % width
+        for ahead, first, end in ((step, row, row + width), (step * width, 0, len(index))):
+            slope = 0
+            for side in (-1, 1):
+                beside = place + side * ahead
+                if beside < first or beside >= end or index[beside] < 0:
+                    continue
+                other = index[beside]
+                rise = distance[other] - distance[n]
+                x = points[other, 0] - points[n, 0]
+                y = points[other, 1] - points[n, 1]
+                z = points[other, 2] - points[n, 2]
+                if rise * rise <= limit * (x * x + y * y + z * z):
+                    slope = 0
+                    break
+                slope += side if rise > 0 else -side
+            veiled[n] |= slope != 0
     return veiled
 
 
