@@ -56,8 +56,7 @@ def test_version_short_help_completion_and_an_unknown_command(run) -> None:
     for words in (["-h"], ["detect", "-h"]):
         assert "edgegrasp detect cloud.ply" in " ".join(run(*words).split())
     bash = {"_EDGEGRASP_COMPLETE": "source_bash"}
-    script = CliRunner().invoke(main.app, [], prog_name="edgegrasp", env=bash)
-    assert "complete" in script.output
+    assert "complete" in CliRunner().invoke(main.app, [], prog_name="edgegrasp", env=bash).output
     asked = {"COMP_WORDS": "edgegrasp detect --viewp", "COMP_CWORD": "2"}
     asked |= {"_EDGEGRASP_COMPLETE": "complete_bash"}
     done = CliRunner().invoke(main.app, [], prog_name="edgegrasp", env=asked)
@@ -119,8 +118,7 @@ SERVE = ("serve", "--http-port", 0, "--grpc-port", 0, "--robots", "fr3")
 
 @pytest.mark.parametrize("words", [SERVE, ("robot", "check", "fr3")])
 def test_arms_are_an_extra(words: tuple[object, ...], tmp_path: Path) -> None:
-    absent = "raise ModuleNotFoundError('no arms', name='roboplan')"
-    (tmp_path / "roboplan.py").write_text(absent)
+    (tmp_path / "roboplan.py").write_text("raise ModuleNotFoundError('no arms', name='roboplan')")
     paths = os.pathsep.join([str(tmp_path), *sys.path])
     ended = run_program(*EDGEGRASP, *words, code=1, env=os.environ | {"PYTHONPATH": paths})
     assert f"edgegrasp {words[0]}: roboplan is not installed" in ended.stderr

@@ -76,16 +76,14 @@ async def test_an_agent_gets_grasps_and_sees_them(dummy_server, folder: Path) ->
         for wrong in ({"object": "bottle"}, *wrong_options, {"num_grasps": -3}):
             assert not validator.is_valid(IMAGE | wrong)
         assert client.server_info.version == importlib.metadata.version("edgegrasp")
-        health = await client.call_tool("edgegrasp_health_check", {})
-        assert health.content[0].text == "ready"
+        assert (await client.call_tool("edgegrasp_health_check", {})).content[0].text == "ready"
         info = answer(await client.call_tool("edgegrasp_server_info", {}))
         assert [model["name"] for model in info["models"]] == ["dummy"]
         assert info["robots"] == []
 
         asked = {"point_cloud_file": "cloud.npy", "num_grasps": 3, "options": {"seed": 7}}
         found = answer(await client.call_tool(CLOUD, asked))
-        again = answer(await client.call_tool(CLOUD, asked))
-        assert found == again
+        assert found == answer(await client.call_tool(CLOUD, asked))
         assert len(found["grasps"]) == 3
         grasp = found["grasps"][0]
         assert np.linalg.norm(grasp["hand_quaternion_xyzw"]) == pytest.approx(1, abs=1e-3)

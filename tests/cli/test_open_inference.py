@@ -135,8 +135,7 @@ def test_what_cannot_be_served(gateway, cloud, changes, model, status, told) -> 
 
 
 def test_two_gateways_do_not_share_a_port(gateway) -> None:
-    taken = pytest.raises(OSError, match="cannot listen")
-    with taken, grpc_server(Any, gateway["grpc"]):
+    with pytest.raises(OSError, match="cannot listen"), grpc_server(Any, gateway["grpc"]):
         pass
 
 

@@ -124,8 +124,7 @@ def test_answers_are_those_of_one_process_though_a_replica_dies(cluster, tmp_pat
                     poses = [grasp.T_cloud_hand for grasp in found.grasps]
                     assert np.array_equal(poses, [grasp.T_cloud_hand for grasp in here.grasps])
                     scores = [grasp.score for grasp in found.grasps]
-                    expected = [grasp.score for grasp in here.grasps]
-                    assert scores == pytest.approx(expected, abs=1e-6)
+                    assert scores == pytest.approx([grasp.score for grasp in here.grasps], abs=1e-6)
                 names = {model["name"] for model in catalogue.describe()}
                 assert {one.name for one in client.models()} == names
                 assert client.robots() == []

@@ -88,8 +88,7 @@ def test_every_option_goes_through_and_none_is_its_default(client, cloud) -> Non
     alone = {name: client.detect(cloud, **{name: value}) for name, value in ALL_OPTIONS.items()}
     assert len(alone["top_k"].grasps) == 3
     assert_same(client.detect(cloud, **dict.fromkeys(ALL_OPTIONS)), client.detect(cloud))
-    coded = {"kind": "mask", "mask": b64encode(np.arange(500) % 2 == 0).decode()}
-    region = {"include": [coded]}
+    region = {"include": [{"kind": "mask", "mask": b64encode(np.arange(500) % 2 == 0).decode()}]}
     assert_same(client.detect(cloud, approach_region=region), alone["approach_region"])
 
 
@@ -161,11 +160,9 @@ def test_a_mask_narrows_the_regions_that_are_asked_for() -> None:
 
 
 def test_an_object_is_cut_out_of_the_scene_that_repeats_it() -> None:
-    rng = np.random.default_rng(0)
-    scene = rng.uniform(-0.3, 0.3, (4000, 3))
+    scene = np.random.default_rng(0).uniform(-0.3, 0.3, (4000, 3))
     wanted = np.linalg.norm(scene - 0.1, axis=1) < 0.08
-    holed = np.concatenate([scene, [[np.nan] * 3]])
-    for around in (holed, scene[~wanted]):
+    for around in (np.concatenate([scene, [[np.nan] * 3]]), scene[~wanted]):
         cloud, segment_ids = api.object_in_scene(scene[wanted], around)
         np.testing.assert_array_equal(cloud[segment_ids == 1], scene[wanted].astype(np.float32))
         far = np.linalg.norm(cloud[segment_ids == 0] - 0.1, axis=1)

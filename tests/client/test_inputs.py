@@ -48,17 +48,14 @@ def test_organised_clouds_may_have_holes(client, cloud) -> None:
 def test_point_cloud2_messages_are_read(client, cloud) -> None:
     expected = contacts(client.detect(cloud))
     assert contacts(client.detect(ros_message(cloud))) == expected
-    listed = ros_message(cloud, data=list(cloud.tobytes()))
-    assert contacts(client.detect(listed)) == expected
+    assert contacts(client.detect(ros_message(cloud, data=list(cloud.tobytes())))) == expected
     assert contacts(client.detect(ros_message(cloud.reshape(20, 25, 3)))) == expected
-    short = ros_message(cloud, data=b"")
     with refusal("point_cloud2.data"):
-        client.detect(short)
+        client.detect(ros_message(cloud, data=b""))
 
 
 def test_depth_images_are_sent_in_every_form(client) -> None:
-    one = client.detect(depth_images=[depth_image()])
-    assert one.counts["points"] == 600
+    assert client.detect(depth_images=[depth_image()]).counts["points"] == 600
     millimetres = np.round(depth_image()["depth"] * 1000).astype(np.uint16)
     expected = client.detect(depth_images=[depth_image(depth=millimetres)])
     assert expected.grasps
@@ -71,8 +68,7 @@ def test_depth_images_are_sent_in_every_form(client) -> None:
     zeros = client.detect(depth_images=[depth_image(depth=masked.filled(0))])
     assert contacts(found) == contacts(zeros) != contacts(expected)
     views = [depth_image(), depth_image(T_cloud_camera=np.eye(4).tolist())]
-    ids = np.arange(1200)
-    assert client.detect(depth_images=views, segment_ids=ids).counts["points"] == 1200
+    assert client.detect(depth_images=views, segment_ids=np.arange(1200)).counts["points"] == 1200
 
 
 def test_depth_files_are_read_with_their_scale(client, tmp_path) -> None:
@@ -113,10 +109,9 @@ def test_scoring_over_any_cloud(client, cloud) -> None:
 @pytest.mark.parametrize("kind", [bool, np.uint8, np.int64])
 def test_options_too_long_for_a_query_are_sent(client, cloud, kind) -> None:
     mask = np.full((20, 25), 255).astype(kind)
-    indices = np.arange(499)
     options: dict[str, Any] = {
         "approach_region": {"include": [{"kind": "mask", "mask": mask}]},
-        "contact_region": {"include": [{"kind": "indices", "indices": indices}] * 10},
+        "contact_region": {"include": [{"kind": "indices", "indices": np.arange(499)}] * 10},
     }
     assert contacts(client.detect(cloud, **options)) == contacts(client.detect(cloud))
 
