@@ -74,13 +74,11 @@ def test_a_compressed_pcd_with_a_second_header_in_its_comments() -> None:
         f"WIDTH {count}\nHEIGHT 1\nPOINTS {count}\n"
     )
     points = np.random.default_rng(0).normal(size=(3, count)).astype("<f4")
-    data = compressed_pcd(header, points.tobytes() + b"\7" * (3 * count))
-    cloud = read_file("pcd", data, MANY)
+    cloud = read_file("pcd", compressed_pcd(header, points.tobytes() + b"\7" * (3 * count)), MANY)
     np.testing.assert_array_equal(cloud.points, points.T)
     np.testing.assert_array_equal(cloud.normals, np.full((count, 3), 7))
-    short = compressed_pcd(header, points.tobytes())
     with pytest.raises(InvalidRequest):
-        read_file("pcd", short, MANY)
+        read_file("pcd", compressed_pcd(header, points.tobytes()), MANY)
 
 
 def npy_with(header: bytes, version: int) -> bytes:

@@ -46,8 +46,7 @@ BINARY = json.dumps({"inputs": [TENSOR | BESIDE]}).encode()
 
 def infer(body: bytes, header: str | None = None) -> None:
     with refused():
-        answer = open_inference._http_infer(MODELS, "grasps", bytearray(body), header)
-        json.dumps(answer).encode()
+        json.dumps(open_inference._http_infer(MODELS, "grasps", bytearray(body), header)).encode()
 
 
 @contextlib.contextmanager

@@ -26,8 +26,7 @@ def tracked_files() -> list[Path]:
 
 
 def test_tracked_files_are_small_and_name_no_registry_or_path_of_one_machine() -> None:
-    large = [path.name for path in tracked_files() if path.stat().st_size > 20 * 2**20]
-    assert large == []
+    assert [path.name for path in tracked_files() if path.stat().st_size > 20 * 2**20] == []
     found = [
         f"{path.relative_to(ROOT)}: {match[0]}"
         for path in tracked_files()

@@ -76,8 +76,7 @@ CAMERA = sent("sensor_msgs/msg/CameraInfo", SIZE | {"k": [9.0] * 9, "p": PROJECT
 
 def test_a_cloud_and_its_grasps_in_every_message(client, cloud) -> None:
     settings = Settings(target_frame="base", hand_frame="hand", parent_link="link8")
-    options = {"seed": 3, "top_k": 5}
-    found = detect(client, Scene(make_cloud(cloud)), settings, options)
+    found = detect(client, Scene(make_cloud(cloud)), settings, {"seed": 3, "top_k": 5})
     expected = client.detect(cloud, viewpoint=[0, 0, 0], seed=3, top_k=5).grasps
     hands = [T_base_camera @ grasp.T_cloud_hand for grasp in expected]
     assert len(hands) == 5
@@ -139,8 +138,7 @@ def matrix(pose: Any) -> np.ndarray:
 @pytest.mark.parametrize(("kind", "encoding"), [(np.uint16, "16UC1"), (np.float32, "32FC1")])
 def test_a_depth_image_with_its_camera(client, kind, encoding) -> None:
     depth = DEPTH if kind == np.uint16 else DEPTH.astype(kind) / 1000
-    scene = Scene(depth=make_image(depth, encoding, padding=6), camera=CAMERA)
-    found = detect(client, scene)
+    found = detect(client, Scene(depth=make_image(depth, encoding, padding=6), camera=CAMERA))
     expected = client.detect(depth_images=[{"depth": depth, "intrinsics": MATRIX}]).grasps
     assert found.header["frame_id"] == "camera"
     assert bridge.trajectories(found) == []
@@ -201,8 +199,7 @@ def test_an_object_and_its_scene_come_apart(asked, bigendian):
     cluster = make_cloud(in_base, "base", bigendian)
     scene = Scene(make_cloud(organised, bigendian=bigendian))
     detect(asked, scene, object_cloud=cluster)
-    segment_ids = asked.given["segment_ids"]
-    np.testing.assert_allclose(asked.cloud[segment_ids == 1], wanted, atol=1e-5)
+    np.testing.assert_allclose(asked.cloud[asked.given["segment_ids"] == 1], wanted, atol=1e-5)
     assert len(wanted) + 100 < len(asked.cloud) <= 150
 
     detect(asked, Scene(depth=make_image(DEPTH), camera=CAMERA), object_cloud=cluster)
@@ -309,8 +306,7 @@ def test_every_option_is_a_parameter(client, cloud) -> None:
     assert settings.joints.at(0.08) == {"finger": 0.04}
     assert options["workspace"]["max"] == [1, 1, 1]
     assert options["objects"] == "off"
-    found = detect(client, Scene(make_cloud(cloud)), settings, options)
-    assert len(found.grasps) == 2
+    assert len(detect(client, Scene(make_cloud(cloud)), settings, options).grasps) == 2
     with pytest.raises(InvalidRequestError, match="top_k"):
         detect(client, Scene(make_cloud(cloud)), settings, options | {"top_k": "many"})
 
