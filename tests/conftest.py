@@ -70,8 +70,7 @@ class RunningServer:
 @contextlib.contextmanager
 def running_server(*flags, program=EDGEGRASP[1:], seconds=0.0, **more) -> Iterator[RunningServer]:
     words = (sys.executable, *program, "serve", "--http-port", "0", "--grpc-port", "0", *flags)
-    environment = os.environ | {"DUMMY_SECONDS": str(seconds)}
-    with started(*words, env=environment, **more) as process:
+    with started(*words, env=os.environ | {"DUMMY_SECONDS": str(seconds)}, **more) as process:
         line = process.stdout.readline()  # empty once the process is gone
         match = READY_LINE.fullmatch(line)
         assert match, f"the server said {line!r}"
@@ -117,8 +116,7 @@ def transport(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def cloud() -> np.ndarray:
-    rng = np.random.default_rng(0)
-    return rng.uniform(-0.1, 0.1, (500, 3)).astype(np.float32)
+    return np.random.default_rng(0).uniform(-0.1, 0.1, (500, 3)).astype(np.float32)
 
 
 @pytest.fixture(scope="session")

@@ -70,8 +70,7 @@ def test_grasps_are_judged_by_the_labels(scene: Path) -> None:
     assert figures.on_object == 3
     assert (figures.from_below, figures.through_points) == (1, 2)
     assert figures.objects_with_grasp == 1
-    doubtful = judged(scene, grasps[1:3])
-    assert doubtful.objects_with_grasp == 0
+    assert judged(scene, grasps[1:3]).objects_with_grasp == 0
     nothing = judged(scene, [])
     assert (nothing.best, nothing.on_object, nothing.objects_with_grasp) == (0, 0, 0)
     labels = seen_scene()["labels"].astype(np.uint16)  # which may be any numbers
@@ -86,8 +85,7 @@ def test_grasps_are_judged_by_the_labels(scene: Path) -> None:
 def test_a_plane_is_right_within_5_degrees_and_10_mm(scene, tilt, shift, right) -> None:
     turn = np.radians(tilt)
     normal = np.cos(turn) * NORMAL + np.sin(turn) * ALONG
-    plane = normal, float(normal @ (TABLE + shift * NORMAL))
-    found = judged(scene, [], plane).plane
+    found = judged(scene, [], (normal, float(normal @ (TABLE + shift * NORMAL)))).plane
     assert found.angle == pytest.approx(tilt, abs=0.1)
     assert found.right == right
 
@@ -115,8 +113,7 @@ def test_clouds_show_the_same_scene_as_depth_images(scene: Path, tmp_path: Path)
 def test_results_page_and_pictures(scene: Path, run, tmp_path: Path) -> None:
     output = tmp_path / "results"
     asked = ("--support", '{"kind":"ransac"}', "--up", ",".join(map(str, NORMAL)))
-    shown = run("benchmark-real", "--scenes", scene.parent, "--output", output, *asked)
-    assert "1 of 1" in shown
+    assert "1 of 1" in run("benchmark-real", "--scenes", scene.parent, "--output", output, *asked)
     results = json.loads((output / "results.json").read_text())
     assert results["scenes"]["box"]["on_object"] == results["scenes"]["box"]["best"] > 0
     assert results["all"]["on_object"] == results["all"]["planes_right"] == 1

@@ -204,8 +204,7 @@ async def test_turns_come_in_order(running, cloud) -> None:
 
 
 async def test_requests_over_a_bound(serve, transport, cloud) -> None:
-    running = await serve(max_points=600, max_body_bytes=100_000)
-    client = running.connect(transport)
+    client = (await serve(max_points=600, max_body_bytes=100_000)).connect(transport)
     within = {"num_approach_points": 256, "num_candidates": 16_000}
     assert (await client.detect(cloud, **within)).fine
     for option, most in within.items():

@@ -97,8 +97,7 @@ def test_a_form_of_camera_files(http) -> None:
         ({"intrinsics": "60,50"}, "depth_images.0.intrinsics"),
         ({"intrinsics": "60,50,15.5,11.5", "depth_images": "[]"}, "depth_images"),
     ):
-        problem = check(http.post("/v1/grasps", files=images, data=parts), "Problem")
-        assert problem["field"] == field
+        assert check(http.post("/v1/grasps", files=images, data=parts), "Problem")["field"] == field
 
 
 def check(answer: httpx.Response, name: str) -> Any:

@@ -123,8 +123,7 @@ async def test_messages_that_never_end(serve, cloud) -> None:
         connection.stop.set()
         await asyncio.to_thread(sending.join, PATIENCE)
     await running.until_idle()
-    client = running.connect("grpc")
-    assert (await client.detect(cloud)).fine
+    assert (await running.connect("grpc").detect(cloud)).fine
 
 
 class Http2:
@@ -324,8 +323,7 @@ async def test_a_health_check_waits_for_no_other_calls(serve) -> None:
     running.server.service.observe = lambda call: order.append(call.method) or observe(call)
     with contextlib.closing(Http2(running.server.grpc_address)) as connection:
         for number in range(90):
-            path = CHECK if number == 60 else STREAM
-            connection.begin(path, 2 * number + 1)
+            connection.begin(CHECK if number == 60 else STREAM, 2 * number + 1)
         time.sleep(0.5)  # all of them arrive before this event loop looks
         await running.until(lambda: len(order) == 90)
     assert order.index("HealthCheck") < 10
@@ -381,8 +379,7 @@ async def test_silent_streams_give_their_places_to_others(serve, cloud, monkeypa
     silent = [stub.DetectGraspsStream() for _ in range(4)]
     ended = [asyncio.ensure_future(call.code()) for call in silent]
     await running.until(lambda: sum(code.done() for code in ended) == 2)
-    codes = {code.result() for code in ended if code.done()}
-    assert codes == {grpc.StatusCode.RESOURCE_EXHAUSTED}
+    assert {code.result() for code in ended if code.done()} == {grpc.StatusCode.RESOURCE_EXHAUSTED}
     mine = stub.DetectGraspsStream()
     await mine.write(request("", cloud))
     assert (await mine.read()).detection.grasps
@@ -423,8 +420,7 @@ def test_a_cloud_far_too_dense(real_server, cloud) -> None:
             client.detect(dense, objects="off", support="none")
 
     with ThreadPoolExecutor() as threads:
-        attacks = [threads.submit(attack) for _ in range(2)]
-        for each in attacks:
+        for each in [threads.submit(attack) for _ in range(2)]:
             each.result(PATIENCE)
     with GraspClient(real_server.http_url, timeout=PATIENCE) as client:
         client.detect(cloud, num_approach_points=2, num_candidates=20)

@@ -46,8 +46,7 @@ async def test_not_ready_until_loaded(begin, cloud) -> None:
     names = ("", "edgegrasp.v1.GraspService")
     watches = [stub.Watch(health_pb2.HealthCheckRequest(service=name)) for name in names]
     assert [(await watch.read()).status for watch in watches] == [Status.NOT_SERVING] * 2
-    not_ready = (200, 503, 503, Status.NOT_SERVING, "UNAVAILABLE")
-    assert await states(running, cloud) == not_ready
+    assert await states(running, cloud) == (200, 503, 503, Status.NOT_SERVING, "UNAVAILABLE")
     port = int(running.server.http_url.rpartition(":")[2])
     assert not await asyncio.to_thread(is_ready, http_port=port)
     assert (await running.http().get("/v1/models")).json()["title"] == "Not ready"
@@ -79,8 +78,7 @@ async def test_a_server_ends_as_it_loads_where_it_has_to(begin) -> None:
 
 async def test_while_draining_both_transports_say_so(running, transport, cloud) -> None:
     client, by_grpc, http = running.connect(transport), running.connect("grpc"), running.http()
-    health = health_pb2_grpc.HealthStub(by_grpc.channel)
-    watch = health.Watch(health_pb2.HealthCheckRequest())
+    watch = health_pb2_grpc.HealthStub(by_grpc.channel).Watch(health_pb2.HealthCheckRequest())
     assert (await watch.read()).status == Status.SERVING
     assert (await http.get("/health/live")).status_code == 200
     accepted = [await running.hold(client.detect(cloud), "finish")]

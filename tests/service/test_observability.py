@@ -187,8 +187,7 @@ async def test_requests_and_results_of_streams_are_counted(running, cloud: np.nd
     assert info.keys() >= {"name", "digest"}
     assert (info["name"], info["default"], info["device"]) == ("dummy", "true", "cpu")
     requests = [StreamRequest(points) for points in (cloud, cloud[:0], cloud)]
-    answers = [answer async for answer in running.ours("grpc").detect_stream(requests)]
-    assert len(answers) == 3
+    assert len([answer async for answer in running.ours("grpc").detect_stream(requests)]) == 3
     found = await read(running)
     assert found["edgegrasp_stream_results_total", (("code", "OK"),)] == 2.0
     assert found["edgegrasp_stream_results_total", (("code", "INVALID_ARGUMENT"),)] == 1.0
@@ -206,8 +205,7 @@ async def test_hostile_callers_add_no_labels(running, cloud: np.ndarray) -> None
         unknown = client.channel.unary_unary(f"/evil.Service{number}/Method", bytes, bytes)
         assert await unknown(b"").code() is grpc.StatusCode.UNIMPLEMENTED
     after = await read(running)
-    added = requests_total({key: after[key] for key in set(after) - before})
-    assert set(added) == {
+    assert set(requests_total({key: after[key] for key in set(after) - before})) == {
         ("http", "Metrics", "200"),
         ("http", "other", "404"),
         ("http", "DetectGrasps", "405"),

@@ -128,8 +128,7 @@ def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(real_serv
     assert np.linalg.norm(contacts - region, axis=1).max() < np.linalg.norm(half) + 0.002
 
     curl, python = (page.locator(name).text_content() for name in ("#curl", "#python"))
-    printed = run("bash", "-c", curl, cwd=SAMPLES).stdout
-    assert json.loads(printed)["grasps"] == answer["grasps"]
+    assert json.loads(run("bash", "-c", curl, cwd=SAMPLES).stdout)["grasps"] == answer["grasps"]
     assert run(sys.executable, "-c", python, cwd=SAMPLES).stdout.count("[[") == len(contacts)
 
 
@@ -157,8 +156,7 @@ def test_objects_and_points_are_asked_for_and_answers_saved(real_server, open_pa
             page.locator(f"[data-save={kind}]").click()
         saved[kind] = Path(download.value.path())
     grasps = json.loads(saved["json"].read_text())["grasps"]
-    exported = read_isaac_grasps(saved["isaac"].read_text())
-    for grasp, each in zip(grasps, exported, strict=True):
+    for grasp, each in zip(grasps, read_isaac_grasps(saved["isaac"].read_text()), strict=True):
         np.testing.assert_allclose(each.T_object_gripper, grasp["T_cloud_hand"], atol=1e-5)
     with Image.open(saved["picture"]) as picture:
         assert min(picture.size) > 300

@@ -78,8 +78,7 @@ def evaluated(scoring: Any) -> list[Any]:
 def test_scores_are_the_same_everywhere(catalogue, real_server) -> None:
     options: dict[str, Any] = {"seed": 3, "viewpoint": [0.3, 0.1, 0.6]}
     detector, parsed = catalogue.get(), parse_options(options)
-    found = detector.detect(POINTS, parsed).grasps
-    poses = np.stack([grasp.T_cloud_hand for grasp in found])
+    poses = np.stack([grasp.T_cloud_hand for grasp in detector.detect(POINTS, parsed).grasps])
     edges = np.random.default_rng(2).integers(0, 9000, (40, 2))
     for given in ({"edges": edges}, {"hand_poses": poses}):
         expected = detector.score(POINTS, parsed, **given)

@@ -121,8 +121,7 @@ def test_outcomes_are_appended_until_the_file_is_full(start_dummy, cloud, tmp_pa
             ({"cloud": []}, "body.cloud"),
             ({"model": "resnet"}, "options.model"),
         ):
-            answer = http.post("/v1/outcomes", json=TRIED | changes)
-            assert answer.json()["field"] == field
+            assert http.post("/v1/outcomes", json=TRIED | changes).json()["field"] == field
         as_json = {"content-type": "application/json"}
         assert http.post("/v1/outcomes", content=b"{", headers=as_json).status_code == 400
         # A form of a web page elsewhere.

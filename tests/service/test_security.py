@@ -65,8 +65,7 @@ async def test_certificates_are_read_anew(serve, pem, transport, cloud, tmp_path
     assert await before.models()
     put("other_")
     await running.server.service.reload()
-    after = running.ours(transport, tls=tls("other_", "other_"))
-    for client in (after, before):
+    for client in (running.ours(transport, tls=tls("other_", "other_")), before):
         assert len((await client.detect(cloud)).grasps) == 10
     for stranger in (tls("", ""), tls("other_", ""), Tls(ca=pem["other_ca"])):
         assert isinstance(await refused(address, tls=stranger), ServerUnavailableError)
@@ -150,8 +149,7 @@ async def test_no_tls_older_than_1_2_and_a_health_check(serve, server_tls, pem) 
     server = (await serve(**given, tokens=[USER])).server
     port = int(server.http_url.rpartition(":")[2])
     assert await asyncio.to_thread(is_ready, "127.0.0.1", port, pem["server"], pem["ca"])
-    loaded = ServerTls(Settings(**given))
-    assert loaded.http.current.minimum_version == ssl.TLSVersion.TLSv1_2
+    assert ServerTls(Settings(**given)).http.current.minimum_version == ssl.TLSVersion.TLSv1_2
 
 
 async def test_health_checks_read_what_the_server_reads(serve, server_tls, tmp_path, monkeypatch):

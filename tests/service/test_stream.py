@@ -96,8 +96,7 @@ async def test_streams_are_bounded_and_told_that_the_server_is_full(serve, cloud
     await running.until_idle()
     await stream.write(request("first", cloud))
     assert (await stream.read()).request_id == "first"
-    second = running.stub().DetectGraspsStream()
-    assert await second.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+    assert await running.stub().DetectGraspsStream().code() is grpc.StatusCode.RESOURCE_EXHAUSTED
     await stream.done_writing()
     assert await stream.code() is grpc.StatusCode.OK
 
