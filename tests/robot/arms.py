@@ -74,8 +74,7 @@ def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=(), eyes=()):
         for row, box in enumerate(boxes)
     ]
     detection = Detection(grasps, counts, {}, "", gripper, objects=found)
-    cloud = np.concatenate([objects, in_cloud(table), *map(in_cloud, more)])
-    return scene, cloud, detection
+    return scene, np.concatenate([objects, in_cloud(table), *map(in_cloud, more)]), detection
 
 
 def picks_of(

@@ -35,8 +35,7 @@ def fr3():
 
 def assert_pose(found, wanted):
     assert np.linalg.norm(found[:3, 3] - wanted[:3, 3]) < CLOSE
-    turn = Rotation.from_matrix(found[:3, :3].T @ wanted[:3, :3]).magnitude()
-    assert turn < CLOSE_ANGLE
+    assert Rotation.from_matrix(found[:3, :3].T @ wanted[:3, :3]).magnitude() < CLOSE_ANGLE
 
 
 def assert_motion(robot, motion):
@@ -80,8 +79,7 @@ def test_every_box_gets_a_motion_unless_reach_is_asked_for(robot):
 def test_the_hand_comes_to_the_grasp_and_limits_are_kept(robot, x, y, tilt):
     T_base_cloud = TURNED.copy()
     T_base_cloud[:3, :3] = Rotation.from_euler("z", tilt).as_matrix()
-    detection = picks_of(robot, T_base_cloud, boxes=((x, y, 0.04),))
-    for grasp, plan in plans_of(detection):
+    for grasp, plan in plans_of(picks_of(robot, T_base_cloud, boxes=((x, y, 0.04),))):
         T_base_hand = T_base_cloud @ grasp.T_cloud_hand
         assert_pose(robot.hand_pose(plan.grasp_joints), T_base_hand)
         before = T_base_hand.copy()
@@ -390,8 +388,7 @@ def test_an_object_is_not_pressed_into_the_support(fr3, below, lowest):
     points = [placed(grasp, plan)[:, 2].min() for grasp, plan in plans_of(found)]
     assert points == ([] if lowest is None else [pytest.approx(lowest, abs=0.004)])
     there = put_at(BOXES[0][2] - below)  # given to the millimetre: it stays there
-    pressed = picks_of(fr3, boxes=BOXES[:1], place=there, plan="reach")
-    assert pressed.counts["no_place"] == 1
+    assert picks_of(fr3, boxes=BOXES[:1], place=there, plan="reach").counts["no_place"] == 1
 
 
 def test_a_foot_that_no_camera_saw_is_not_pressed_into_the_support(fr3):
@@ -423,8 +420,7 @@ def test_what_stands_in_the_region_is_not_met(fr3):
     there = surface(0.45, -0.4, 0.06)
     detection = picks_of(fr3, boxes=BOXES[:1], more=[there], place={"region": TRAY})
     ((grasp, plan),) = plans_of(detection)
-    gap = np.abs(placed(grasp, plan)[:, None, :2] - there[None, :, :2]).max(axis=2)
-    assert gap.min() > 0.0
+    assert np.abs(placed(grasp, plan)[:, None, :2] - there[None, :, :2]).max(axis=2).min() > 0.0
     assert np.abs(plan.T_base_place[:2, 3] - (0.45, -0.4)).max() > HALF
 
 

@@ -48,8 +48,7 @@ def test_a_grasp_that_holds_nothing_says_so_and_moves_nothing(simulation) -> Non
 
 @pytest.mark.parametrize("name", gripper_names())
 def test_every_gripper_lifts_a_cube_between_its_pads(engine: str, name: str) -> None:
-    gripper = load_gripper(name)
-    T_world_hand = top_down(0.15, 0.15, 0.075 - FINGERTIP + gripper.contact_z_at(0.05))
+    T_world_hand = top_down(0.15, 0.15, 0.075 - FINGERTIP + load_gripper(name).contact_z_at(0.05))
     with ClutterSimulation(engine=engine, gripper=gripper_fields(name)) as simulation:
         simulation.reset_from_poses([cube_at(0.15, 0.15)])
         result = simulation.try_grasp(T_world_hand, shake=True)
@@ -97,8 +96,7 @@ def test_outcomes_do_not_depend_on_what_was_tried_before(simulation: ClutterSimu
         for _ in range(2)
     ]
     forward = [simulation.try_grasp(grasp).opening for grasp in grasps]
-    backward = [simulation.try_grasp(grasp).opening for grasp in reversed(grasps)]
-    assert forward == backward[::-1]
+    assert forward == [simulation.try_grasp(grasp).opening for grasp in reversed(grasps)][::-1]
     last = simulation.try_grasp(grasps[0], to_the_end=True)
     assert simulation.execute_grasp(grasps[0]).opening == last.opening
 
@@ -133,8 +131,7 @@ def test_an_observation_holds_the_objects_alone_and_an_image_shows_them(simulati
     simulation.reset_from_poses([cube_at(0.15, 0.15, 0.2)])  # in the air
     image = simulation.color_image(FRONT).astype(int)
     assert image.shape == (480, 640, 3)
-    red = image[..., 0] > 1.8 * image[..., 1]
-    assert 1000 < red.sum() < 20_000
+    assert 1000 < (image[..., 0] > 1.8 * image[..., 1]).sum() < 20_000
 
 
 def test_an_object_without_a_solid_is_refused(engine: str, tmp_path: Path) -> None:
@@ -148,9 +145,8 @@ def test_an_object_without_a_solid_is_refused(engine: str, tmp_path: Path) -> No
 
 
 def test_wrong_use_is_refused(simulation: ClutterSimulation) -> None:
-    rng = np.random.default_rng(0)
     with pytest.raises(ValueError, match="scene is 'heap'; choose one of packed, pile"):
-        simulation.reset("heap", rng)
+        simulation.reset("heap", np.random.default_rng(0))
     with pytest.raises(FileNotFoundError, match="no object file"):
         simulation.reset_from_poses([ObjectPlacement(Path("gone.urdf"), 1.0, (0, 0, 0), UPRIGHT)])
     simulation.reset_from_poses([cube_at(0.15, 0.15)])

@@ -97,8 +97,7 @@ def test_scenes_of_a_seed_are_all_made_with_the_same_options(tmp_path: Path) -> 
 def test_random_hands_differ_between_scenes_and_are_what_the_network_is_told(tmp_path) -> None:
     options = small(scenes=3, views_per_scene=2, scene="packed", gripper="random")
     list(generate(tmp_path, None, options))
-    paths = find_views([tmp_path])
-    views = [load_view(path) for path in paths]
+    views = [load_view(path) for path in find_views([tmp_path])]
     openings = [view.hand.max_opening for view in views]
     assert openings[::2] == openings[1::2]  # of the two views of each scene
     assert len(set(openings)) == 3

@@ -65,8 +65,7 @@ def test_loss_falls_and_the_best_network_is_kept_with_a_card(make_trainer, tmp_p
 def test_loss_falls_in_a_few_steps_on_the_views_that_come_with_the_project(tmp_path: Path) -> None:
     train, validation = split_by_scene(find_views([SAMPLE]), 0.1, seed=0)
     metadata = CheckpointMetadata("sample", RECIPES["edgegrasp-plus"], 0.0045, "panda")
-    options = TrainingOptions(evaluate_every=1000)
-    run = Trainer(metadata, train, validation, tmp_path, options)
+    run = Trainer(metadata, train, validation, tmp_path, TrainingOptions(evaluate_every=1000))
     before = run.evaluate()
     list(run.run(until=20))
     after = run.evaluate()
