@@ -296,8 +296,7 @@ def test_the_server_keeps_to_its_document(start_dummy, tmp_path: Path) -> None:
     token = "fuzz-0123456789abcdef0123456789abcdef"
     file = tmp_path / "tokens"
     file.write_text(token)
-    flags = ("--log-level", "error", "--admin-token-file", str(file))
-    with start_dummy(*flags) as server:
+    with start_dummy("--log-level", "error", "--admin-token-file", str(file)) as server:
         command = [program, "run", f"{server.http_url}/openapi.json", "--no-color", "--seed", "1"]
         command += ["--header", f"Authorization: Bearer {token}"]
         # What the document allows may be shorter than any answer takes: a 504 is no fault.

@@ -140,8 +140,7 @@ def test_two_planners_are_compared_scene_by_scene(in_process, top_down, run, tmp
 
 
 def test_a_server_killed_and_restarted_changes_nothing(start_dummy, dummy_server, tmp_path) -> None:
-    address = dummy_server.grpc_address
-    calm = benchmark(tmp_path / "calm", "server", "--server", address, rounds=2)
+    calm = benchmark(tmp_path / "calm", "server", "--server", dummy_server.grpc_address, rounds=2)
     shaken = tmp_path / "shaken"
     with ExitStack() as stack:
         first = stack.enter_context(start_dummy())
@@ -188,8 +187,7 @@ LITTLE = {"num_approach_points": 8, "num_candidates": 100}
 
 
 def planned(**changes: object) -> PlannedGrasp:
-    choice = PlannerFlags(planner="in-process", **changes)
-    with open_planner(choice, PAPER, LITTLE) as made:
+    with open_planner(PlannerFlags(planner="in-process", **changes), PAPER, LITTLE) as made:
         grasp = made.make()(seen_under("edgegrasp"), 3)
     assert grasp is not None
     return grasp
