@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
-from itertools import product
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -89,17 +88,11 @@ def leaves_image(
 ) -> Bools:
     """Which hands (E,) reach out of the image on the approach, where nobody knows what is there."""
     places = np.stack(_palm_ways(gripper))  # (slices, S, 3)
-    low, high = places.min(axis=(0, 1)), places.max(axis=(0, 1))
     P_image_hand = P_image_cloud @ T_cloud_hand.astype(np.float64)  # (E, 3, 4)
-    corners = np.array(list(product(*zip(low, high, strict=True))))
-    seen = P_image_hand[:, :, :3] @ corners.T + P_image_hand[:, :, 3:]  # (E, 3, 8)
-    leaves: Bools = np.asarray((np.abs(seen[:, :2]) > seen[:, 2:]).any(axis=(1, 2)))
-    # A hand whose box is within the image needs no closer look.
-    hands = P_image_hand[leaves, None]
-    seen = hands[..., :3] @ places.swapaxes(1, 2) + hands[..., 3:]  # (L, slices, 3, S)
-    outside = (np.abs(seen[:, :, :2]) > seen[:, :, 2:]).any(axis=2)
-    leaves[leaves] = outside.mean(axis=2).max(axis=1) > OUTSIDE_SHARE
-    return leaves
+    seen = P_image_hand[:, :, :3] @ places.reshape(-1, 3).T + P_image_hand[:, :, 3:]
+    outside = (np.abs(seen[:, :2]) > seen[:, 2:]).any(axis=1)  # (E, slices * S)
+    shares = outside.reshape(-1, *places.shape[:2]).mean(axis=2)
+    return np.asarray(shares.max(axis=1) > OUTSIDE_SHARE)
 
 
 def unseen(behind: Float32) -> Float32:
