@@ -40,7 +40,7 @@ def measure(detector: GraspDetector, robot: Robot, cloud: Any, fields: dict[str,
         prepared = detector.prepare(cloud, with_robot(options, robot))
         detection = detector.finish(prepared, detector.evaluate(prepared))
         detected = time.process_time()
-        found = plan_picks(detection, prepared.scene, cloud, options, robot)
+        found = plan_picks(detection, prepared.scene, options, robot)
         if seed >= 0:
             seconds.append(1000 * (time.process_time() - start))
             arm.append(1000 * (time.process_time() - detected))

@@ -170,7 +170,7 @@ class OwnDetector:
         robot = load_robot(self.robot or parsed.robot.name)
         prepared = detector.prepare(sent, with_robot(parsed, robot))
         detection = detector.finish(prepared, detector.evaluate(prepared))
-        return plan_picks(detection, prepared.scene, sent.points, parsed, robot)
+        return plan_picks(detection, prepared.scene, parsed, robot)
 
     def close(self) -> None:
         """Do nothing; a client would close its connection."""

@@ -71,7 +71,6 @@ def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
 def plan_picks(
     detection: Detection,  # made with the options of `with_robot`
     scene: Scene | None,  # the detection's; None: too little is left of the cloud
-    points: object,  # (..., 3) metres, the whole cloud as sent; NaN: no reading
     options: DetectOptions,  # as they were sent
     robot: Robot,
     until: float = float("inf"),  # when to stop, on `time.monotonic()`
@@ -89,11 +88,10 @@ def plan_picks(
     start_joints = np.clip(asked.joints, robot.lower, robot.upper).tolist()
     asked = asked.model_copy(update={"joints": start_joints})
     start = time.perf_counter()
-    points = points if scene.corrected is None else scene.corrected
     picks: list[_Pick] = []
     failures: Counter[str] = Counter()
     kept = _kept(detection)
-    with surrounded(robot, scene, points, asked, options.collision.obstacles) as around:
+    with surrounded(robot, scene, asked, options.collision.obstacles) as around:
         grasps = [grasp for grasp in detection.grasps if grasp.object not in around.own]
         failures["on_arm"] = len(detection.grasps) - len(grasps)
         arm = _Arm(robot, asked, scene, options, around, detection.objects, until)

@@ -101,7 +101,6 @@ def carrying(
 def surrounded(
     robot: Robot,
     scene: Scene,  # what the camera's cloud shows
-    points: object,  # (..., 3) metres, cloud frame: the whole cloud
     asked: RobotArm,  # where the robot is
     boxes: Sequence[Box | OrientedBox],  # beside the cloud, cloud frame
 ) -> Iterator[Surroundings]:
@@ -118,11 +117,11 @@ def surrounded(
         place = T_base_cloud @ T_cloud_box
         known.append((f"collision.obstacles.{row}", core.Box(*(2 * half)), place))
     in_base = CanonicalFrame(T_base_cloud @ np.linalg.inv(scene.frame.T_canonical_cloud))
-    flat, support = np.asarray(points).reshape(-1, 3), None
+    support = None
     if scene.support is not None:
         support = plane_in(in_base, scene.support)
-        known.append(("the support", *_slab(support, flat, T_base_cloud)))
-    voxels = _voxels(support, flat, T_base_cloud)
+        known.append(("the support", *_slab(support, scene.readings, T_base_cloud)))
+    voxels = _voxels(support, scene.readings, T_base_cloud)
     voxels = voxels[~_near_robot(robot, joints, voxels, SELF_DISTANCE)]
     if asked.avoid_unseen:
         hidden = _hidden(support, voxels, in_base.points(scene.viewpoints))
@@ -174,7 +173,7 @@ def _slab(support: SupportPlane, points: Floats, T_base_cloud: Float64) -> tuple
     size, middle = np.array(SUPPORT_SIZE), np.zeros(3)
     if -support.offset < LOW_BASE:
         seen = moved(T_base_cloud, points)
-        seen = seen[np.abs(heights_over(support, seen)) < VOXEL_SIZE]  # NaN is not
+        seen = seen[np.abs(heights_over(support, seen)) < VOXEL_SIZE]
         if len(seen):
             low, high = np.percentile(seen @ upright[:, :2], (0.5, 99.5), axis=0)
             size, middle[:2] = np.array([*(high - low), 2 * VOXEL_SIZE]), (low + high) / 2
@@ -213,16 +212,14 @@ def _voxels(support: SupportPlane | None, points: Floats, T_base_cloud: Float64)
 
     Their grid is the base's: it must not depend on which part of a cloud was selected.
     """
-    if support is None:
-        kept = np.flatnonzero(np.isfinite(points).all(axis=1))
-    else:  # in single precision, since most of an image is support
+    if support is not None:  # in single precision, since most of an image is support
         plane = np.append(support.normal, -support.offset)
         plane = (plane @ T_base_cloud).astype(points.dtype)
         height = points @ plane[:3] + plane[3]
         if -support.offset < LOW_BASE:  # what is below is in its way too
             height = np.abs(height)
-        kept = np.flatnonzero(height > VOXEL_SIZE / 2)  # NaN is not
-    cells = points[kept] @ (T_base_cloud[:3, :3].T / VOXEL_SIZE).astype(points.dtype)
+        points = points[height > VOXEL_SIZE / 2]
+    cells = points @ (T_base_cloud[:3, :3].T / VOXEL_SIZE).astype(points.dtype)
     cells += (T_base_cloud[:3, 3] / VOXEL_SIZE).astype(points.dtype)
     cells = cells[np.einsum("ij,ij->i", cells, cells) < (MAX_RANGE / VOXEL_SIZE) ** 2]
     return _centers(cells, shifts=(-MARGIN, MARGIN))

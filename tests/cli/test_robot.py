@@ -68,7 +68,7 @@ def test_what_is_missing_is_said(refused, words, said, monkeypatch, tmp_path: Pa
 
 def test_what_no_camera_saw_is_avoided_only_with_a_camera(refused, tmp_path: Path) -> None:
     robot = load_robot("fr3")
-    np.save(tmp_path / "cloud.npy", scene_of(robot, np.eye(4))[1])
+    np.save(tmp_path / "cloud.npy", scene_of(robot, np.eye(4))[0].readings)
     joints, base = (",".join(map(str, values)) for values in (robot.home, np.eye(4).ravel()))
     flags = ("--robot", "fr3", "--joints", joints, "--base", base, "--objects", "off")
     said = refused("detect", tmp_path / "cloud.npy", *flags, "--avoid-unseen")

@@ -38,7 +38,7 @@ def hand_over(gripper, x, y, half_height, tilt=0.0):
 
 
 def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=(), eyes=()):
-    """A scene of boxes on a table, its whole cloud, and a detection with a hand over each box."""
+    """A scene of boxes on a table, and a detection with a hand over each box."""
     table = grid(np.arange(0.3, 0.8, 0.01), np.arange(-0.4, 0.4, 0.01), [0.0])
     things = [surface(*box) for box in boxes]
     T_cloud_base = np.linalg.inv(T_base_cloud)
@@ -57,6 +57,7 @@ def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=(), eyes=()):
         approach_allowed=every, contact_allowed=every, at_side=~every, object_of_point=number,
         support=SupportPlane(normal=(0.0, 0.0, 1.0), offset=float(foot[2])), obstacles=None,
         viewpoints=frame.points(in_cloud(np.reshape(eyes, (-1, 3)))),
+        readings=np.concatenate([objects, in_cloud(table), *map(in_cloud, more)]),
     )  # fmt: skip
     poses = [T_cloud_base @ hand_over(robot.gripper, *box) for box in boxes]
     grasps = [
@@ -74,7 +75,7 @@ def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=(), eyes=()):
         for row, box in enumerate(boxes)
     ]
     detection = Detection(grasps, counts, {}, "", gripper, objects=found)
-    return scene, np.concatenate([objects, in_cloud(table), *map(in_cloud, more)]), detection
+    return scene, detection
 
 
 def picks_of(
@@ -91,7 +92,7 @@ def picks_of(
     **given,
 ):
     """The detection with the arm's plans, the table raised by metres over the arm's base."""
-    scene, cloud, detection = scene_of(robot, T_base_cloud, **given)
+    scene, detection = scene_of(robot, T_base_cloud, **given)
     scene, detection = changed(scene, detection)
     T_base_cloud = T_base_cloud.copy()
     T_base_cloud[2, 3] += raised
@@ -100,4 +101,4 @@ def picks_of(
     asked["joints"] = (robot.home if joints is None else np.asarray(joints)).tolist()
     parsed = parse_options({"robot": asked, **(options or {})})
     with_robot(parsed, robot)
-    return plan_picks(detection, scene, cloud, parsed, robot, until)
+    return plan_picks(detection, scene, parsed, robot, until)

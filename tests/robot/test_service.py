@@ -34,7 +34,7 @@ class Catalogue:
     pace = Pace()
 
     def __init__(self, robot):
-        self.scene, self.cloud, self.detection = scene_of(robot)
+        self.scene, self.detection = scene_of(robot)
 
     def get(self, name):
         return self
@@ -59,11 +59,11 @@ def ask(robot, transport, settings=SETTINGS, **changes):
     """The answer to a request about the robot, and the catalogue that it went to."""
     catalogue = Catalogue(robot)
     asked = {"name": "fr3", "T_base_cloud": TURNED, "joints": robot.home} | changes
-    request = Request(catalogue.cloud, {"robot": asked})
+    request = Request(catalogue.scene.readings, {"robot": asked})
     if transport == "grpc":
         body = message_of(request).SerializeToString()
         return answer(Job("DetectGrasps", "grpc", body, 60.0), catalogue, settings), catalogue
-    text = {"points": catalogue.cloud.tolist(), "options": dict(request.options)}
+    text = {"points": catalogue.scene.readings.tolist(), "options": dict(request.options)}
     job = Job("DetectGrasps", "http", json.dumps(text).encode(), 60.0, "application/json")
     return answer(job, catalogue, settings), catalogue
 

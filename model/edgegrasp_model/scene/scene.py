@@ -102,7 +102,8 @@ class Scene(Surroundings):
     confidence: dict[int, float] = field(default_factory=dict)  # probability of each, if found
     # (3, 4) point to place in the image that was sent, its sides at -1 and 1; None: not known
     P_image_cloud: Float64 | None = None
-    corrected: Float32 | None = None  # (M, 3) all points, cloud frame, if depths were corrected
+    # (M, 3) what an arm has to avoid: every reading, whatever the workspace; cloud frame
+    readings: Float32 = field(default_factory=lambda: np.empty((0, 3), np.float32))
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ class SelectedPoints:
     viewpoints: Float64  # (W, 3) the cameras
     labels: Int64  # (R,) of the rows of the cloud as sent, as in `DebugInfo`
     confidence: dict[int, float]  # of each object that the network found
-    corrected: Float32 | None = None  # (N, 3) all points, if their depths were corrected
+    readings: Float32  # (N, 3) every one, as in `Scene`
 
 
 def select_points(
@@ -127,10 +128,10 @@ def select_points(
     for name in ("approach_region", "contact_region"):
         if (region := getattr(options, name)) is not None:
             check_region(region, sent, name)
-    counts["points"], corrected, found = len(sent.points), None, None
+    counts["points"], found = len(sent.points), None
     if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
         sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
-        corrected = sent.points
+    readings = sent.points if options.robot is None else sent.points[~veils(sent, viewpoints)]
     if options.workspace is not None:
         reach = FOLLOWED_REACH if options.follows_only else HAND_REACH
         sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
@@ -178,7 +179,7 @@ def select_points(
     kept = near_objects_along(plan, number)
     near, number = sent.take(kept), number[kept]
     up = _up(options, seen, support, None if options.viewpoint is None else found)
-    return SelectedPoints(near, number, support, up, viewpoints, labels, confidence, corrected)
+    return SelectedPoints(near, number, support, up, viewpoints, labels, confidence, readings)
 
 
 def _objects_given(sent: CheckedCloud, options: DetectOptions) -> bool:
@@ -248,7 +249,7 @@ def build_scene(
         confidence=selected.confidence,
         P_image_cloud=projection,
         obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
-        corrected=selected.corrected,
+        readings=selected.readings,
     )
 
 

@@ -186,7 +186,7 @@ class _Work:
         if robot is not None:
             until = self.deadline - ENCODE_SHARE * self.job.remaining
             with self.stage("arm"):
-                detection = plan_picks(detection, prepared.scene, cloud.points, asked, robot, until)
+                detection = plan_picks(detection, prepared.scene, asked, robot, until)
         return detection
 
     def decode(self) -> tuple[Any, CloudInput, DetectOptions, dict[str, Array]]:
