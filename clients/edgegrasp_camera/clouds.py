@@ -27,7 +27,6 @@ class CloudInput:
     segment_ids: object | None = None  # (N,) or (H, W) integers
     view_ids: object | None = None  # (N,) or (H, W) integers: which of options.viewpoint saw it
     viewpoint: Any = None  # as images and files have it: (x, y, z) of the camera, or of several
-    image_sizes: tuple[tuple[int, int], ...] = ()  # (H, W) of each of several images, in order
     warnings: tuple[str, ...] = ()  # warnings from reading it, for the answer
 
 

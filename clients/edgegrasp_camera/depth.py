@@ -133,14 +133,8 @@ def fuse_depth_images(depths: Sequence[Array], views: Sequence[Any]) -> CloudInp
     if len(views) == 1:
         return CloudInput(clouds[0], viewpoint=cameras[0], warnings=tuple(doubts))
     together = np.concatenate([cloud.reshape(1, -1, 3) for cloud in clouds], axis=1)
-    sizes = tuple((cloud.shape[0], cloud.shape[1]) for cloud in clouds)
-    return CloudInput(
-        together,
-        view_ids=np.repeat(np.arange(len(clouds)), np.prod(sizes, axis=1)),
-        viewpoint=tuple(cameras),
-        image_sizes=sizes,
-        warnings=tuple(doubts),
-    )
+    view_ids = np.repeat(np.arange(len(clouds)), [cloud.size // 3 for cloud in clouds])
+    return CloudInput(together, view_ids=view_ids, viewpoint=tuple(cameras), warnings=tuple(doubts))
 
 
 def _intrinsics_warnings(camera: Intrinsics, shape: tuple[int, ...], field: str) -> Iterator[str]:

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from tests.checks import refusal
 
@@ -106,25 +105,6 @@ def test_several_depth_images_show_each_object_once() -> None:
     found = detector().detect(cloud, DetectOptions.model_validate({"viewpoint": cloud.viewpoint}))
     assert len(found.objects) == 4
     assert found.grasps
-
-
-@pytest.mark.parametrize("views", [1, 2])
-def test_edges_that_a_camera_smooths_do_not_make_objects_larger(views: int) -> None:
-    poses = [camera(0.7, turn, 0.9) for turn in (0.0, 2.1)[:views]]
-    sharp = [np.nan_to_num(render([table(), *boxes_on_table(1)], T)[..., 2]) for T in poses]
-
-    def sizes(depths: list[np.ndarray]) -> np.ndarray:
-        intrinsics = Intrinsics(FOCAL_LENGTH, FOCAL_LENGTH, WIDTH / 2, HEIGHT / 2)
-        cloud = fuse_depth_images(depths, [DepthView(intrinsics, pose) for pose in poses])
-        found = detector().detect(
-            cloud, DetectOptions.model_validate({"viewpoint": cloud.viewpoint})
-        )
-        assert all(one.best_score is not None and one.best_score > 0.5 for one in found.objects)
-        halves = sorted((one.half_extents for one in found.objects), key=lambda half: half[2])
-        return np.array([[*sorted(half[:2]), half[2]] for half in halves])
-
-    smooth = sizes([ndimage.uniform_filter(depth, 2) for depth in sharp])
-    np.testing.assert_allclose(smooth, sizes(sharp), atol=0.008)
 
 
 def test_normals_that_contradict_each_other_are_estimated() -> None:

@@ -41,7 +41,7 @@ class CheckedCloud:
     normals: Float32 | None = None  # (N, 3)
     segment_ids: Int64 | None = None  # (N,)
     view_ids: Int64 | None = None  # (N,)
-    image_sizes: tuple[tuple[int, int], ...] = ()  # (H, W) of the images whose pixels the rows are
+    image_size: tuple[int, int] | None = None  # (H, W) of an organised cloud as sent
     step: int = 1  # between its rows and columns that are kept
     warnings: tuple[str, ...] = ()
 
@@ -52,11 +52,6 @@ class CheckedCloud:
         arrays = {name: array[place] for name, array in beside.items() if array is not None}
         points = self.points.take(place, axis=0)  # many times faster than indexing
         return replace(self, points=points, row=self.row[place], **arrays)
-
-    @property
-    def image_size(self) -> tuple[int, int] | None:
-        """(H, W) of an organised cloud as sent."""
-        return self.image_sizes[0] if len(self.image_sizes) == 1 else None
 
     def looks_along_z(self) -> bool:
         """Whether it is an image whose columns run along x and rows along y, seen from the origin.
@@ -102,12 +97,12 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
     if not is_array or points.ndim not in (2, 3) or points.shape[-1] != 3:
         fix = "Send float32 or float64 metres, (N, 3) or (H, W, 3), or depth_images."
         raise wrong_array("cloud", points, fix)
-    size, said, sizes, step = points.size // 3, sent.warnings, sent.image_sizes, 1
+    size, said, image_size, step = points.size // 3, sent.warnings, None, 1
     row = np.arange(size)
     if holes := points.ndim == 3:
         # A single row of points, such as fused images, is not an image.
-        sizes = sizes if 1 in points.shape[:2] else (points.shape[:2],)
-        large = len(sizes) == 1 and np.greater_equal(sizes[0], LARGE_IMAGE).all()
+        image_size = None if 1 in points.shape[:2] else points.shape[:2]
+        large = image_size is not None and np.greater_equal(image_size, LARGE_IMAGE).all()
         step = 2 if thin and large and _pixel_spacing(points) <= 0.00125 else 1
         row = row.reshape(points.shape[:2])[::step, ::step].reshape(-1)
         points = points[::step, ::step].reshape(-1, 3)
@@ -148,7 +143,9 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
         if (array := getattr(sent, name)) is not None
     }
     points = np.require(points, np.float32, ("C", "W"))  # loops are not compiled for read-only ones
-    return CheckedCloud(points, row, size, **arrays, image_sizes=sizes, step=step, warnings=said)
+    return CheckedCloud(
+        points, row, size, **arrays, image_size=image_size, step=step, warnings=said
+    )
 
 
 def _readings(points: Floats, holes: bool) -> Int64:

@@ -6,7 +6,6 @@ A U-Net on depth alone, as networks that segment unseen objects from simulated d
 et al., T-RO 2021): its input has twice the resolution of its output.
 """
 
-import math
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,14 +15,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
+from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.scene.cloud import (
     LARGE_IMAGE,
     MAX_VIEW_TANGENT,
     OUTLIER_PERCENT,
     SUBSAMPLE_SIZE,
-    CheckedCloud,
     subsample,
     unit,
     usual_up,
@@ -116,7 +114,6 @@ MIN_FILLED = 0.93  # of the pixels between two that show something; else pixels 
 # Metres at the median depth: larger pixels are divided, and those of less than half show noise.
 MAX_PIXEL_SIZE = 0.003
 SURFACE_DEPTH = 0.02  # metres; a point nearer by this much hides another of the same pixel
-VEIL_ANGLE = math.radians(80)  # from a slope's normal to the camera; surfaces are hardly seen so
 
 
 class RangeImage(NamedTuple):
@@ -262,62 +259,6 @@ def _fill_holes(image: Float32) -> Float32:
     agree = high - low < SURFACE_DEPTH + 0.01 * high
     out[rows[agree] + 1, columns[agree] + 1] = np.nanmean(near[:, agree], axis=0)
     return out
-
-
-def veils(cloud: CheckedCloud, viewpoints: Float64) -> Bools:
-    """Which points (N,) of images lie between an edge and what is behind it, where nothing is.
-
-    Cameras that compare or smooth windows of pixels interpolate there. `viewpoints` (W, 3) are of
-    the images, cloud frame; none of a cloud that is no image.
-    """
-    veiled, first = np.zeros(len(cloud.points), dtype=np.bool_), 0
-    images = cloud.image_sizes if len(cloud.image_sizes) == len(viewpoints) else ()
-    for (height, width), viewpoint in zip(images, viewpoints.astype(np.float32), strict=False):
-        last = first + height * width
-        rows = slice(*np.searchsorted(cloud.row, (first, last)))
-        pixel = cloud.row[rows] - first
-        veiled[rows] = _veils(cloud.points[rows], pixel, (height, width), cloud.step, viewpoint)
-        first = last
-    return veiled
-
-
-@compiled("contract")
-def _veils(
-    points: Float32, pixel: Int64, size: tuple[int, int], step: int, viewpoint: Float32
-) -> Bools:
-    """Which points (N,) lie, with both neighbours in a row or column, on one grazing slope.
-
-    One neighbour is enough beside a hole.
-    """
-    (height, width), limit = size, np.float32(np.sin(VEIL_ANGLE) ** 2)
-    index, distance = np.full(height * width, -1, np.int32), np.empty(len(points), np.float32)
-    for n in range(len(points)):
-        index[pixel[n]] = n
-        x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        distance[n] = np.sqrt(
-            (x - viewpoint[0]) ** 2 + (y - viewpoint[1]) ** 2 + (z - viewpoint[2]) ** 2
-        )
-    veiled = np.zeros(len(points), np.bool_)
-    for n in range(len(points)):
-        place = pixel[n]
-        row = place - place % width
-        for ahead, first, end in ((step, row, row + width), (step * width, 0, len(index))):
-            slope = 0
-            for side in (-1, 1):
-                beside = place + side * ahead
-                if beside < first or beside >= end or index[beside] < 0:
-                    continue
-                other = index[beside]
-                rise = distance[other] - distance[n]
-                x = points[other, 0] - points[n, 0]
-                y = points[other, 1] - points[n, 1]
-                z = points[other, 2] - points[n, 2]
-                if rise * rise <= limit * (x * x + y * y + z * z):
-                    slope = 0
-                    break
-                slope += side if rise > 0 else -side
-            veiled[n] |= slope != 0
-    return veiled
 
 
 def scene_features(

@@ -41,7 +41,7 @@ from edgegrasp_model.scene.cloud import (
     unit,
     voxelise,
 )
-from edgegrasp_model.scene.network import NEAREST_DEPTH, veils
+from edgegrasp_model.scene.network import NEAREST_DEPTH
 from edgegrasp_model.scene.obstacles import SolidBoxes, box_pose
 from edgegrasp_model.scene.segment import (
     BACKGROUND,
@@ -131,14 +131,14 @@ def select_points(
     counts["points"], found = len(sent.points), None
     if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
         sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
-    readings = sent.points if options.robot is None else sent.points[~veils(sent, viewpoints)]
+    readings = sent.points
     if options.workspace is not None:
         reach = FOLLOWED_REACH if options.follows_only else HAND_REACH
         sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
-    inside, veiled = inside_workspace(sent.points, options.workspace), veils(sent, viewpoints)
     rows: Int64 | slice = slice(None)
     if len(viewpoints) == 0 and len(sent.points) > 0:
         rows, viewpoints = _seen_from_above(sent.points, options.known_up)
+    inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
     # The caller's segments, 0 and below meaning none; else all points are one object.
     ids, one = sent.segment_ids, np.zeros(len(sent.points), dtype=np.int64)
@@ -153,7 +153,7 @@ def select_points(
     height, margin = above_all if support is None else support.heights(seen)
     labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
     labels[sent.row[np.abs(height) <= margin]] = SUPPORT
-    above = np.flatnonzero((height > margin) & ~veiled)
+    above = np.flatnonzero(height > margin)
     sent, inside = sent.take(above), inside[above]
     counts["above_support"] = int(inside.sum())
     plan = (support.frame.points(sent.points) if support else sent.points.astype(np.float64))[:, :2]
@@ -166,7 +166,7 @@ def select_points(
         elif options.viewpoint is not None and (
             (found.number >= 0).any() or np.median(seen.distance()) < NEAREST_DEPTH
         ):
-            number, confidence = found.number[above], dict(enumerate(found.confidence.tolist()))
+            number, confidence = found.number, dict(enumerate(found.confidence.tolist()))
     if not given:
         number = without_long(number, sent.points, options.max_object_size)
         if counts["above_support"] and not (inside & (number >= 0)).any():
