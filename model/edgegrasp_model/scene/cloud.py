@@ -113,10 +113,7 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
         raise InvalidRequest("cloud", value, "Send an image or points in metres.")
     low, high = (np.array([end(axis) for axis in points.T]) for end in (np.min, np.max))
     if not np.isfinite([low, high]).all():
-        finite = np.isfinite(points).all(axis=1)
-        value = f"{int((~finite).sum())} points with NaN or infinity, the first in row "
-        value += f"{row[np.argmin(finite)]}"
-        raise InvalidRequest("cloud", value, "Remove points without a finite x, y, z.")
+        raise _not_finite(points, row)
     if (extent := float((high - low).max())) < MIN_CLOUD_EXTENT:
         said += (f"the cloud is {extent:.2g} m wide: send metres, or another depth_scale.",)
     if extent > MAX_CLOUD_EXTENT:
@@ -378,6 +375,13 @@ def wrong_array(field: str, array: object, fix: str) -> InvalidRequest:
     if isinstance(array, np.ndarray):
         value = f"dtype {array.dtype}, shape {array.shape}"
     return InvalidRequest(field, value, fix)
+
+
+def _not_finite(points: Floats, row: Int64) -> InvalidRequest:
+    finite = np.isfinite(points).all(axis=1)
+    bad = f"the first in row {row[np.argmin(finite)]}"
+    value = f"{int((~finite).sum())} points with NaN or infinity, {bad}"
+    return InvalidRequest("cloud", value, "Remove points without a finite x, y, z.")
 
 
 def _without_far_points(points: Floats) -> Int64:
