@@ -249,15 +249,27 @@ def _render(
     return pixels.reshape(height, width, 3)
 
 
+@compiled("contract")
 def _fill_holes(image: Float32) -> Float32:
     """The image, an empty pixel filled with the mean of its neighbours if most exist and agree."""
-    seen, out = ~np.isnan(image[..., 2]), image.copy()
-    around = ndimage.convolve(seen.astype(np.int8), np.ones((3, 3), np.int8))
-    rows, columns = np.nonzero(((around >= 4) & ~seen)[1:-1, 1:-1])
-    near = np.stack([image[rows + k, columns + m] for k, m in np.ndindex(3, 3)], dtype=np.float64)
-    low, high = np.nanmin(near[..., 2], axis=0), np.nanmax(near[..., 2], axis=0)
-    agree = high - low < SURFACE_DEPTH + 0.01 * high
-    out[rows[agree] + 1, columns[agree] + 1] = np.nanmean(near[:, agree], axis=0)
+    (height, width, _), out = image.shape, image.copy()
+    for i in range(1, height - 1):
+        for j in range(1, width - 1):
+            if not np.isnan(image[i, j, 2]):
+                continue
+            count, low, high = 0, np.inf, 0.0
+            x = y = z = 0.0
+            for k in range(-1, 2):
+                for m in range(-1, 2):
+                    depth = image[i + k, j + m, 2]
+                    if not np.isnan(depth):
+                        count += 1
+                        low, high = min(low, depth), max(high, depth)
+                        x += image[i + k, j + m, 0]
+                        y += image[i + k, j + m, 1]
+                        z += depth
+            if count >= 4 and high - low < SURFACE_DEPTH + 0.01 * high:
+                out[i, j, 0], out[i, j, 1], out[i, j, 2] = x / count, y / count, z / count
     return out
 
 
