@@ -278,7 +278,7 @@ def _learn(
     # Products in bfloat16 are some three times as fast on processors that have them.
     with torch.autocast("cpu", torch.bfloat16):
         output = network(batch.features.contiguous(memory_format=torch.channels_last))
-    parts = scene_loss(SceneOutput(*(each.float() for each in output)), batch)
+    parts = scene_loss(output, batch)
     optimiser.zero_grad(set_to_none=True)
     torch.stack(list(parts.values())).sum().backward()  # type: ignore[no-untyped-call]
     torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)

@@ -180,6 +180,13 @@ def test_a_hand_s_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it()
         assert torch.equal(hand_scores(HandBatch(*parts), HAND), together[rows])
 
 
+def test_bfloat16_changes_a_hand_s_score_little() -> None:
+    batch, network = look(4), build_network(HAND).eval()
+    exact = network(batch).detach()  # while gradients are recorded
+    close = 0.03 * float(exact.std())
+    torch.testing.assert_close(scores(network, batch), exact, rtol=0, atol=close)
+
+
 def test_weights_that_were_changed_are_those_that_score() -> None:
     batch = look(5)
     changed, fresh = (build_network(TINY["hand"]).eval() for _ in range(2))

@@ -113,13 +113,13 @@ class HandNet(nn.Module):
         """Logits (E,) of success; in training `left_out` draws what dropout removes."""
         known = batch.description[:, : self.config.description_size]
         description = (known - self.mean) / self.std  # (E, F)
-        encoder, chunks = layers.packed(self.point_encoder), []
+        encoder, chunks = layers.packed(self.point_encoder, layers.FAST), []
         for points, count in layers.in_chunks(HANDS_AT_A_TIME, batch.points, batch.point_count):
             positions, normals = torch.split(points, 3, dim=2)
             encoded = encoder(torch.cat((positions / POINT_UNIT, normals), dim=2))  # (E, P, C)
-            if layers.float32_inference(encoded):
+            if layers.float32_inference(points):
                 pooled = torch.zeros(len(encoded), 2 * encoded.shape[2])
-                _pool(encoded.numpy(), count.numpy(), pooled.numpy())
+                _pool(encoded.float().numpy(), count.numpy(), pooled.numpy())
             else:
                 there = torch.arange(points.shape[1], device=points.device) < count.unsqueeze(1)
                 features = F.relu(encoded) * there.unsqueeze(2)  # (E, P, C), none below 0
@@ -130,7 +130,8 @@ class HandNet(nn.Module):
         if left_out is not None:
             draws = torch.rand(seen.shape, generator=left_out, device=left_out.device)
             seen = seen * (draws >= DROPOUT).to(seen.device) / (1.0 - DROPOUT)
-        logits = layers.by_chunks(layers.packed(self.classifier), seen, layers.EDGE_ROWS)
+        classifier = layers.packed(self.classifier, layers.FAST)
+        logits = layers.by_chunks(classifier, seen, layers.EDGE_ROWS)
         return logits.squeeze(1)  # (E,)
 
 

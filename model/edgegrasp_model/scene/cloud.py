@@ -449,8 +449,7 @@ def clean_cloud(
 
     Normals are as given, else estimated and turned to the camera.
     """
-    # For a single round of queries a tree that is quickly built is faster.
-    tree = cKDTree(middles, balanced_tree=False, compact_nodes=False)
+    tree = cKDTree(middles, balanced_tree=False)  # for one round of queries
     distance, near = map(np.asarray, tree.query(middles, k=range(1, min(20, len(middles)) + 1)))
     kept = np.ones(len(middles), dtype=bool)
     if len(middles) > 8:  # outliers lie farther than others from the 8 points next to them

@@ -69,7 +69,7 @@ class SceneNet(nn.Module):
         for across, layer, beside in zip(self.across, self.up, kept[::-1], strict=True):
             x = functional.interpolate(across(x), size=beside.shape[2:], mode="bilinear")
             x = layer(x + beside)
-        out = self.head(x)
+        out = self.head(x).float()  # the rest may be in bfloat16
         return SceneOutput(out[:, :3], VOTE_UNIT * out[:, 3:6], out[:, 6:8], out[:, 8:])
 
     def fused(self) -> "SceneNet":

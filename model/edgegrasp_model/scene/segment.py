@@ -144,7 +144,8 @@ def run_network(
     footprint: float,  # width of a pixel at a depth of one metre, metres
 ) -> tuple[Pixels, Float64]:
     """A network's output for a range image, and its estimate of up (3,); camera frame."""
-    with torch.inference_mode(), one_thread():
+    fast = torch.autocast("cpu", torch.bfloat16, enabled=torch.cpu._is_avx512_bf16_supported())
+    with torch.inference_mode(), one_thread(), fast:
         output = network(torch.from_numpy(features)[None])
         classes = output.classes[0].softmax(dim=0).contiguous().numpy()
         votes = output.votes[0].permute(1, 2, 0).contiguous().numpy()
