@@ -44,14 +44,14 @@ __all__ = [
 
 
 class Cone(TypedDict):
-    """Directions within an angle of a given one."""
+    """Directions within an angle of a given direction."""
 
     direction: Numbers
     max_angle: float
 
 
 class AutoPlane(TypedDict):
-    """The plane of the points near objects that are classified as support."""
+    """The plane through the points near objects that are classified as support."""
 
     kind: Literal["auto"]
 
@@ -95,21 +95,21 @@ class HalfSpace(TypedDict):
 
 
 class Indices(TypedDict):
-    """Points by their row in the cloud as it was sent."""
+    """Points, given by their rows in the cloud as it was sent."""
 
     kind: Literal["indices"]
     indices: Sequence[int] | NDArray[Any]
 
 
 class Mask(TypedDict):
-    """Points by a boolean for each row of the cloud as it was sent."""
+    """Points, given by a boolean for each row of the cloud as it was sent."""
 
     kind: Literal["mask"]
     mask: Sequence[bool] | NDArray[Any]
 
 
 class ObjectChoice(TypedDict, total=False):
-    """Some of the objects that are found, by their numbers in an answer to the same cloud."""
+    """Some of the detected objects, by their numbers in an answer to the same cloud."""
 
     include: Sequence[int] | NDArray[Any]
     exclude: Sequence[int] | NDArray[Any]
@@ -148,7 +148,7 @@ class RansacPlane(TypedDict):
 
 
 class Segments(TypedDict):
-    """Points by their segment in `segment_ids`, sent with the cloud."""
+    """Points, given by their segments in `segment_ids`, which are sent with the cloud."""
 
     kind: Literal["segments"]
     ids: Sequence[int] | NDArray[Any]
@@ -172,7 +172,7 @@ class SupportPlane(TypedDict):
 
 
 class Suppression(TypedDict, total=False):
-    """Drops a grasp that is nearer to a better one than both distances."""
+    """Drops a grasp that lies within both distances of a better one."""
 
     translation: float
     rotation: float

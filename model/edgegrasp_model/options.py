@@ -1,7 +1,7 @@
 """The options of one detection; every option is defined here.
 
 The command line's flags, the OpenAPI document, the client's types and the documentation's table are
-made from these models; the gRPC messages have the same fields, which a test compares.
+generated from these models; a test checks that the gRPC messages have the same fields.
 """
 
 import base64
@@ -28,7 +28,7 @@ from edgegrasp_model.errors import parse
 
 Tuple = TypeVar("Tuple", bound=tuple[Any, ...])
 
-FARTHEST = 1e7  # metres from the origin, any way: beyond every place on Earth
+FARTHEST = 1e7  # metres from the origin along an axis: more than the Earth's radius
 
 
 def _no_text_or_truth(value: object) -> object:
@@ -64,7 +64,7 @@ ApproachPoints = Annotated[int, Field(ge=1, le=MAX_APPROACH_POINTS), numeric]
 Candidates = Annotated[int, Field(ge=1, le=MAX_CANDIDATES), numeric]
 MAX_VIEWS = 64
 MAX_PREVIOUS, MAX_SURFACE = 64, 128  # grasps or objects of an answer; points of an object
-APPROACH_STREAM, CANDIDATE_STREAM, SUPPORT_STREAM = range(3)  # of random numbers, for a seed
+APPROACH_STREAM, CANDIDATE_STREAM, SUPPORT_STREAM = range(3)  # streams of random numbers of a seed
 CollisionMode = Literal["avoid", "penalise", "ignore"]
 
 
@@ -93,7 +93,7 @@ Quaternion = Annotated[tuple[Finite, Finite, Finite, Finite], AfterValidator(_of
 
 
 def _in_one_line(schema: dict[str, Any]) -> None:
-    """Descriptions of fields without the line breaks of their docstrings."""
+    """Remove the docstrings' line breaks from the descriptions of fields."""
     for part in schema.get("properties", {}).values():
         if "description" in part:
             part["description"] = " ".join(part["description"].split())
@@ -162,7 +162,7 @@ class HalfSpace(Strict):
 
 
 class Indices(Strict):
-    """Points by their row in the cloud as it was sent."""
+    """Points, given by their rows in the cloud as it was sent."""
 
     kind: Literal["indices"] = "indices"
     indices: tuple[Row, ...] = Field(max_length=MAX_ROWS)
@@ -185,7 +185,7 @@ def _byte_for_each(value: object) -> bytes:
 
 
 class Mask(Strict):
-    """Points by a boolean for each row of the cloud as it was sent."""
+    """Points, given by a boolean for each row of the cloud as it was sent."""
 
     kind: Literal["mask"] = "mask"
     mask: Annotated[
@@ -204,7 +204,7 @@ class Mask(Strict):
 
 
 class Segments(Strict):
-    """Points by their segment in `segment_ids`, sent with the cloud."""
+    """Points, given by their segments in `segment_ids`, which are sent with the cloud."""
 
     kind: Literal["segments"] = "segments"
     ids: tuple[Annotated[int, Field(strict=True, ge=-(2**31), lt=2**31)], ...] = Field(
@@ -220,36 +220,36 @@ Shapes = Annotated[tuple[Shape, ...], Field(max_length=MAX_SHAPES)]
 class Region(Strict):
     """Points in any of `include` and in none of `exclude`.
 
-    Shapes see each voxel of the processed cloud as its mean point. Rows (indices, mask, segments)
-    contain a voxel if they contain at least half of its points.
+    A shape contains a voxel of the processed cloud if it contains the voxel's mean point. Rows
+    (indices, mask, segments) contain a voxel if they contain at least half of its points.
     """
 
     include: Shapes = Field(default=(), description="union of shapes; empty: everywhere")
-    exclude: Shapes = Field(default=(), description="union of shapes taken away")
+    exclude: Shapes = Field(default=(), description="union of shapes to leave out")
 
 
 class Cone(Strict):
-    """Directions within an angle of a given one."""
+    """Directions within an angle of a given direction."""
 
     direction: Direction = Field(
         description="direction in which the hand moves, its +z axis; any length but zero"
     )
     max_angle: Annotated[float, Field(ge=0.0, le=math.pi), numeric]
-    """greatest angle between it and the hand's direction, radians"""
+    """greatest angle between `direction` and the hand's +z axis, radians"""
 
 
 class ApproachDirection(Strict):
     """Directions in which the hand may move: those in any cone or in the preset.
 
     `top-down` is within 30 degrees of straight down, `side` within 30 degrees of the horizontal,
-    both relative to `up`. Without this option, every hand is allowed that does not come from more
+    both relative to `up`. Without this option, all hands are allowed but those that come from more
     than 6 degrees below the horizontal.
     """
 
     cones: tuple[Cone, ...] = Field(default=(), max_length=64)
-    """directions are allowed in any of these"""
+    """a direction in any of these is allowed"""
     preset: Literal["top-down", "side"] | None = None
-    """or in this, relative to up"""
+    """a direction in this is allowed too, relative to up"""
 
     @model_validator(mode="after")
     def _not_empty(self) -> Self:
@@ -265,20 +265,20 @@ class SupportPlane(Strict):
     normal: UnitVector = Field(description="unit normal, away from the table")
     offset: Finite = Field(description="normal . x of its points, metres")
     max_depth_error: Annotated[float, Field(ge=0.0, le=0.3), numeric] = 0.0
-    """greatest relative error of a camera's depths: each view is scaled about its viewpoint by up
-    to this, so that its table lies in the plane; 0: no correction"""
+    """greatest relative error of a camera's depths: each view is scaled about its viewpoint by at
+    most this share, to move its table into the plane; 0: no correction"""
 
 
 class RansacPlane(Strict):
     """The largest plane in the cloud that is nearly level.
 
-    Found from the request's seed, within the workspace. Its points are removed before anything
-    else; the plane stays as an obstacle. If none is found, there is a warning and no support plane.
+    It is searched within the workspace, with the request's seed. Its points are removed first; the
+    plane stays as an obstacle. If none is found, there is a warning and no support plane.
     """
 
     kind: Literal["ransac"] = "ransac"
     distance: Annotated[float, Field(gt=0.0, le=0.1), numeric] = 0.005
-    """points within this distance belong to the plane, metres; noise may raise it"""
+    """points within this distance belong to the plane, metres; it is raised if depths are noisy"""
     max_tilt: Annotated[float, Field(ge=0.0, le=1.6), numeric] = 0.35
     """greatest angle between its normal and up, radians; π/2: any plane"""
     min_share: Annotated[float, Field(gt=0.0, le=1.0), numeric] = 0.1
@@ -286,10 +286,10 @@ class RansacPlane(Strict):
 
 
 class AutoPlane(Strict):
-    """The plane of the points near objects that are classified as support.
+    """The plane through the points near objects that are classified as support.
 
     If `up` is sent, the plane is level to within 30 degrees. If no plane is seen, there is a
-    warning, and one is assumed only under a cloud that was cut off above it. Its normal is then
+    warning, and one is assumed only if the cloud was cropped above its support. Its normal is then
     `up`, or +z if no camera is at the origin, else estimated from the lower edge of the cloud.
     """
 
@@ -308,7 +308,7 @@ class Linkage(Strict):
     """A linkage that carries each finger along an arc; the tips move forward as they close."""
 
     radius: HandLength = Field(description="length of the link that carries a finger, metres")
-    reach: NearHand = Field(description="outward part (y) of that link in the open gripper, metres")
+    reach: NearHand = Field(description="y of that link in the open gripper, outward, metres")
 
 
 class GripperGeometry(Strict):
@@ -318,7 +318,7 @@ class GripperGeometry(Strict):
     max_opening: HandLength = Field(description="metres between the open fingers' inner faces")
     tip_z: HandLength = Field(description="fingertips of the open gripper, metres along z")
     contact_z: HandLength
-    """contact, metres along z; between palm and fingertips"""
+    """contact point, metres along z; between palm and fingertips"""
     tcp_z: NearHand = Field(description="origin of the TCP frame, metres along z")
     hand: HandPart = Field(description="the hand without its fingers")
     finger: HandPart
@@ -353,7 +353,7 @@ class GripperGeometry(Strict):
 
     @property
     def pad_half_width(self) -> float:
-        """Half width along x of that box, metres."""
+        """Half width of the pad along x, metres."""
         low, high = self.pad
         return max(-low[0], high[0])
 
@@ -373,7 +373,7 @@ class GripperGeometry(Strict):
 
 
 class Suppression(Strict):
-    """Drops a grasp that is nearer to a better one than both distances."""
+    """Drops a grasp that lies within both distances of a better one."""
 
     translation: Number = Field(default=0.01, ge=0.0, le=1.0)
     """metres between TCPs"""
@@ -403,7 +403,7 @@ class Collision(Strict):
 
 
 class ObjectChoice(Strict):
-    """Some of the objects that are found, by their numbers in an answer to the same cloud."""
+    """Some of the detected objects, by their numbers in an answer to the same cloud."""
 
     include: ObjectNumbers = Field(default=(), description="numbers of objects; empty: all")
     exclude: ObjectNumbers = Field(default=(), description="numbers of objects to leave out")
@@ -504,7 +504,7 @@ class PreviousObject(Strict):
 class Previous(Strict):
     """Grasps and objects of an earlier answer, to be followed.
 
-    All of it is in the frame of the cloud that is sent now.
+    All coordinates are in the frame of the cloud that is sent now.
     """
 
     gripper: Name = Field(default="", description="name of the gripper in that answer")
@@ -519,7 +519,7 @@ class Previous(Strict):
 
     @property
     def free_id(self) -> int:
-        """Above all ids of grasps and numbers of objects in it; low again after 2**29."""
+        """An id above all ids of grasps and numbers of objects in it; restarts low after 2**29."""
         used = [grasp.id for grasp in self.grasps] + [one.number for one in self.objects]
         free = max([self.next_id, *(1 + one for one in used)])
         return free if free < 2**29 else 1 + max((one for one in used if one < 2**29), default=0)
@@ -600,8 +600,8 @@ class DetectOptions(Strict):
     """seed of every random choice"""
     viewpoint: Viewpoint | None = None
     """camera position, metres. If there are several, `view_ids` beside the cloud says which one saw
-    each point. null: the origin if the whole cloud lies in front of it, else a place above the
-    cloud from which the least of it is hidden"""
+    each point. null: the origin if the whole cloud lies in front of it, else the position above
+    the cloud from which the fewest points are hidden"""
     up: Direction | None = None
     """direction away from gravity; any length but zero; null: the support plane's normal; without
     one, an estimate in a camera's frame, else +z"""
@@ -637,7 +637,7 @@ class DetectOptions(Strict):
     suppression: Suppression | None = Suppression()
     """non-maximum suppression; null: none"""
     order: Literal["score", "highest", "clearance"] = "score"
-    """score: first, for each object with a grasp of 0.5 or more, one surrounded by other good ones;
+    """score: first, for each object with a grasp of 0.5 or more, a grasp among other good grasps;
     then by score, and by the pose of the hand where scores are close. highest: scores of 0.9 or
     more by height of the TCP along up, then the others by score. clearance: by clearance"""
     previous: Previous | None = None
@@ -648,7 +648,7 @@ class DetectOptions(Strict):
 
     @property
     def known_up(self) -> NDArray[np.float64] | None:
-        """(3,) unit, away from gravity; None if neither it nor the support is given."""
+        """(3,) unit, away from gravity; None if neither `up` nor a support plane is given."""
         plane = self.support.normal if isinstance(self.support, SupportPlane) else None
         known = plane if self.up is None else self.up
         return None if known is None else np.asarray(known) / np.linalg.norm(known)

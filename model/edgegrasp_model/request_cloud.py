@@ -1,6 +1,6 @@
-"""Decode the cloud of a request, in any of its forms, into arrays; and options that are text.
+"""Decode the cloud of a request, in any of its forms, into arrays, and options that are text.
 
-Both transports give the fields of the JSON body. A value is JSON, a `File` from a form or a
+Both transports pass the fields of the JSON body. A value is JSON, a `File` from a form or a
 message, or bytes of little-endian numbers from a message. The detector checks the arrays.
 """
 
@@ -93,7 +93,7 @@ def decode_cloud(
 
 
 def decode_points(points: object, max_points: int) -> Array:
-    """Read points (N, 3) of bytes, or of lists, in which a row of null is a hole."""
+    """Read points (N, 3) from bytes, or from lists, in which rows of null in images are holes."""
     array = decode_array("points", points, max_points)
     if array.size // 3 > max_points:
         raise too_many(array.size // 3, max_points)
@@ -114,7 +114,7 @@ def decode_array(field: str, value: object, max_points: int) -> Array:
     if isinstance(value, bytes):
         width, kind = PACKED[field]
         if len(value) % (4 * width):
-            found = f"{len(value)} bytes, which are no whole number of rows"
+            found = f"{len(value)} bytes, which are not a whole number of rows"
             fix = f"Send {4 * width} bytes a row: little-endian {kind}."
             raise InvalidRequest(field, found, fix)
         array = np.frombuffer(value, np.dtype(kind).newbyteorder("<"))
@@ -149,10 +149,10 @@ def _numbers(field: str, values: list[Any], holes: bool) -> Array:
     raise InvalidRequest(field, brief(row), "Send numbers only; integers must fit in 64 bits.")
 
 
-# What requests hold besides arrays, checked
+# Schemas of what requests contain besides arrays
 
 
-Bytes = Annotated[  # as they are over gRPC, in base64 in JSON
+Bytes = Annotated[  # plain over gRPC, base64 in JSON
     bytes,
     BeforeValidator(
         lambda sent: base64.b64decode(sent, validate=True) if isinstance(sent, str) else sent,
@@ -200,7 +200,7 @@ class Intrinsics(Strict):
 class Depth(Strict):
     """An image of depths, row by row from the top left pixel; 0 or NaN: no reading."""
 
-    height: Size = Field(default=0, description="pixels; not needed of a PNG, like the width")
+    height: Size = Field(default=0, description="pixels; a PNG needs neither height nor width")
     width: Size = 0
     encoding: Literal["32FC1", "64FC1", "16UC1", "png"]
     """32FC1 or 64FC1, metres; 16UC1 or a 16-bit PNG file, millimetres"""
@@ -226,7 +226,7 @@ class DepthImage(Strict):
     """rows of metres, or an object as Depth"""
 
 
-CAMERA = tuple(DepthImage.model_fields)  # what a form may have as parts, of one image
+CAMERA = tuple(DepthImage.model_fields)  # fields of one image, which a form may have as parts
 
 
 # Depth images
@@ -304,7 +304,7 @@ def value_of_text(name: str, text: str) -> object:
 
 
 def unique_keys(field: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON; raises InvalidRequest for a key that is there twice."""
+    """Build an object of JSON; raises InvalidRequest if a key occurs more than once."""
     found = dict(pairs)
     if len(found) < len(pairs):
         ((name, count),) = Counter(name for name, _ in pairs).most_common(1)

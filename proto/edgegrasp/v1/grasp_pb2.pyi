@@ -613,7 +613,7 @@ class DetectOptions(_message.Message):
     top_k: _builtins.int
     """Grasps returned at most."""
     order: _builtins.str
-    """Score: first, for each object with a grasp of 0.5 or more, one surrounded by other good ones;
+    """Score: first, for each object with a grasp of 0.5 or more, a grasp among other good grasps;
     then by score, and by the pose of the hand where scores are close. highest: scores of 0.9 or
     more by height of the TCP along up, then the others by score. clearance: by clearance. One of
     "score", "highest", "clearance".
@@ -627,8 +627,8 @@ class DetectOptions(_message.Message):
     @_builtins.property
     def viewpoint(self) -> _containers.RepeatedCompositeFieldContainer[Global___Vector]:
         """Camera position, metres. If there are several, `view_ids` beside the cloud says which one saw
-        each point. Absent: the origin if the whole cloud lies in front of it, else a place above the
-        cloud from which the least of it is hidden.
+        each point. Absent: the origin if the whole cloud lies in front of it, else the position above
+        the cloud from which the fewest points are hidden.
         """
 
     @_builtins.property
@@ -791,7 +791,7 @@ class GripperGeometry(_message.Message):
     tip_z: _builtins.float
     """Fingertips of the open gripper, metres along z."""
     contact_z: _builtins.float
-    """Contact, metres along z; between palm and fingertips."""
+    """Contact point, metres along z; between palm and fingertips."""
     tcp_z: _builtins.float
     """Origin of the TCP frame, metres along z."""
     @_builtins.property
@@ -860,8 +860,8 @@ class Support(_message.Message):
     offset: _builtins.float
     """Normal . x of its points, metres."""
     max_depth_error: _builtins.float
-    """Greatest relative error of a camera's depths: each view is scaled about its viewpoint by up to
-    this, so that its table lies in the plane; 0: no correction.
+    """Greatest relative error of a camera's depths: each view is scaled about its viewpoint by at
+    most this share, to move its table into the plane; 0: no correction.
     """
     disabled: _builtins.bool
     """True: null in JSON."""
@@ -877,8 +877,8 @@ class Support(_message.Message):
 
     @_builtins.property
     def auto(self) -> Global___AutoPlane:
-        """The plane of the points near objects that are classified as support. `kind` is "auto" in JSON,
-        its fields beside it.
+        """The plane through the points near objects that are classified as support. `kind` is "auto" in
+        JSON, its fields beside it.
         """
 
     def __init__(
@@ -916,7 +916,7 @@ class RansacPlane(_message.Message):
     MAX_TILT_FIELD_NUMBER: _builtins.int
     MIN_SHARE_FIELD_NUMBER: _builtins.int
     distance: _builtins.float
-    """Points within this distance belong to the plane, metres; noise may raise it."""
+    """Points within this distance belong to the plane, metres; it is raised if depths are noisy."""
     max_tilt: _builtins.float
     """Greatest angle between its normal and up, radians; π/2: any plane."""
     min_share: _builtins.float
@@ -949,7 +949,7 @@ Global___RansacPlane: _TypeAlias = RansacPlane  # noqa: Y015
 
 @_typing.final
 class AutoPlane(_message.Message):
-    """The plane of the points near objects that are classified as support."""
+    """The plane through the points near objects that are classified as support."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -966,7 +966,7 @@ Global___AutoPlane: _TypeAlias = AutoPlane  # noqa: Y015
 
 @_typing.final
 class ObjectChoice(_message.Message):
-    """Some of the objects that are found, by their numbers in an answer to the same cloud."""
+    """Some of the detected objects, by their numbers in an answer to the same cloud."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1038,7 +1038,7 @@ class Region(_message.Message):
 
     @_builtins.property
     def exclude(self) -> _containers.RepeatedCompositeFieldContainer[Global___Shape]:
-        """Union of shapes taken away."""
+        """Union of shapes to leave out."""
 
     def __init__(
         self,
@@ -1063,10 +1063,10 @@ class ApproachDirection(_message.Message):
     CONES_FIELD_NUMBER: _builtins.int
     PRESET_FIELD_NUMBER: _builtins.int
     preset: _builtins.str
-    """Or in this, relative to up. One of "top-down", "side"."""
+    """A direction in this is allowed too, relative to up. One of "top-down", "side"."""
     @_builtins.property
     def cones(self) -> _containers.RepeatedCompositeFieldContainer[Global___Cone]:
-        """Directions are allowed in any of these."""
+        """A direction in any of these is allowed."""
 
     def __init__(
         self,
@@ -1286,7 +1286,7 @@ Global___PlaceRegion: _TypeAlias = PlaceRegion  # noqa: Y015
 
 @_typing.final
 class Suppression(_message.Message):
-    """Drops a grasp that is nearer to a better one than both distances."""
+    """Drops a grasp that lies within both distances of a better one."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1411,7 +1411,7 @@ class Swing(_message.Message):
     radius: _builtins.float
     """Length of the link that carries a finger, metres."""
     reach: _builtins.float
-    """Outward part (y) of that link in the open gripper, metres."""
+    """y of that link in the open gripper, outward, metres."""
     def __init__(
         self,
         *,
@@ -1495,7 +1495,7 @@ Global___HalfSpace: _TypeAlias = HalfSpace  # noqa: Y015
 
 @_typing.final
 class Indices(_message.Message):
-    """Points by their row in the cloud as it was sent."""
+    """Points, given by their rows in the cloud as it was sent."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1519,7 +1519,7 @@ Global___Indices: _TypeAlias = Indices  # noqa: Y015
 
 @_typing.final
 class Mask(_message.Message):
-    """Points by a boolean for each row of the cloud as it was sent."""
+    """Points, given by a boolean for each row of the cloud as it was sent."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1579,7 +1579,7 @@ Global___OrientedBox: _TypeAlias = OrientedBox  # noqa: Y015
 
 @_typing.final
 class Segments(_message.Message):
-    """Points by their segment in `segment_ids`, sent with the cloud."""
+    """Points, given by their segments in `segment_ids`, which are sent with the cloud."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1633,14 +1633,14 @@ Global___Sphere: _TypeAlias = Sphere  # noqa: Y015
 
 @_typing.final
 class Cone(_message.Message):
-    """Directions within an angle of a given one."""
+    """Directions within an angle of a given direction."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
     DIRECTION_FIELD_NUMBER: _builtins.int
     MAX_ANGLE_FIELD_NUMBER: _builtins.int
     max_angle: _builtins.float
-    """Greatest angle between it and the hand's direction, radians."""
+    """Greatest angle between `direction` and the hand's +z axis, radians."""
     @_builtins.property
     def direction(self) -> Global___Vector:
         """Direction in which the hand moves, its +z axis; any length but zero."""
