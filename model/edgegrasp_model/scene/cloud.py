@@ -20,12 +20,12 @@ MIN_CLOUD_EXTENT = 0.01  # metres; a narrower cloud is probably in kilometres
 MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 MAX_VIEW_TANGENT = 1.2  # of half a depth camera's field of view
-MAX_WIDE_TANGENT = 2.0  # of half a wide one's
-USUAL_DISTANCE = 0.8  # metres from a camera to objects and around them, if it is not known
+MAX_WIDE_TANGENT = 2.0  # of half a wide-angle camera's field of view
+USUAL_DISTANCE = 0.8  # metres from an unknown camera to objects, and around them
 SUBSAMPLE_SIZE = 6000  # points that represent a cloud in fits, means and views
-LARGE_IMAGE = 704, 960  # pixels of an image of which every second row and column may be enough
-HAND_REACH = 0.25  # metres around an object in which a hand at it may collide
-OUTLIER_PERCENT = 0.5  # of the points, beyond each end of a range
+LARGE_IMAGE = 704, 960  # rows and columns of an image from which every second one may be enough
+HAND_REACH = 0.25  # metres around an object within which a hand that grasps it may collide
+OUTLIER_PERCENT = 0.5  # of the points, cut off at each end of a range
 
 Vectors = TypeVar("Vectors", bound=Floats)
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -42,7 +42,7 @@ class CheckedCloud:
     segment_ids: Int64 | None = None  # (N,)
     view_ids: Int64 | None = None  # (N,)
     image_size: tuple[int, int] | None = None  # (H, W) of an organised cloud as sent
-    step: int = 1  # between its rows and columns that are kept
+    step: int = 1  # every `step`-th row and column of it is kept
     warnings: tuple[str, ...] = ()
 
     def take(self, kept: Bools | Int64) -> "CheckedCloud":
@@ -56,7 +56,7 @@ class CheckedCloud:
     def looks_along_z(self) -> bool:
         """Whether it is an image whose columns run along x and rows along y, seen from the origin.
 
-        From behind a surface, as from a robot's base below a table, an image looks mirrored.
+        The image of a camera above a table looks mirrored from a robot's base below the table.
         """
         if self.image_size is None:
             return False
@@ -67,10 +67,10 @@ class CheckedCloud:
         return bool(min(along) > 0.9)
 
     def projection(self, frame: "CanonicalFrame", eyes: Float64) -> Float64 | None:
-        """The projection (3, 4) of canonical points into the image of one camera that was sent.
+        """The projection (3, 4) of canonical points into the image that was sent.
 
-        By direct linear transformation; None without such an image. `eyes` (W, 3) are the cameras,
-        canonical frame.
+        Found by direct linear transformation; None without an image of a single camera. `eyes`
+        (W, 3) are the cameras, canonical frame.
         """
         if self.image_size is None or len(eyes) > 1:
             return None
@@ -119,7 +119,7 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
     if extent > MAX_CLOUD_EXTENT:
         near = _without_far_points(points)
         said += (
-            f"{len(points) - len(near)} points are left out that lie more than "
+            f"{len(points) - len(near)} points are left out: they lie more than "
             f"{MAX_CLOUD_EXTENT / 2:g} m from the middle of the cloud.",
         )
         points, row = points[near], row[near]
@@ -139,14 +139,14 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
         for name in ("normals", "segment_ids", "view_ids")
         if (array := getattr(sent, name)) is not None
     }
-    points = np.require(points, np.float32, ("C", "W"))  # loops are not compiled for read-only ones
+    points = np.require(points, np.float32, ("C", "W"))  # compiled loops need writable ones
     return CheckedCloud(
         points, row, size, **arrays, image_size=image_size, step=step, warnings=said
     )
 
 
 def _readings(points: Floats, holes: bool) -> Int64:
-    """Rows of the points (N, 3) that are readings; with `holes`, NaN and infinity are none."""
+    """Rows of the points (N, 3) that are readings; with `holes`, NaN and infinity are not."""
     x, y, z = points.T
     seen = (x != 0) | (y != 0) | (z != 0)  # many drivers send 0, 0, 0 where there is no reading
     if holes:
@@ -155,7 +155,7 @@ def _readings(points: Floats, holes: bool) -> Int64:
 
 
 def _pixel_spacing(image: Floats) -> float:
-    """Median distance, metres, between neighbouring pixels of an image (H, W, 3); NaN: no two."""
+    """Median distance, metres, between neighbouring pixels of an image (H, W, 3); NaN if none."""
     with np.errstate(invalid="ignore"):  # holes may be infinite
         apart = np.linalg.norm(image[::16, 1::8] - image[::16, :-1:8], axis=-1)
     apart = apart[(apart > 0) & (apart < np.inf)]  # holes may be equal, too
@@ -168,11 +168,11 @@ def subsample(rows: NDArray[Scalar], most: int = SUBSAMPLE_SIZE) -> NDArray[Scal
 
 
 def grid_cells(points: Floats, side: float) -> tuple[Int64, Int64]:
-    """The cell (N,), from 0, in which each point (N, D) lies, and the points (C,) in each cell.
+    """The cell (N,), from 0, of each point (N, D), and the number (C,) of points in each cell.
 
-    They are `side` metres wide.
+    Cells are `side` metres wide.
     """
-    # Numbers are many times as fast to compare as rows.
+    # Comparing numbers is many times faster than comparing rows.
     keys = np.floor(points / side) @ 10.0 ** (5.0 * np.arange(points.shape[1]))
     _, cell, count = np.unique(keys, return_inverse=True, return_counts=True)
     return cell, count
@@ -188,7 +188,7 @@ def inside_workspace(points: Float32, box: Workspace | None, around: Floats | fl
 
 
 def unit(vectors: Vectors) -> Vectors:
-    """Vectors (..., 3) of length 1; those that have none stay short."""
+    """Scale vectors (..., 3) to length 1; those of almost zero length stay short."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return cast("Vectors", vectors / np.maximum(length, 1e-9))
 
@@ -203,11 +203,11 @@ def pose_matrix(turn: Floats, place: ArrayLike) -> Float64:
 def assumed_viewpoint(
     sent: CheckedCloud, options: DetectOptions, warnings: list[str]
 ) -> tuple[float, float, float] | None:
-    """Where the camera is assumed to be that saw a cloud, if a request does not say it.
+    """The assumed position of the camera that saw a cloud, if a request does not give it.
 
-    None: several cameras saw them.
+    None: several cameras saw the cloud.
 
-    InvalidRequest: the place is needed to the millimetre.
+    InvalidRequest: an option needs the position to the millimetre.
     """
     points, wide = sent.points, sent.looks_along_z()
     if seen_from_origin(points, options.known_up, MAX_WIDE_TANGENT if wide else MAX_VIEW_TANGENT):
@@ -227,14 +227,14 @@ def assumed_viewpoint(
     eye = likely_viewpoint(points[inside] if inside.any() else points, up)
     if eye is None:
         warnings.append(
-            "viewpoint is not given, and several cameras saw the cloud, as a part of it is hidden "
-            "from everywhere: send their positions, and view_ids."
+            "viewpoint is not given, and several cameras saw the cloud, as no single position sees "
+            "all of it: send their positions, and view_ids."
         )
         return None
     x, y, z = eye.tolist()
     warnings.append(
         f"viewpoint is not given: the camera is assumed at ({x:.2f}, {y:.2f}, {z:.2f}), from where "
-        "the least of the cloud is hidden; send its position."
+        "the fewest points are hidden; send its position."
     )
     return x, y, z
 
@@ -242,9 +242,9 @@ def assumed_viewpoint(
 def seen_from_origin(
     points: Float32, up: ArrayLike | None, max_tangent: float = MAX_VIEW_TANGENT
 ) -> bool:
-    """Whether points (N, 3) look as if seen by a camera at the origin along +z.
+    """Whether a camera at the origin that looks along +z may have seen the points (N, 3).
 
-    If `up` (3,) is known, such a camera looks at most 30 degrees upward.
+    If `up` (3,) is known, the camera must look at most 30 degrees upward.
     """
     x, y, z = points.T
     if len(points) == 0 or z.min() <= 0 or np.quantile(np.hypot(x, y) / z, 0.99) > max_tangent:
@@ -255,11 +255,11 @@ def seen_from_origin(
 
 
 def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64 | None:
-    """The place (3,) above points (N, 3) from which the least is hidden: where their camera was.
+    """The probable camera position (3,): above points (N, 3), where the fewest are hidden.
 
-    Of places from which nothing is hidden, the one that is nearest to USUAL_DISTANCE and to 30
+    Of the positions from which nothing is hidden, it is the one nearest to USUAL_DISTANCE and to 30
     degrees off `up` (3,). It turns with the cloud, up to rounding. None: several cameras saw the
-    points, as some are hidden from everywhere.
+    points, as some are hidden from every position.
     """
     some = subsample(points, 20_000)
     apart = np.linalg.norm(some - np.median(some, axis=0), axis=1)
@@ -281,7 +281,7 @@ def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64 | None:
         unusual = (tilt - 0.5) ** 2 + np.log(distance / USUAL_DISTANCE) ** 2
         return np.asarray(eyes[np.argmin(hidden(eyes, 0) + 0.012 * unusual)])
 
-    # Places spread evenly over half of a sphere, then around the best one.
+    # Positions spread evenly over half of a sphere, then around the best one.
     z, turn = 1.0 - (np.arange(60) + 0.5) / 60, np.pi * (3.0 - np.sqrt(5.0)) * np.arange(60)
     level = np.sqrt(1.0 - z * z)
     ways = np.stack([level * np.cos(turn), level * np.sin(turn), z], axis=1)
@@ -289,7 +289,7 @@ def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64 | None:
     around = np.indices((3, 3, 3)).reshape(3, -1).T - 1.0
     while step > 0.01:
         eye, step = best(eye + step * around), 0.7 * step
-    # Beside edges, sparse and noisy points show through.
+    # Near edges, points behind show through sparse and noisy ones.
     several = hidden(eye[None], 1)[0] > 0.003
     return None if several else frame.points_in_cloud(eye).astype(np.float64)
 
@@ -301,8 +301,8 @@ def _hidden_share(
     """Share (K,) of points (N, 3) that lie behind others as seen from each of the eyes (K, 3).
 
     Columns of `turn` (K, 3, 3) are the axes of cameras; cells are 11 mm wide at a `distance` (K,).
-    Points 15 mm behind others are seen, those 45 mm behind are hidden, others count in part; the
-    others must be in all cells that are not empty, up to `edge` beside the point's.
+    Points up to 15 mm behind others count as seen, from 45 mm as hidden, between that in part. A
+    point must lie behind the first point of each occupied cell up to `edge` cells from its own.
     """
     share, half = np.zeros(len(eyes)), 72
     cell, away = np.empty((len(points), 2), np.int64), np.empty(len(points))
@@ -330,7 +330,7 @@ def _hidden_share(
 
 
 def usual_up(forward: Float64) -> Float64:
-    """Up (3,) in most clouds that a camera sees along `forward` (3,), unit.
+    """The up direction (3,) in most clouds of a camera that looks along `forward` (3,), unit.
 
     It is -y in a camera's frame, whose z points forward, and +z in the frames of robots.
     """
@@ -338,7 +338,7 @@ def usual_up(forward: Float64) -> Float64:
 
 
 def _checked_array(field: str, array: object, size: int, row: Int64) -> Array:
-    """The given rows of an array beside the cloud, of one integer or of three floats a point."""
+    """The given rows of a per-point array, which has one integer or three floats for each point."""
     width = 1 if field.endswith("_ids") else 3
     kinds, kind = ("iu", "one integer") if width == 1 else ("fui", "three numbers")
     if (
@@ -370,7 +370,7 @@ class Cloud:
 
 
 def wrong_array(field: str, array: object, fix: str) -> InvalidRequest:
-    """The error for something that is no array, or an array of a wrong type or shape."""
+    """The error for a value that is not an array, or is an array of the wrong type or shape."""
     value = f"a {type(array).__name__}"
     if isinstance(array, np.ndarray):
         value = f"dtype {array.dtype}, shape {array.shape}"
@@ -409,7 +409,7 @@ class Voxels(NamedTuple):
     def commonest(self, labels: NDArray[np.integer]) -> Int64:
         """Most common label (V,) in each voxel, from labels (N,); the lowest one on ties."""
         low, one = labels.min(), np.ones(len(labels), dtype=np.int64)
-        tally = coo_array((one, (self.voxel, labels - low))).tocsr()  # (V, labels), few of them
+        tally = coo_array((one, (self.voxel, labels - low))).tocsr()  # (V, labels); few labels
         voxel = np.repeat(np.arange(len(self.size)), np.diff(tally.indptr))
         order = np.lexsort((-tally.indices, tally.data, voxel))
         return np.asarray(tally.indices[order[tally.indptr[1:] - 1]] + low, dtype=np.int64)
@@ -422,7 +422,7 @@ def voxelise(points: Floats, voxel_size: float, most: float = math.inf) -> Voxel
     """
     # Axis by axis is three times as fast as all at once.
     cells = [((axis - float(axis.min())) / voxel_size).astype(np.int64) for axis in points.T]
-    # In cubes of 8 voxels a side, so that loops over hands skip many distant points at a time.
+    # Sorted by cubes of 8 voxels a side, so loops over hands skip many distant points at a time.
     keys, cube = np.zeros(len(points), dtype=np.int64), 8
     for cell in cells:
         keys = keys * (cell.max() // cube + 1) + cell // cube
@@ -445,14 +445,14 @@ def clean_cloud(
     frame: "CanonicalFrame",
     eyes: Float64,  # (W, 3) the cameras, canonical frame
 ) -> tuple["Cloud", Bools]:
-    """The voxels without outliers, and a mask (V,) of them.
+    """The voxels without outliers, and a mask (V,) of these.
 
-    Normals are as given, else estimated and turned to the camera.
+    Normals are those that were sent, else estimates that are turned toward the camera.
     """
-    tree = cKDTree(middles, balanced_tree=False)  # for one round of queries
+    tree = cKDTree(middles, balanced_tree=False)  # faster for one round of queries
     distance, near = map(np.asarray, tree.query(middles, k=range(1, min(20, len(middles)) + 1)))
     kept = np.ones(len(middles), dtype=bool)
-    if len(middles) > 8:  # outliers lie farther than others from the 8 points next to them
+    if len(middles) > 8:  # outliers lie unusually far from their 8 nearest points
         mean = distance[:, 1:9].mean(axis=1)
         kept = mean <= mean.mean() + 2.5 * mean.std()
     points, normals = middles[kept], smallest_variance_directions(middles, near)[kept]
@@ -463,7 +463,7 @@ def clean_cloud(
     normals = np.where(away[:, None], -normals, normals)
     if sent.normals is not None:
         given = frame.directions(voxels.mean(unit(sent.normals))[kept])
-        none = np.linalg.norm(given, axis=1) < 1e-3  # opposite ones in a voxel
+        none = np.linalg.norm(given, axis=1) < 1e-3  # opposite normals in a voxel
         normals = np.where(none[:, None], normals, unit(given)).astype(np.float32)
     return Cloud(points, normals), kept
 
@@ -551,27 +551,27 @@ class CanonicalFrame:
         return cls(pose_matrix(turn, -turn @ origin))
 
     def points(self, points: ArrayLike) -> Float64:
-        """Points (..., 3) of the cloud's frame in this one."""
+        """Transform points (..., 3) from the cloud's frame to this one."""
         return self.directions(points) + self.T_canonical_cloud[:3, 3]
 
     def directions(self, directions: ArrayLike) -> Float64:
-        """Directions (..., 3) of the cloud's frame in this one."""
+        """Transform directions (..., 3) from the cloud's frame to this one."""
         return np.asarray(directions, dtype=np.float64) @ self.T_canonical_cloud[:3, :3].T
 
     def poses(self, T_cloud_hand: ArrayLike) -> Float32:
-        """Poses (..., 4, 4) in the cloud's frame, in this one."""
+        """Transform poses (..., 4, 4) from the cloud's frame to this one."""
         return (self.T_canonical_cloud @ np.asarray(T_cloud_hand, np.float64)).astype(np.float32)
 
     def points_in_cloud(self, points: ArrayLike) -> Float32:
-        """Points (..., 3) of this frame in the cloud's."""
+        """Transform points (..., 3) from this frame to the cloud's."""
         return self.directions_in_cloud(np.asarray(points) - self.T_canonical_cloud[:3, 3])
 
     def directions_in_cloud(self, directions: ArrayLike) -> Float32:
-        """Directions (..., 3) of this frame in the cloud's."""
+        """Transform directions (..., 3) from this frame to the cloud's."""
         turned = np.asarray(directions, dtype=np.float64) @ self.T_canonical_cloud[:3, :3]
         return turned.astype(np.float32)
 
     def poses_in_cloud(self, T_canonical_hand: ArrayLike) -> Float32:
-        """Poses (..., 4, 4) in this frame, in the cloud's."""
+        """Transform poses (..., 4, 4) from this frame to the cloud's."""
         T_cloud_canonical = np.linalg.inv(self.T_canonical_cloud)
         return (T_cloud_canonical @ np.asarray(T_canonical_hand, np.float64)).astype(np.float32)

@@ -1,9 +1,9 @@
-"""The `scene` network: classifies pixels of a range image and says which belong together.
+"""The `scene` network: classifies pixels of a range image and links pixels of the same object.
 
 The range image is rendered from points, as seen from a viewpoint.
 
-A U-Net on depth alone, as networks that segment unseen objects from simulated depth (UOIS-Net, Xie
-et al., T-RO 2021): its input has twice the resolution of its output.
+The network is a U-Net on depth alone, like networks that segment unseen objects from simulated
+depth (UOIS-Net, Xie et al., T-RO 2021). Its input has twice the resolution of its output.
 """
 
 from itertools import pairwise
@@ -108,12 +108,12 @@ def _layer(
 # Range images
 
 NEAREST_DEPTH = 0.05  # metres from the viewpoint
-PIXEL_SPACING = 1.25  # side of a pixel, in distances of sparse points, so that few stay empty
-MAX_HOLE_SPACING = 1.6  # pixels between points up to which holes are filled by interpolation
-MIN_FILLED = 0.93  # of the pixels between two that show something; else pixels are larger
-# Metres at the median depth: larger pixels are divided, and those of less than half show noise.
+PIXEL_SPACING = 1.25  # side of a pixel, in spacings of sparse points, so that few pixels are empty
+MAX_HOLE_SPACING = 1.6  # point spacing, in pixels, up to which holes are filled by interpolation
+MIN_FILLED = 0.93  # share of the pixels between two filled ones that is filled; else enlarge pixels
+# Metres at the median depth: larger pixels are divided; pixels below half of this show noise.
 MAX_PIXEL_SIZE = 0.003
-SURFACE_DEPTH = 0.02  # metres; a point nearer by this much hides another of the same pixel
+SURFACE_DEPTH = 0.02  # metres; a point this much nearer hides another one in the same pixel
 
 
 class RangeImage(NamedTuple):
@@ -129,12 +129,12 @@ def range_image(
     points: Float32,  # (N, 3) cloud frame, metres; at least one
     viewpoint: Float64,  # (3,) of the camera
     up: Float64 | None,  # (3,) away from gravity, drawn upward; None: unknown
-    # (3,) downward in the image if `up` is unknown or along the sight; None: by the usual frames
+    # (3,) downward in the image, used if `up` is unknown or the line of sight; None: usual down
     down: Float64 | None,
 ) -> RangeImage:
     """Render points as seen from a viewpoint."""
     downward = [*([] if up is None else [-up]), *([] if down is None else [unit(down)])]
-    # A whole step that divides an image's width would leave out its last columns.
+    # An integer step that divides the width of an image would always skip its last columns.
     step = max(0.9983 * (len(points) // SUBSAMPLE_SIZE), 1.0)
     apart = points[np.arange(0.0, len(points), step).astype(np.int64)] - viewpoint
     sight = unit(apart)
@@ -147,8 +147,8 @@ def range_image(
     low, high = _view(in_view)
     # As many pixels as a large image has with half of its rows and columns.
     finest = float(np.sqrt(4 * (high - low).prod() / np.prod(LARGE_IMAGE)))
-    # Distance at a depth of one metre between neighbours, from the area that points cover, in
-    # cells of which 40 lie across the view.
+    # Distance between neighbours at a depth of one metre, from the area of the occupied cells; 40
+    # cells lie across the view.
     ahead = in_view[in_view[:, 2] > NEAREST_DEPTH]
     cell = max(float((high - low).max()) / 40, 1e-6)
     place = ((ahead[:, :2] / ahead[:, 2:] - low) / cell).astype(np.int64)
@@ -204,9 +204,9 @@ def _view(points: Float64) -> tuple[Float64, Float64]:
 
 
 def smoothly_enlarged(depth: Float32, times: int) -> Float32:
-    """The image (H, W) of a sparse cloud with pixels as fine as the network knows, metres.
+    """Enlarge the depths (H, W), metres, of a sparse cloud to the pixel size of the training data.
 
-    Depths are interpolated on a surface, and repeated beside its edges.
+    Depths are interpolated on a surface, and repeated near its edges.
     """
     nearest = depth.repeat(times, axis=0).repeat(times, axis=1)
     between = ndimage.zoom(depth, times, order=1, mode="nearest", grid_mode=True)
@@ -223,7 +223,7 @@ def _render(
     pixel_size: float,
     size: tuple[int, int],
 ) -> Float32:
-    """Of each pixel (H, W, 3) the nearest surface's point that is closest to its centre, or NaN."""
+    """For each pixel (H, W, 3), the point of the nearest surface closest to its centre, or NaN."""
     height, width = size
     pixels = np.full((height * width, 3), np.nan, np.float32)
     nearest, best = np.full((2, len(pixels)), np.inf, dtype=np.float32)
@@ -251,7 +251,7 @@ def _render(
 
 @compiled("contract")
 def _fill_holes(image: Float32) -> Float32:
-    """The image, an empty pixel filled with the mean of its neighbours if most exist and agree."""
+    """Fill each empty pixel with the mean of its neighbours if half of them exist and agree."""
     (height, width, _), out = image.shape, image.copy()
     for i in range(1, height - 1):
         for j in range(1, width - 1):

@@ -46,7 +46,7 @@ class SolidBoxes:
         return SolidBoxes(self.center[rows], self.half[rows])
 
     def corners(self) -> Float64:
-        """(M, 8, 3)."""
+        """The corners (M, 8, 3)."""
         signs = np.array(list(product((-1, 1), repeat=3)))
         return np.asarray(self.center[:, None] + signs @ self.half)
 
@@ -68,9 +68,9 @@ def box_pose(box: Box | OrientedBox) -> tuple[Float64, Float64]:
 def near_pairs(
     ours: SolidBoxes, theirs: SolidBoxes, within: Floats | float
 ) -> Iterator[tuple[Int64, SolidBoxes]]:
-    """For each of theirs, rows of ours that it may be nearer to than `within` metres, and itself.
+    """For each of their boxes, rows of ours that may be nearer than `within`, and copies of it.
 
-    Judged by bounding spheres, which leaves few pairs to measure exactly.
+    `within` is in metres. Bounding spheres are compared, so few pairs are left to measure exactly.
     """
     for place, (center, radius) in enumerate(zip(theirs.center, theirs.radius, strict=True)):
         apart = np.linalg.norm(ours.center - center, axis=1) - ours.radius - radius
@@ -102,15 +102,15 @@ def separation(ours: SolidBoxes, theirs: SolidBoxes, sweep: Float64 | None = Non
 
 
 def signed_distance(ours: SolidBoxes, theirs: SolidBoxes) -> Float64:
-    """Metres (M,) between boxes, row by row; negative: what they would have to move apart."""
+    """Metres (M,) between boxes, row by row; negative: how far they would have to move apart."""
     distance, some = separation(ours, theirs), 20_000  # pairs at a time, which bounds the memory
     apart = np.flatnonzero(distance > 0)
-    # Between corners (12, 2) that differ in one sign.
+    # Edges (12, 2) join corners that differ in one sign.
     edges_of_box = np.array([(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])
     for start in range(0, len(apart), some):
         rows = apart[start : start + some]
         one, other = ours.take(rows), theirs.take(rows)
-        # A corner of a box is nearest to the other box, or two edges are to each other.
+        # The nearest points are a corner and a point of the other box, or lie on two edges.
         p, q = one.corners(), other.corners()
         least = np.minimum(_corner_distance(p, other), _corner_distance(q, one))
         edges = q[:, edges_of_box[:, 0]], q[:, edges_of_box[:, 1]]

@@ -63,7 +63,7 @@ from edgegrasp_model.scene.support import (
 from edgegrasp_model.unseen import DepthMap
 
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
-FOLLOWED_REACH = 0.16  # metres around an object, as HAND_REACH, if only known grasps are checked
+FOLLOWED_REACH = 0.16  # metres; replaces HAND_REACH if only known grasps are checked
 FOUND_PLANE_CLEARANCE = 0.0015  # metres that hands stay above a plane that was not given
 NO_OBJECT = (
     "no object was recognised above the support plane. Send objects: off to look for grasps on "
@@ -73,7 +73,7 @@ NO_OBJECT = (
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What hands see around them, in one frame, metres: N points and what is known about them."""
+    """The surroundings of hands, in one frame, metres: N points and what is known about them."""
 
     cloud: Cloud  # N points
     up: Float32  # (3,) away from gravity
@@ -84,25 +84,25 @@ class Surroundings:
 
     @cached_property
     def depths(self) -> list[DepthMap]:
-        """What each camera saw; nothing if the cameras are unknown."""
+        """The depth map of each camera; none if the cameras are unknown."""
         eyes = self.viewpoints if len(self.cloud.points) else ()
         return [DepthMap.of_cloud(self.cloud.points, eye, self.up) for eye in eyes]
 
 
 @dataclass(frozen=True)
 class Scene(Surroundings):
-    """The scene in which grasps are searched; canonical frame. N voxels are left of the cloud."""
+    """The scene in which grasps are searched: the N voxels left of the cloud; canonical frame."""
 
     frame: CanonicalFrame
     points_in_cloud: Float32  # (N, 3) the points in the cloud's frame
     point_of_row: Int64  # (R,) voxel of each row of the cloud as sent; -1: none
     approach_allowed: Bools  # (N,) in the approach region
     contact_allowed: Bools  # (N,) in the contact region
-    obstacles: SolidBoxes | None  # beside the cloud; None: there are none
-    confidence: dict[int, float] = field(default_factory=dict)  # probability of each, if found
-    # (3, 4) point to place in the image that was sent, its sides at -1 and 1; None: not known
+    obstacles: SolidBoxes | None  # in addition to the cloud; None: there are none
+    confidence: dict[int, float] = field(default_factory=dict)  # of each object, if found
+    # (3, 4) projects points into the image that was sent, with sides at -1 and 1; None: unknown
     P_image_cloud: Float64 | None = None
-    # (M, 3) what an arm has to avoid: every reading, whatever the workspace; cloud frame
+    # (M, 3) points that an arm has to avoid: all readings, inside the workspace or not; cloud frame
     readings: Float32 = field(default_factory=lambda: np.empty((0, 3), np.float32))
 
 
@@ -111,13 +111,13 @@ class SelectedPoints:
     """The selected points of a cloud: M points of objects and their surroundings."""
 
     sent: CheckedCloud  # M points
-    number: Int64  # (M,) number of each one's object, or BACKGROUND or UNDECIDED
+    number: Int64  # (M,) number of each point's object, or BACKGROUND or UNDECIDED
     support: Support | None
     up: Float64  # (3,) unit, away from gravity, cloud frame
     viewpoints: Float64  # (W, 3) the cameras
     labels: Int64  # (R,) of the rows of the cloud as sent, as in `DebugInfo`
     confidence: dict[int, float]  # of each object that the network found
-    readings: Float32  # (N, 3) every one, as in `Scene`
+    readings: Float32  # (N, 3) all readings, as in `Scene`
 
 
 def select_points(
@@ -190,7 +190,7 @@ def _objects_given(sent: CheckedCloud, options: DetectOptions) -> bool:
 
 
 def labels_of_all_pixels(sent: CheckedCloud, labels: Int64) -> Int64:
-    """Labels (R,) of the rows sent, with those of the nearest kept pixel at pixels left out."""
+    """Labels (R,) of the rows sent; pixels that were left out get the label of a kept neighbour."""
     if sent.image_size is None or sent.step == 1:
         return labels
     height, width = sent.image_size
@@ -254,11 +254,11 @@ def build_scene(
 
 
 def _seen_from_above(points: Float32, up: Float64 | None) -> tuple[Int64, Float64]:
-    """Rows (M,) near the middle, since a whole room would be too small, and an eye (1, 3) above."""
+    """Rows (M,) near the middle, as a whole room has too few pixels, and an eye (1, 3) above it."""
     over = np.array([0.0, 0.0, 1.0]) if up is None else up
     beside = points - np.median(points, axis=0)
     beside -= (beside @ over)[:, None] * over
-    beside -= beside[np.linalg.norm(beside, axis=1).argmin()]  # there may be none at the median
+    beside -= beside[np.linalg.norm(beside, axis=1).argmin()]  # the median may be in a gap
     near = np.flatnonzero(np.linalg.norm(beside, axis=1) < USUAL_DISTANCE)
     return near, (points[near].mean(axis=0, dtype=np.float64) + USUAL_DISTANCE * over)[None]
 
@@ -282,7 +282,7 @@ def _up(
 
 
 def near_objects_along(plan: Float64, number: Int64) -> Bools:
-    """Which points (M,), at (M, 2) along the support, a hand at any object could reach."""
+    """Which points (M,) a hand at any object could reach; `plan` (M, 2) is along the support."""
     if not (number >= 0).any():
         return np.zeros(len(plan), dtype=bool)
     x, y = (((axis - axis.min()) / (HAND_REACH / 5)).astype(np.int64) for axis in plan.T)
@@ -349,13 +349,13 @@ def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
 def chosen_objects(
     number: Int64, cloud: CheckedCloud, options: DetectOptions, warnings: list[str]
 ) -> Int64:
-    """The object (N,) of each point if the request names that object; BACKGROUND otherwise.
+    """The object (N,) of each point, but BACKGROUND if the request does not choose that object.
 
-    `number` (N,) is the object of each point, negative: none. `warnings` gets objects that are
-    named but not there.
+    `number` (N,) is the object of each point; negative numbers, no object, stay. `warnings` gets
+    objects that are named but not found.
     """
     held = number[number >= 0]
-    # Counting is many times faster, but takes as much memory as the caller's numbers are high.
+    # Counting is many times faster, but its memory grows with the caller's highest number.
     found = np.flatnonzero(np.bincount(held)) if cloud.segment_ids is None else np.unique(held)
     wanted = numbers_chosen(found, options.objects, warnings)
     for name, target in (("at", options.at), ("near", options.near)):
@@ -391,7 +391,7 @@ def _image_width(pixel: tuple[float, ...], cloud: CheckedCloud) -> int:
 
 
 def numbers_chosen(found: Int64, choice: ObjectChoice | str, warnings: list[str]) -> Int64:
-    """Those of the objects numbered `found` that a choice names; all if it is in a word."""
+    """The numbers in `found` of the objects that a choice names; all if the choice is a word."""
     if isinstance(choice, str):
         return found
     if unknown := sorted({*choice.include, *choice.exclude} - {*found.tolist()}):
@@ -407,7 +407,7 @@ def inside_region(
     voxels: Voxels,
     cloud: CheckedCloud,  # the points in `voxels`, of the cloud as sent
 ) -> Bools:
-    """Which voxels (V,) of the processed cloud a region holds."""
+    """Which voxels (V,) of the processed cloud a region contains."""
     nowhere, arrays = np.zeros(len(points), dtype=bool), (points, voxels, cloud)
     included, excluded = (
         np.any([nowhere, *(_inside_shape(shape, *arrays) for shape in shapes)], axis=0)
@@ -417,7 +417,7 @@ def inside_region(
 
 
 def _inside_shape(shape: Shape, points: Float32, voxels: Voxels, cloud: CheckedCloud) -> Bools:
-    """Which voxels (V,) a shape holds, by their mean points or as it lists their points."""
+    """Which voxels (V,) a shape contains, by their mean points or by the rows that it lists."""
     match shape:
         case Box():
             return inside_workspace(points, shape)

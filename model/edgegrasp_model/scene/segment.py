@@ -1,4 +1,4 @@
-"""Classifies each point with the `scene` network: which object, the support, or background."""
+"""Classifies each point with the `scene` network as one of the objects, support or background."""
 
 import json
 from collections.abc import Iterator
@@ -26,16 +26,16 @@ WEIGHTS = Path(__file__).with_name("network.safetensors")
 # In place of an object's number. An undecided point may be part of an object.
 BACKGROUND, UNDECIDED = -1, -2
 
-# When pixels show the same object.
+# Which pixels and points belong to the same object.
 MAX_DEPTH_STEP = 0.035  # metres between neighbours, and between the mean votes of two parts
 MIN_PIXELS = 45  # pixels of an object, in the network's output
-MIN_AREA = 5e-4  # square metres of it, as seen
-MIN_VIEW_OVERLAP = 0.25  # of the smaller one's cells (POINT_REACH) that two views share
+MIN_AREA = 5e-4  # square metres of the visible part of an object
+MIN_VIEW_OVERLAP = 0.25  # share of the smaller object's cells (POINT_REACH wide) in both views
 POINT_REACH = 0.012  # metres from a point to an object, or to its pixel at a depth of 0
 MIN_RISE = 0.004  # metres above the support's margin, of points that are added to an object
-MIN_CLUSTER_CELLS, MIN_CELL_POINTS = 5, 4  # of cells POINT_REACH wide
+MIN_CLUSTER_CELLS, MIN_CELL_POINTS = 5, 4  # cells, POINT_REACH wide; mean points in one
 MIN_CONFIDENCE = 0.5  # of an object; below, it is background
-BESIDE_FACTOR = 0.65  # of a confidence; of 55 small parts beside objects 33 were objects
+BESIDE_FACTOR = 0.65  # on the confidence of small parts beside objects: 33 of 55 were objects
 CROPPED_CONFIDENCE = 0.95  # of clusters in a cloud that was cropped above its support
 
 
@@ -61,10 +61,10 @@ class Pixels(NamedTuple):
 
 @cache
 def shipped() -> tuple[SceneNet, Float64]:
-    """The `scene` network with the shipped weights, loaded once per process, and its confidence.
+    """The `scene` network with the shipped weights, loaded once per process, and its calibration.
 
-    The log odds that an instance is an object are that confidence (2,): a constant, and a factor of
-    the mean probability of an object over its pixels.
+    The calibration (2,) gives the log odds that an instance is an object: a constant, plus a factor
+    times the mean probability of an object over the instance's pixels.
     """
     network = SceneNet()
     network.load_state_dict(load_file(WEIGHTS))
@@ -74,7 +74,7 @@ def shipped() -> tuple[SceneNet, Float64]:
 
 
 def confidences(mean: Float64) -> Float64:
-    """The confidence (O,) of instances by the mean probability (O,) of an object over each one."""
+    """The confidence (O,) of instances, from the mean probability (O,) of an object over each."""
     constant, factor = shipped()[1]
     return np.asarray(1.0 / (1.0 + np.exp(-(constant + factor * mean))))
 
@@ -83,7 +83,7 @@ def segment_cloud(
     cloud: CheckedCloud,  # N points
     viewpoints: Float64,  # (W, 3) of the cameras
     up: Float64 | None,  # (3,) unit, away from gravity; None: unknown
-    near: Int64 | slice,  # rows that are looked at, if there is one camera
+    near: Int64 | slice,  # rows to segment, if there is one camera
 ) -> Segmentation:
     """Segment a cloud view by view; an object seen in several views gets one number."""
     points = cloud.points
@@ -99,7 +99,7 @@ def segment_cloud(
         row = subsample(cloud.row, 5000) // cloud.image_size[1]
         sight = unit(subsample(points, 5000) - viewpoints[0])
         down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
-    if not isinstance(near, slice):  # from above: in an image that turns with the points
+    if not isinstance(near, slice):  # from above, in an image that rotates with the points
         sight = points[near] - viewpoints[0]
         down = sight[np.linalg.norm(sight, axis=1).argmax()]
     seen = [(rows, points[rows], eye) for rows, eye in zip(rows_of_view, viewpoints, strict=True)]
@@ -153,7 +153,7 @@ def run_network(
         ways = functional.normalize(output.up[0], dim=0).numpy()
     seen = np.ascontiguousarray(points[::2, ::2])
     seen_up = ways[:, ~np.isnan(seen[..., 2])].sum(axis=1).astype(np.float64)
-    if not seen_up.any():  # nothing was seen: assume toward the camera
+    if not seen_up.any():  # nothing was seen: assume up is toward the camera
         seen_up = np.array([0.0, 0.0, -1.0])
     return Pixels(seen, classes, votes, links, 2 * footprint), unit(seen_up)
 
@@ -172,7 +172,7 @@ def one_thread() -> Iterator[None]:
 def group_pixels(pixels: Pixels) -> tuple[Int64, Float64]:
     """The object (H, W) of each pixel, from 0, or BACKGROUND or UNDECIDED.
 
-    And the mean probability (O,) of an object over the pixels of each.
+    Also returns the mean probability (O,) of an object over the pixels of each object.
     """
     points, classes, votes, links, footprint = pixels
     seen = ~np.isnan(points[..., 2])
@@ -206,7 +206,7 @@ def _join_pixels(
 ) -> None:
     """Join pairs of pixels in order, but not two large parts with different centres.
 
-    So one weak link cannot join two objects (Kruskal's algorithm with that exception).
+    That way, one weak link cannot join two objects (Kruskal's algorithm with that exception).
     """
     count = np.ones(len(component), dtype=np.int64)
     for p in range(len(pairs)):
@@ -242,12 +242,12 @@ def merge_views(
     points: Float32,  # (N, 3) metres, of all views
     number: Int64,  # (N,) of the objects that the views show
     confidence: Float64,  # (O,)
-    view: Int64,  # (O,) that shows each of them
+    view: Int64,  # (O,) the view that shows each object
 ) -> tuple[Int64, Float64]:
-    """The numbers (N,) and confidences of objects, those of several views in one place joined.
+    """Join overlapping objects of different views; returns their numbers (N,) and confidences.
 
-    Those that overlap most come first; two of one view stay apart. Points of one that overlaps both
-    belong to what most views show in their place, then to the smaller object.
+    Pairs that overlap most are joined first; two objects of one view stay apart. Points of an
+    object that overlaps both belong to what most views show there, on ties to the smaller object.
     """
     held = np.flatnonzero(number >= 0)
     if len(held) == 0:
@@ -285,22 +285,22 @@ def merge_views(
 def objects_above(
     found: Segmentation,  # of N points
     above: Int64,  # (M,) which of them rise above the support
-    plan: Float64,  # (M, 2) places along it, metres
-    height: Float32,  # (N,) metres over it
-    margin: Float32,  # (N,) metres over it that belong to it
-    cut_off: bool,  # the cloud ends above the support
+    plan: Float64,  # (M, 2) positions along the support, metres
+    height: Float32,  # (N,) metres over the support
+    margin: Float32,  # (N,) metres over the support up to which points belong to it
+    cut_off: bool,  # whether the cloud was cropped above the support
 ) -> tuple[Int64, Float64]:
     """The object (M,) of each point above the support, and the confidence (O,) of each object."""
     likely = (found.object + found.support)[above] > MIN_CONFIDENCE
     number, height = found.number[above], height[above]
-    # The network misses thin parts, such as handles and edges, of the object beside them.
+    # The network misses thin parts, such as handles and edges: they join the object beside them.
     rows = np.flatnonzero((number < 0) & (height > margin[above] + MIN_RISE) & likely)
     held, places = subsample(np.flatnonzero(number >= 0)), np.column_stack([plan, height])
     apart, nearest = cKDTree(places[held]).query(places[rows], distance_upper_bound=POINT_REACH)
     near = np.isfinite(apart)
     number[rows[near]] = number[held[np.asarray(nearest)[near]]]
     first = len(found.confidence)
-    # Beside objects, background stays background: only points of parts too small to keep are left.
+    # If there are objects, background stays background: only parts that were too small are left.
     alone = not (number >= 0).any()
     among = likely & ((number == UNDECIDED) | alone)
     number = with_clusters(number, plan, among | cut_off, first)
@@ -314,11 +314,11 @@ def objects_above(
 
 
 def with_clusters(number: Int64, plan: Float64, among: Bools, first: int) -> Int64:
-    """The numbers (N,), with clusters of other points as further objects, from `first` on.
+    """The numbers (N,), with clusters of other points as additional objects, from `first` on.
 
-    For clouds whose support was cut off, in which the network sees objects without what they stand
-    on, and for small or distant objects, which it overlooks. `plan` (N, 2) are metres along
-    the support, `among` (N,) are the points that may belong to an object.
+    The network misses objects in clouds that were cropped above the support, as it does not see
+    what they stand on, and small or distant objects. `plan` (N, 2) are metres along the support,
+    `among` (N,) are the points that may belong to an object.
     """
     rows = np.flatnonzero((number < 0) & among)
     if len(rows) == 0:
@@ -359,14 +359,14 @@ def without_long(number: Int64, points: Float32, max_size: float) -> Int64:
 def _label_points(
     points: Float32,  # (N, 3) cloud frame, metres
     turn: Float64,  # (3, 3) to the camera's frame
-    origin: Float64,  # (3,) the camera's place, in the directions of its frame
+    origin: Float64,  # (3,) the camera's position, along the axes of its frame
     corner: Float64,  # (2,) of the image, as in `RangeImage`
     pixels: Pixels,
     of_pixel: Int64,  # (H, W) the object of each
 ) -> tuple[Int64, Float32, Float32]:
-    """The labels (N,) of the nearest output pixel around each point, if one is near enough.
+    """Label points (N,) by the nearest output pixel around each, if one is near enough.
 
-    Its object, and its probabilities of an object and of a support.
+    Returns its object, and its probabilities of an object and of a support.
     """
     seen, classes = pixels.points, pixels.classes
     rows, columns, _ = seen.shape

@@ -1,4 +1,4 @@
-"""The support plane: given, the largest one seen, or fitted to what the network calls support."""
+"""The support plane: given, the largest one seen, or fitted to points classified as support."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -28,11 +28,11 @@ from edgegrasp_model.scene.segment import Segmentation
 PLANE_NOISE, NOISE_GROWTH = 0.004, 0.006
 
 # The margin above a plane, up to which points belong to it.
-MARGIN_DEVIATIONS = 4.0  # standard deviations of its own points; PLANE_NOISE metres at least
+MARGIN_DEVIATIONS = 4.0  # standard deviations of the plane's points; PLANE_NOISE metres at least
 MAX_MARGIN = 0.02  # metres
 GIVEN_PLANE_MARGIN = 0.005  # metres, of a plane that the caller gives
 MAX_BOW = 0.025  # metres by which a bowed support rises or sinks from its plane
-HEEDED_RISE = 0.001  # metres by which what is seen must rise over a plane for hands to heed it
+HEEDED_RISE = 0.001  # metres; hands ignore smaller rises of the visible support over its plane
 
 # The fit to points classified as support.
 MIN_PLANE_POINTS = 60
@@ -44,13 +44,13 @@ MIN_SUPPORT_AREA = 0.008  # square metres; the top of an object is smaller
 
 # A cloud that was cropped above its support.
 MIN_SUPPORT_SHARE = 0.2  # of points classified as support, otherwise
-MIN_UP_COSINE = 0.5  # of the angle between up and where most cameras see it
+MIN_UP_COSINE = 0.5  # of the angle between up and its usual direction
 ASSUMED_PLANE_GAP = 0.003  # metres from the lowest points down to the assumed plane
 
 # Depths that a given plane corrects.
 INLIER_DISTANCE = 0.01  # metres from the plane
 MIN_INLIER_SHARE = 0.1  # of the points
-MAX_INLIER_SPREAD = 0.35  # median, as a share of INLIER_DISTANCE; a wall's is 0.5
+MAX_INLIER_SPREAD = 0.35  # median distance, as a share of INLIER_DISTANCE; a wall's is 0.5
 MIN_CORRECTED_AREA = 0.035  # square metres; flat tops of objects are smaller
 
 
@@ -68,9 +68,9 @@ class Support:
     bow: Float64 = field(default_factory=lambda: np.zeros(6))
 
     def under(self, objects: Floats, least: float) -> SupportPlane:
-        """The plane that hands stay above: as far as it is seen, the support under objects (N, 3).
+        """The plane that hands stay above, fitted to the visible support under objects (N, 3).
 
-        It is `least` metres over the support's plane, or higher where what is seen rises more.
+        It is `least` metres over the support's plane, or higher where the support rises more.
         """
         terms = _bow_terms(*self.frame.points(objects)[:, :2].T)
         rise = np.minimum(self.bow @ terms, MAX_BOW)
@@ -83,7 +83,7 @@ class Support:
         return plane_in(CanonicalFrame(T_cloud_plane), tilted)
 
     def heights(self, seen: "ViewedPoints") -> tuple[Float32, Float32]:
-        """Heights (N,) over the support, which may be bowed, and up to which points belong to it.
+        """Heights (N,) over the support, which may be bowed, and margins (N,) that belong to it.
 
         The noise of depth cameras grows with the square of the distance.
         """
@@ -113,7 +113,7 @@ def heights_over(plane: SupportPlane, points: Floats) -> Floats:
 
 
 def plane_in(frame: CanonicalFrame, plane: SupportPlane) -> SupportPlane:
-    """A plane of the cloud's frame in another one."""
+    """Transform a plane from the cloud's frame to another one."""
     normal = np.asarray(plane.normal)
     length = float(np.linalg.norm(normal))
     foot = frame.points(normal * (plane.offset / length**2))
@@ -124,9 +124,9 @@ def plane_in(frame: CanonicalFrame, plane: SupportPlane) -> SupportPlane:
 def find_support(
     seen: ViewedPoints,  # N points
     inside: Bools,  # (N,) which of them lie in the workspace
-    segmentation: Segmentation | None,  # the network's output, where it was asked
+    segmentation: Segmentation | None,  # the network's output, if it was run
     options: DetectOptions,
-    warnings: list[str],  # gets what is wrong with it, or that there is none
+    warnings: list[str],  # gets what is wrong with the support, or that there is none
 ) -> Support | None:
     """The support plane of a request."""
     request = options.support
@@ -137,7 +137,7 @@ def find_support(
     if isinstance(request, SupportPlane):
         found = _given_support(seen, segmentation, request, options, warnings)
     elif isinstance(request, RansacPlane):
-        cell, count = grid_cells(seen.points, AREA_CELL)  # equal areas count alike
+        cell, count = grid_cells(seen.points, AREA_CELL)  # equal areas get equal weight
         plane = fit_plane(seen, inside / count[cell], rng, up, request.max_tilt)
         if plane is not None:
             found = measure_support(seen, plane, request.distance, True)
@@ -165,8 +165,8 @@ def _given_support(
     options: DetectOptions,
     warnings: list[str],
 ) -> Support:
-    """A plane that the caller gives, as the points show it."""
-    # A bin's floor is not measured by the table around it; a followed object's workspace is no bin.
+    """The support in a plane that the caller gives, measured on the points."""
+    # The table around a bin must not count as its floor; a followed object's workspace is no bin.
     around = np.inf if options.follows_only else HAND_REACH * np.abs(plane.normal)
     over = np.flatnonzero(inside_workspace(seen.points, options.workspace, around))
     sample = ViewedPoints(seen.points[subsample(over)], seen.viewpoint)
@@ -177,7 +177,7 @@ def _given_support(
             "its frame, normal, and offset in metres."
         )
     on = np.flatnonzero([] if segmentation is None else segmentation.support > 0.5)
-    # Where a support was cut off, only flat tops may be classified as support.
+    # In a cloud cropped above its support, only flat tops may be classified as support.
     whole = len(on) > MIN_SUPPORT_SHARE * len(seen.points)
     whole = whole and _wider_than_object(seen.points[subsample(on)], plane)
     return measure_support(sample, plane, GIVEN_PLANE_MARGIN, whole)
@@ -206,7 +206,7 @@ def _fit_support(
         weight[heights_over(plane, part.points) > -MAX_MARGIN] = 0.0
     else:
         return None
-    # Of the points close to objects: the plane of a bin's floor, not the table's.
+    # Refined by the points close to objects: the plane of a bin's floor, not the table's.
     close = part.points[apart < REFINE_DISTANCE]
     near = close[np.abs(heights_over(plane, close)) < MAX_MARGIN].astype(np.float64)
     for within in (2.0, 1.25, 1.0):
@@ -220,7 +220,7 @@ def _fit_support(
     _, count = grid_cells(places[np.abs(places[:, 2]) < MAX_MARGIN, :2], AREA_CELL)
     if len(count) * AREA_CELL**2 <= MIN_SUPPORT_AREA:
         return None
-    return replace(found, share=found.share * len(on) / len(seen.points))  # of all that is seen
+    return replace(found, share=found.share * len(on) / len(seen.points))  # of all points
 
 
 def _assume_support(
@@ -250,7 +250,7 @@ def _assume_support(
 
 
 def in_camera_frame(options: DetectOptions) -> bool:
-    """Whether a camera is the origin: else the frame is of a robot or a world, whose z is up."""
+    """Whether a camera is at the origin; if not, z is up, as in the frame of a robot or a world."""
     cameras = options.viewpoint
     return cameras is not None and not np.reshape(cameras, (-1, 3)).any(axis=1).all()
 
@@ -260,12 +260,12 @@ def up_of_cropped(
     viewpoint: Float64,  # (3,)
     estimate: Float64 | None,  # (3,) unit, of the network; None: unknown
 ) -> Float64:
-    """Up (3,), unit, of a cloud without its support: its lower edge lies in a plane.
+    """Up (3,), unit, of a cloud without its support, from the plane of the cloud's lower edge.
 
-    Of the planes that the cloud touches on the side that the camera does not see, the one that it
-    touches in the most places. As the sides of a box are touched as often as what it stands on,
-    planes count less the more they differ from where most cameras see up: between the top of the
-    image and the camera, and near the network's estimate.
+    Of the faces of the convex hull that the camera does not see, this takes the one with points in
+    the most places. As many may lie in the sides of a box as in its bottom, so a face counts less
+    the more its direction differs from the usual up: between the top of the image and the camera,
+    and near the network's estimate.
     """
     points = subsample(cloud).astype(np.float64)
     toward = unit(viewpoint - points.mean(axis=0))
@@ -297,19 +297,19 @@ def _fit_least_squares(points: Float64, like: SupportPlane) -> SupportPlane:
 
 def fit_plane(
     seen: ViewedPoints,  # N points that may belong to it
-    weight: Floats,  # (N,) what each counts
+    weight: Floats,  # (N,) the weight of each
     rng: np.random.Generator,
-    up: Float64 | None,  # (3,) unit; None: any tilt will do
+    up: Float64 | None,  # (3,) unit; None: any tilt is allowed
     max_tilt: float = math.radians(30),  # from `up`
 ) -> SupportPlane | None:
-    """The plane that holds the most of weighted points, facing the camera (RANSAC).
+    """The plane that contains the most of the weighted points, facing the camera (RANSAC).
 
-    None: there are too few points, or none of it is level enough.
+    None: there are too few points, or no plane is level enough.
     """
     held = np.flatnonzero(weight > 0)
     if len(held) < MIN_PLANE_POINTS:
         return None
-    # Of 150 planes, the best one by the judgement of 1200 points.
+    # The best of 150 planes on a sample of 1200 points.
     chosen = rng.choice(
         held, min(1200, len(held)), replace=False, p=weight[held] / weight[held].sum()
     )
@@ -342,9 +342,9 @@ def fit_plane(
 
 
 def measure_support(seen: ViewedPoints, plane: SupportPlane, least: float, whole: bool) -> Support:
-    """The support of a plane, at least `least` metres thick, as the points show it.
+    """Measure the support in a plane on the points; it is at least `least` metres thick.
 
-    `whole`: the cloud was not cut off above the plane.
+    `whole`: the cloud was not cropped above the plane.
     """
     sample = ViewedPoints(subsample(seen.points), seen.viewpoint)
     frame = CanonicalFrame.of_scene(sample.points, plane.normal, seen.viewpoint)
@@ -353,7 +353,7 @@ def measure_support(seen: ViewedPoints, plane: SupportPlane, least: float, whole
     distance = sample.distance()
     thick = PLANE_NOISE + NOISE_GROWTH * np.square(distance)
     near = np.abs(height) < thick
-    # If the cloud was cut off above the plane, only objects on it are near.
+    # If the cloud was cropped above the plane, only objects on it are near.
     if near.sum() < MIN_PLANE_POINTS or (not whole and (height[near] < 1e-4).mean() < 0.2):
         return Support(plane, frame, least)
     terms, bow = _bow_terms(x, y), np.zeros(6)
@@ -424,13 +424,13 @@ def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> floa
     falls = height - heights_over(plane, points.astype(np.float64))
     if not INLIER_DISTANCE < height < MAX_DISTANCE:
         return None
-    # A scaled point lies in the plane if it is as far below the camera as the plane.
+    # A scaled point lies in the plane if it is as far below the camera as the plane is.
     factors = np.sort(height / falls[falls > 0.5 * height])
     reach = INLIER_DISTANCE / height
     tried = np.arange(1.0 - plane.max_depth_error, 1.0 + plane.max_depth_error, reach / 10)
     held = np.searchsorted(factors, tried + reach) - np.searchsorted(factors, tried - reach)
     enough = max(MIN_INLIER_SHARE * len(points), MIN_PLANE_POINTS)
-    start, width = 0, 21  # number of factors from the rise of a peak to past it
+    start, width = 0, 21  # factors from the start of a peak to beyond it
     while start < len(tried):
         window = held[start : start + width]
         if window.max() >= enough:
@@ -453,7 +453,7 @@ def _wider_than_object(points: Floats, plane: SupportPlane) -> bool:
 
 
 def _median_scale(factors: Float64, scale: float, reach: float) -> float | None:
-    """The median of the factors around one; None if they spread too much for a plane."""
+    """The median of the factors near `scale`; None if they spread too much for a plane."""
     for _ in range(20):
         within = factors[np.abs(factors - scale) <= reach]
         scale = float(np.median(within))
