@@ -1,4 +1,4 @@
-"""Loops over the points that each hand may meet or see, compiled to machine code by Numba.
+"""Loops over the points near each hand, compiled to machine code by Numba.
 
 NumPy would need many passes over large arrays; these loops take one point at a time and stay in the
 processor's cache.
@@ -15,7 +15,7 @@ from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 
 BLOCK_SIZE = 64  # points per block; blocks out of reach are skipped
-SLACK = 1e-5  # metres; a generous bound of float32 errors
+SLACK = 1e-5  # metres; a generous bound on float32 errors
 
 
 def compiled(*freedom: str) -> Callable[[Loop], Loop]:
@@ -33,7 +33,7 @@ def compiled(*freedom: str) -> Callable[[Loop], Loop]:
 
 
 class InHands(NamedTuple):
-    """N points, and the way from their frame to those of E hands."""
+    """N points, and the transforms from their frame to those of E hands."""
 
     columns: Float32  # (3, N) x, y and z, metres
     turn: Float32  # (E, 3, 3)
@@ -41,7 +41,7 @@ class InHands(NamedTuple):
 
 
 def in_hands(points: Float32, T_cloud_hand: Float32) -> InHands:
-    """Points (N, 3), as they are looked at from hands (E, 4, 4) by the loops below."""
+    """Points (N, 3) and hands (E, 4, 4), arranged for the loops below."""
     columns = np.ascontiguousarray(points.T, dtype=np.float32)
     turn = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
     return InHands(columns, turn, -(turn @ T_cloud_hand[:, :3, 3:])[:, :, 0])
@@ -53,7 +53,7 @@ def points_in_hand_boxes(
 ) -> tuple[Int64, Int64, Float32]:
     """The points between two corners (3,) of each hand's frame.
 
-    Hand (P,) ascending, row (P,) ascending within each, position (3, P) in its frame.
+    Returns hand (P,), ascending; row (P,), ascending for each hand; position (3, P) in its frame.
     """
     columns, turn, shift = hands
     sphere = _blocks(columns)
@@ -102,7 +102,7 @@ def any_point_in_boxes(hands: InHands, boxes: Float64) -> Bools:
 
 @compiled("contract")
 def any_point_on_way(hands: InHands, boxes: Float64, lift: Float32) -> Bools:
-    """As `any_point_in_boxes`, of hands that move straight along `lift` (E, 3), their frames."""
+    """Like `any_point_in_boxes`, for hands that move along `lift` (E, 3), in their own frames."""
     columns, turn, shift = hands
     sphere, hit, solid = _blocks(columns), np.zeros(len(turn), np.bool_), boxes.astype(np.float32)
     none = np.float32(0.0)
@@ -123,7 +123,7 @@ def any_point_on_way(hands: InHands, boxes: Float64, lift: Float32) -> Bools:
 
 @compiled("contract", "nnan", "nsz", "reassoc")
 def signed_distance_to_boxes(hands: InHands, boxes: Float64) -> Float32:
-    """Signed distance (E,) of the points to the boxes (B, 2, 3) of each hand, the least."""
+    """Least signed distance (E,) of the points to the boxes (B, 2, 3) of each hand."""
     columns, turn, shift = hands
     extents = np.empty(boxes.shape, np.float32)  # middles and halves
     extents[:, 0], extents[:, 1] = (boxes[:, 0] + boxes[:, 1]) / 2, (boxes[:, 1] - boxes[:, 0]) / 2
@@ -146,7 +146,7 @@ def free_way(hands: InHands, boxes: Float64, behind: float, least: float, most: 
 
     The hand's boxes are (B, 2, 3); points up to `behind` metres behind a box are in its way too.
     Negative where a hand would have to move back; at most `most`, where nothing nearer is ahead.
-    Where it is less than `least`, it may be less still.
+    A value below `least` is only an upper bound.
     """
     columns, turn, shift = hands
     sphere, way, solid = _blocks(columns), np.empty(len(turn), np.float32), boxes.astype(np.float32)
@@ -175,7 +175,7 @@ def free_way(hands: InHands, boxes: Float64, behind: float, least: float, most: 
 def extents_between(hands: InHands, first: Int64, last: Int64, pads: Float32) -> Float32:
     """Least and greatest y (E, 2) of the points between the pads of hands; (inf, -inf) without one.
 
-    Hand e looks at points first[e] to last[e]; `pads` are least and greatest x and z, hand frame.
+    Hand e has points first[e] to last[e]; `pads` are least and greatest x and z, hand frame.
     """
     columns, turn, shift = hands
     (low, high), extent = pads, np.empty((len(turn), 2), np.float32)
@@ -197,9 +197,9 @@ def non_max_suppression(
 ) -> tuple[Int64, Int64]:
     """Keep the first of each group of near duplicates in `order` (M,).
 
-    Those are within `near` metres of each other, T_cloud_tcp (E, 4, 4), and `angle` radians; a turn
-    by 180 degrees about the approach is ignored. Returns the rows kept, in order, and the
-    duplicates dropped.
+    Near duplicates are poses of T_cloud_tcp (E, 4, 4) within `near` metres and `angle` radians of
+    each other; a turn by 180 degrees about the approach is ignored. Returns the rows kept, in
+    order, and the duplicates dropped.
     """
     kept, dropped = np.zeros((2, len(order)), np.bool_)
     rows, found = np.empty(len(order), np.int64), 0
@@ -225,9 +225,9 @@ def non_max_suppression(
 def mean_over_similar(
     values: Float32, T_cloud_tcp: Float32, number: Int64, near: float, angle: float
 ) -> Float32:
-    """The mean value (E,) of the other hands on the same object that are like each one.
+    """The mean value (E,), for each hand, of the other similar hands on the same object.
 
-    Those are within `near` metres of it, T_cloud_tcp (E, 4, 4), and `angle` radians; a turn by
+    Similar poses of T_cloud_tcp (E, 4, 4) are within `near` metres and `angle` radians; a turn by
     180 degrees about the approach is ignored. `number` (E,) are the objects. NaN: there is none.
     """
     total, count = np.zeros(len(values)), np.zeros(len(values), np.int64)
@@ -256,7 +256,7 @@ def distance_behind(
     turn: Float32,  # (E, 3, 3) from each hand's frame to the camera's: across, down, ahead
     shift: Float32,  # (E, 3) of each hand in the camera's frame
     places: Float32,  # (S, 3) hand frame
-    cells: np.float32,  # in a tangent of 1
+    cells: np.float32,  # per unit of the tangent
 ) -> Float32:
     """Metres (E, S) that places of hands lie behind the first surface a camera saw, or 0."""
     behind, half = np.zeros((len(turn), len(places)), np.float32), len(surface) // 2
@@ -329,7 +329,7 @@ def _count_between(
     columns: Float32, k: int, turn: Float32, shift: Float32, low: Float32, high: Float32
 ) -> int:
     """How many points of block k lie between two corners of a hand's frame."""
-    # As separate functions on contiguous arrays, such loops are vectorised to 16 points at a time.
+    # Loops in separate functions on contiguous arrays are vectorised to 16 points at a time.
     start, stop = k * BLOCK_SIZE, (k + 1) * BLOCK_SIZE
     xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
     found = 0
@@ -343,7 +343,7 @@ def _count_between(
 def _count_on_way(
     columns: Float32, k: int, turn: Float32, shift: Float32, box: Float32, per_way: Floats
 ) -> int:
-    """How many points of block k a box passes over; `per_way` (3,): 1 / its way, hand frame."""
+    """How many points of block k a box passes over; `per_way` (3,): 1 / its motion, hand frame."""
     low, high = box[0], box[1]
     start, stop = k * BLOCK_SIZE, (k + 1) * BLOCK_SIZE
     xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
@@ -381,7 +381,7 @@ def _nearest_to_box(columns: Float32, turn: Float32, shift: Float32, extent: Flo
 def _least_between(
     columns: Float32, k: int, turn: Float32, shift: Float32, box: Float32, ahead: Float32
 ) -> np.float32:
-    """Least z of the points of block k in a box (2, 3); `ahead` (BLOCK_SIZE,) is written over."""
+    """Least z of the points of block k in a box (2, 3); `ahead` (BLOCK_SIZE,) is overwritten."""
     low, high = box[0], box[1]
     start, stop = k * BLOCK_SIZE, (k + 1) * BLOCK_SIZE
     xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
@@ -396,7 +396,7 @@ def _least_between(
 
 @compiled("contract")
 def _least_likeness(angle: float) -> np.float32:
-    """The trace of a rotation by an angle; all hands are alike from half a turn on."""
+    """The trace of a rotation by an angle; from 180 degrees on, all hands are similar."""
     return np.float32(1.0 + 2.0 * np.cos(angle) if angle < np.pi else -np.inf)
 
 

@@ -1,4 +1,4 @@
-"""The points near a hand, its collisions and clearance, and the opening its fingers need."""
+"""Collisions and clearance of hands, and the points near them."""
 
 from typing import NamedTuple
 
@@ -23,8 +23,8 @@ from edgegrasp_model.scene.segment import BACKGROUND
 from edgegrasp_model.unseen import enters_unseen
 
 FINGER_SURROUNDINGS = 0.006  # metres around a finger that count as near it
-MIN_BOX_WIDTH = 0.005  # metres across the way; narrower ones may pass between voxels
-MIN_BACKGROUND_VOXELS = 8  # voxels of background between the fingers that keep them from closing
+MIN_BOX_WIDTH = 0.005  # metres across the motion; narrower boxes may pass between voxels
+MIN_BACKGROUND_VOXELS = 8  # voxels of background between the fingers that count as a collision
 
 
 def collides(
@@ -36,9 +36,9 @@ def collides(
 ) -> Bools:
     """Which open hands (E,) collide at the grasp, on the approach or the retreat.
 
-    They hit the cloud, the support plane, an obstacle or space that no camera saw, or close on
-    background. The margin is added on every side of each box of the hand. A negative margin means
-    that the hands were fully checked earlier: unseen space and background are left out.
+    A hand collides if it hits the cloud, the support plane, an obstacle or unseen space, or closes
+    on background. The margin is added on every side of the hand's boxes. A negative margin means
+    that the hands were fully checked earlier: unseen space and background are not checked again.
     """
     boxes = gripper.open_boxes + request.margin * np.array([[-1.0], [1.0]])  # (B, 2, 3)
     thin = np.maximum(MIN_BOX_WIDTH - (boxes[:, 1] - boxes[:, 0]), 0.0) / 2 * (1.0, 1.0, 0.0)
@@ -58,14 +58,14 @@ def collides(
     if scene.support is not None:
         normal = np.asarray(scene.support.normal)
         height = support_clearance(T_cloud_hand, opening, scene.support, gripper)
-        rise = -T_cloud_hand[:, :3, 2] @ normal  # per metre of way back
+        rise = -T_cloud_hand[:, :3, 2] @ normal  # per metre backward
         lowest = np.minimum(height, height + behind * rise)
         lowest = np.minimum(lowest, height + lift * (UP @ normal))
         hit |= np.asarray(lowest < request.margin - SLACK)
     side, inner = gripper.pad_half_width, gripper.max_opening / 2
     low, high = (-side, -inner, gripper.palm_z), (side, inner, gripper.tip_z)
     if scene.obstacles is not None:
-        closing = np.concatenate([swept, [[low, high]]])  # and what is between the fingers
+        closing = np.concatenate([swept, [[low, high]]])  # and the space between the fingers
         for shapes, way in [(closing, 0.0), (boxes, lift)][: 1 + (lift > 0.0)]:
             solid = SolidBoxes.of_hands(T_cloud_hand, shapes)
             for near, theirs in near_pairs(solid, scene.obstacles, way):
@@ -95,21 +95,21 @@ def clearances(scene: Scene, T_cloud_hand: Float32, opening: Float32, gripper: G
         nearest, solid = nearest.astype(np.float64), SolidBoxes.of_hands(T_cloud_hand, boxes)
         for near, theirs in near_pairs(solid, scene.obstacles, np.repeat(nearest, len(boxes))):
             np.minimum.at(nearest, near // len(boxes), signed_distance(solid.take(near), theirs))
-    nearest[np.abs(nearest) < SLACK] = 0.0  # a hand that touches is not within
+    nearest[np.abs(nearest) < SLACK] = 0.0  # touching is not penetration
     return nearest.astype(np.float32)
 
 
 class HandView(NamedTuple):
-    """Cloud points in hand frames, without those out of reach."""
+    """Cloud points in hand frames, without those that are out of reach."""
 
     candidate: Int64  # (P,) ascending
     row: Int64  # (P,) row of the cloud
     position: Float32  # (3, P) x, y and z in the hand frame
-    bounds: Int64  # (E + 1,) where the points of each hand begin, and the last's end
+    bounds: Int64  # (E + 1,) where each hand's points begin, and where the last hand's end
 
 
 def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandView:
-    """The points of a cloud that open hands (E, 4, 4) meet on a straight approach, or nearly."""
+    """The cloud's points in or near the space that open hands (E, 4, 4) sweep on the approach."""
     boxes = gripper.open_boxes
     near = FINGER_SURROUNDINGS
     low = boxes[:, 0].min(axis=0) - np.array([near, near, APPROACH_LENGTH])

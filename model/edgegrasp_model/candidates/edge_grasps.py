@@ -1,8 +1,8 @@
-"""Approach points and the hands around them: edge grasps, centred ones, and across outlines.
+"""Approach points and the hands around them: edge grasps, centred grasps and outline grasps.
 
-At a depth edge the side of the object is not seen, so the normal that an edge grasp needs is
-missing. Grasps across an outline need only its direction and what lies between, beside and below
-the fingers: the hand comes from above or the camera.
+At a depth edge no camera sees the side of the object, so the normal that an edge grasp needs is
+missing. Grasps across an outline need only its direction and the points between, beside and below
+the fingers: the hand approaches from above or from the camera.
 """
 
 from collections.abc import Sequence
@@ -36,8 +36,8 @@ def spread_out(
 ) -> Int64:
     """Choose `count` different rows far from each other, or all of them if there are fewer.
 
-    They lie nearest to the nodes of grids, of 4 cm to 3 mm, each finer than the one before, around
-    the middle of the points: noise and other points hardly change them.
+    They are the points nearest to the nodes of grids around the middle of the points, from 4 cm to
+    3 mm, each finer than the one before: noise and additional points hardly change the choice.
     """
     chosen, total = np.asarray(before, dtype=np.int64), min(len(before) + count, len(points))
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -64,7 +64,7 @@ class BallCrop(NamedTuple):
 
     ball_rows: Int64  # (P,) rows of the cloud, ascending within each ball
     ball_of_point: Int64  # (P,) ascending, 0..A-1
-    start: Int64  # (A + 1,) place in `ball_rows` where each ball begins, and the last one ends
+    start: Int64  # (A + 1,) index in `ball_rows` where each ball begins, and the last one ends
 
 
 def crop_balls(
@@ -84,7 +84,7 @@ def crop_balls(
 class Candidates:
     """Edge grasps of one cloud (paper section III)."""
 
-    pair: Int64  # (E,) which of the given pairs of points
+    pair: Int64  # (E,) index of the given pair of points
     approach_index: Int64  # (E,) p_a, rows of the cloud
     contact_index: Int64  # (E,) p_c, rows of the cloud
     depth: Float32  # (E,) d, metres the contact lies ahead of the approach point
@@ -137,7 +137,7 @@ def edge_grasps(
     faults = {
         NoGrasp.TOO_SHORT: length <= MIN_EDGE_LENGTH,
         NoGrasp.TOO_LONG: length >= min(gripper.max_opening / 2 - FIT_MARGIN, reach),
-        NoGrasp.NO_DIRECTION: depth <= 1e-4,  # the approach is given by nothing but noise
+        NoGrasp.NO_DIRECTION: depth <= 1e-4,  # the approach direction would be noise
         NoGrasp.TOO_DEEP: depth >= gripper.contact_z - gripper.palm_z,
     }
     pair = np.flatnonzero(~np.any(list(faults.values()), axis=0))
@@ -156,9 +156,9 @@ def retract(
 ) -> tuple[Candidates, Bools]:
     """Move hands that cut into the support plane back along their approach, if that frees them.
 
-    The contact may move from contact_z to at most FIT_MARGIN inside the fingertips, so flat objects
+    The contact may move from contact_z as far as FIT_MARGIN behind the fingertips, so flat objects
     on a table are held by the tips. Returns the candidates, and a mask (E,) of those whose hand is
-    `margin` metres above the plane now; the other hands are unchanged.
+    now at least `margin` metres above the plane; the other hands are unchanged.
     """
     pose, opening = candidates.T_cloud_hand, candidates.opening
     clearance = support_clearance(pose, opening, support, gripper) - margin
@@ -206,9 +206,9 @@ def centred_grasps(
 ) -> Candidates:
     """Extra candidates for wide objects: hands shifted along their closing direction.
 
-    The hand of an edge grasp is centred on its approach point, and few sampled points lie in the
-    middle of an object almost as wide as the hand opens. Its extent is taken from the points of the
-    ball between the fingers; whether the hand fits is left to the collision check.
+    The hand of an edge grasp is centred on its approach point, but few sampled points lie in the
+    middle of an object that is almost as wide as the opening. The object's extent is measured on
+    the ball's points between the fingers; the collision check decides whether the hand fits.
     """
     axes, origin = candidates.T_cloud_hand[:, :3, :3], candidates.T_cloud_hand[:, :3, 3]
     outward = np.einsum("ed,ed->e", points[candidates.contact_index] - origin, axes[:, :, 1])
@@ -231,9 +231,9 @@ def centred_grasps(
 
 OUTLINE_RADIUS = 0.016  # metres of surface from which the outline's direction is estimated
 MIN_OUTLINE_OFFSET = 0.002  # metres from a neighbourhood's mean to a point on the outline
-MAX_RIM_DEVIATION = 0.003  # metres, standard deviation across a rim, all of which is outline
+MAX_RIM_DEVIATION = 0.003  # metres, standard deviation across a thin rim, which is all outline
 SURFACE_DROP = 0.006  # metres below an edge from which a surface counts as another one
-SURFACE_GAP = 0.007  # metres without a point, from which a surface counts as ended
+SURFACE_GAP = 0.007  # metres without a point at which a surface counts as ended
 MAX_INSERTION = 0.020  # metres deeper than an edge grasp; more does not hold better
 
 
@@ -248,11 +248,11 @@ class Outline(NamedTuple):
 def outlines(
     points: Float32,  # (N, 3) canonical frame, metres
     viewpoints: Float32,  # (W, 3)
-    rows: Int64,  # (M,) of the points to look at
+    rows: Int64,  # (M,) of the points that may lie on an outline
     *,
-    leaning: bool = False,  # also from four sides, 30 degrees off above
+    leaning: bool = False,  # also from four sides, 30 degrees off the vertical
 ) -> list[Outline]:
-    """The outlines of a cloud from above and, if that is another direction, from each camera."""
+    """The outlines of a cloud as seen from above and, where that differs, from each camera."""
     toward, lean = [np.broadcast_to(UP, points.shape)], np.radians(30.0)
     toward += [unit(eye - points) for eye in viewpoints]
     if leaning:
@@ -275,7 +275,7 @@ def outlines(
         heading[rows] = least
         is_edge[rows] = (outward > MIN_OUTLINE_OFFSET) | (deviation < MAX_RIM_DEVIATION)
         if found:
-            # Directions within half of that of up show the same outline.
+            # Directions within half the lean of the vertical show the same outline.
             is_edge[rows] &= way @ UP < np.cos(lean / 2)
         found.append(Outline(each, heading, is_edge))
     return found
@@ -291,11 +291,11 @@ def outline_grasps(
     gripper: Gripper,
     margin: float = 0.0,  # metres kept free around the hand
 ) -> Candidates:
-    """Hands that approach from the outline's viewpoint and close across it; at most one a contact.
+    """Hands that come from the outline's viewpoint and close across it; at most one per contact.
 
-    The contact point lies on the outline, the hand in the middle between it and the opposite edge
-    of the same surface, and the approach point nearest to the hand's axis. The hand moves in until
-    something is right ahead of it, at most MAX_INSERTION deeper than an edge grasp.
+    The contact point lies on the outline. The hand is centred between it and the opposite edge of
+    the same surface; the approach point is the one nearest to the hand's axis. The hand moves in
+    until something is right ahead of it, at most MAX_INSERTION deeper than an edge grasp.
     """
     y, z = outline.heading, -outline.toward
     frame = np.stack([points, np.cross(y, z), y, z], axis=1)  # (N, 4, 3)
@@ -335,8 +335,8 @@ def _inserted(
     gripper: Gripper,
     margin: float,
 ) -> Candidates:
-    """The hands moved in until something is right ahead, without those that stop early."""
-    least = gripper.contact_z + FIT_MARGIN - gripper.tip_z  # metres of way that it takes
+    """Move hands in until something is right ahead of them; leave out those that stop too early."""
+    least = gripper.contact_z + FIT_MARGIN - gripper.tip_z  # shortest way in, metres; below 0: out
     room = np.full(len(candidates), np.inf, dtype=np.float32)  # metres of way above the support
     if support is not None:
         fall = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
@@ -348,7 +348,7 @@ def _inserted(
     candidates = candidates.take(enough)
     boxes = gripper.open_boxes + margin * np.array([[-1.0], [1.0]])
     seen = in_hands(points, candidates.T_cloud_hand)
-    ends = least + FIT_MARGIN, MAX_INSERTION + FIT_MARGIN  # beyond them, the way does not matter
+    ends = least + FIT_MARGIN, MAX_INSERTION + FIT_MARGIN  # the exact way does not matter beyond
     way = free_way(seen, boxes, APPROACH_LENGTH, *ends) - FIT_MARGIN
     way = np.minimum(way, room[enough])
     row = np.flatnonzero(way >= least)
@@ -360,17 +360,17 @@ def _inserted(
 @compiled("contract")
 def extents_across(
     points: Float32,  # (N, 3) of the cloud
-    rows: Int64,  # (P,) of points to look at, group after group
-    first: Int64,  # (M,) places in `rows` where the group of each edge begins
-    last: Int64,  # (M,) and where they end
-    # (M, 4, 3) of each edge the point it is at; across the strip, out of the object along it, and
-    # ahead of the hand, unit vectors
+    rows: Int64,  # (P,) of the points to measure, group after group
+    first: Int64,  # (M,) indices in `rows` where the group of each edge begins
+    last: Int64,  # (M,) indices where they end
+    # (M, 4, 3) for each edge its point, and unit vectors across the strip, along it out of the
+    # object, and ahead of the hand
     frame: Float32,
-    # (4,) its half width and its length, how far ahead of the edge its points may be, and the gap
-    # length that ends it, metres
+    # (4,) the strip's half width and length, how far ahead of the edge its points may be, and the
+    # gap that ends it, metres
     strip: Float32,
 ) -> Float32:
-    """Least and greatest metres (M, 2) that the surface extends into the object, across an edge."""
+    """Least and greatest distance (M, 2) of a surface from its edge, into the object; metres."""
     columns, extent = np.ascontiguousarray(points[rows].T), np.zeros((len(frame), 2), np.float32)
     length, gap = strip[1], strip[3]
     cell = gap / 4  # of a histogram along the strip
@@ -402,8 +402,8 @@ def extents_across(
 def _into_strip(
     columns: Float32, first: int, last: int, frame: Float32, strip: Float32, depth: Float32
 ) -> None:
-    """Distance of a group's points into the object; the strip's length for points outside of it."""
-    # As separate functions on contiguous arrays, such loops are vectorised to 16 points at a time.
+    """Set `depth` to the points' distances into the object; to the strip's length outside of it."""
+    # Loops in separate functions on contiguous arrays are vectorised to 16 points at a time.
     xs, ys, zs = columns[0, first:last], columns[1, first:last], columns[2, first:last]
     origin, across, out, ahead = frame[0], frame[1], frame[2], frame[3]
     half, length, drop, gap = strip[0], strip[1], strip[2], strip[3]
@@ -420,13 +420,13 @@ def _into_strip(
 def _level_spread(
     columns: Float32,  # (3, N) points, sorted by
     key: Int64,  # (N,) the number of their cell
-    middle: Float32,  # (M, 3) the points to look at
+    middle: Float32,  # (M, 3) the points with these neighbourhoods
     middle_key: Int64,  # (M,)
     sizes: Int64,  # (3,) of the grid, cells
     toward: Float32,  # (T, M, 3) unit, toward each viewpoint
-    reach: Float32,  # (2,) metres around each point in which others count, and how much lower
+    reach: Float32,  # (2,) radius of a neighbourhood, and how far it extends downward, metres
 ) -> tuple[Float32, Float32, Float32]:
-    """How the neighbourhood of each point is distributed, from each viewpoint.
+    """How the neighbours of each point are distributed, as seen from each viewpoint.
 
     Returns the direction orthogonal to `toward` in which they spread least, (T, M, 3) unit; how far
     (T, M) the point lies from their mean along it, not negative; their standard deviation (T, M)
@@ -466,7 +466,7 @@ def _level_spread(
 
 @compiled("contract")
 def _set_level_axes(up: Float32, axes: Float32) -> None:
-    """Up and two level directions, from the axis that is farthest from up."""
+    """Set `axes` to up and two level directions, chosen by the axis that is farthest from up."""
     first = 0
     for d in range(1, 3):
         first = d if abs(up[d]) < abs(up[first]) else first

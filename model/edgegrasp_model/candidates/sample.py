@@ -33,7 +33,7 @@ from edgegrasp_model.scene.cloud import UP, CanonicalFrame
 from edgegrasp_model.scene.scene import Scene
 
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
-MAX_APPROACH_POINTS = 64  # per view of a scene, for up to four views; at least half of them
+MAX_APPROACH_POINTS = 64  # per view, for up to four views; at least half of them are used
 MIN_PER_OBJECT = 4  # for each object, or twice as many where there are few objects
 OUTCOME_CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
 
@@ -44,10 +44,10 @@ class Sample:
 
     candidates: Candidates  # E of them
     collision_free: Bools  # (E,)
-    turned: Bools  # (E,) by 180 degrees about z once scored: free that way only
-    drawn: Candidates  # all of them, C
+    turned: Bools  # (E,) collision-free only if turned by 180 degrees about z after scoring
+    drawn: Candidates  # all C of them
     outcome: NDArray[np.int8]  # (C,) each one's OUTCOME_CODE; RETURNED: it is to be scored
-    row: Int64  # (E,) indices of the candidates among them
+    row: Int64  # (E,) rows of `candidates` in `drawn`
     logits: Float32 = field(default_factory=lambda: np.empty(0, np.float32))  # (E,) once scored
 
     def followed_by(self, other: "Sample") -> "Sample":
@@ -63,14 +63,14 @@ class Sample:
         )
 
     def scored(self, logits: Float32) -> "Sample":
-        """This sample with its logits (E,); the network saw the hands as they were drawn."""
+        """This sample with its logits (E,); the network saw the hands before they are turned."""
         pose = self.candidates.T_cloud_hand
         pose = np.where(self.turned[:, None, None], pose * HALF_TURN, pose)
         return replace(self, candidates=replace(self.candidates, T_cloud_hand=pose), logits=logits)
 
 
 class Sampler:
-    """Draws candidates in rounds, collision-free ones if possible, `num_candidates` in all."""
+    """Draws candidates in rounds, collision-free ones if possible, at most `num_candidates`."""
 
     def __init__(
         self,
@@ -79,7 +79,7 @@ class Sampler:
         gripper: Gripper,
         crop_radius: float,  # of the balls, metres
         counts: defaultdict[str, int],  # gets what each constraint leaves, over all rounds
-        sees_hands: bool = False,  # whether the network scores hands that are no edge grasps well
+        sees_hands: bool = False,  # whether the network can score hands that are not edge grasps
     ) -> None:
         """Share the approach points among the objects."""
         self.scene, self.options, self.gripper = scene, options, gripper
@@ -105,14 +105,14 @@ class Sampler:
 
     def sample(
         self,
-        done: Int64 | tuple[()] = (),  # (D,) numbers of objects that need no more
+        done: Int64 | tuple[()] = (),  # (D,) numbers of objects that need no more candidates
         *,
-        last_resort: bool = False,  # try hands that hold less often or are scored too high
+        last_resort: bool = False,  # also hands that hold less often or are scored too high
     ) -> Sample | None:
         """Candidates around further approach points; None if there is no point to add.
 
-        Half of the points in the first round, all if their number is given; in the second as many
-        as are left; in each further one as many as an object gets in the first two together.
+        The first round uses half of the points, or all if their number is given; the second uses
+        the rest; in each further round an object gets as many as in the first two together.
         """
         open_ = np.where(np.isin(self._objects, done), 0, self._wanted)
         left = (self._wanted - self._first).sum()
@@ -125,12 +125,12 @@ class Sampler:
         options, mode = self.options, self.options.collision.mode
         drawn, outcome = self._constrained(more, last_resort=last_resort)
         passed = np.flatnonzero(outcome == OUTCOME_CODE[Outcome.RETURNED])
-        row = random_rows(passed, 4 * options.num_candidates, self._rng)  # of which many collide
+        row = random_rows(passed, 4 * options.num_candidates, self._rng)  # many collide
         checked = drawn.take(row)
         hands = checked.T_cloud_hand, checked.opening
         free = ~collides(self.scene, *hands, self.gripper, options.collision)
         turned = np.zeros_like(free)
-        if not self.gripper.symmetric:  # it has a camera at one side, say
+        if not self.gripper.symmetric:  # with a camera on one side, for example
             hit = checked.take(np.flatnonzero(~free))
             hands = hit.T_cloud_hand * HALF_TURN, hit.opening
             turned[~free] = ~collides(self.scene, *hands, self.gripper, options.collision)
@@ -154,7 +154,7 @@ class Sampler:
         return Sample(drawn.take(row), free, turned, drawn, outcome, row)
 
     def all(self) -> Sample:
-        """Two rounds, whatever their scores."""
+        """Candidates of two rounds, regardless of their scores."""
         samples = self.sample(), self.sample(last_resort=True)
         return reduce(Sample.followed_by, [one for one in samples if one is not None])
 
@@ -163,8 +163,8 @@ class Sampler:
     ) -> tuple[Candidates, NDArray[np.int8]]:
         """Candidates around approach points; RETURNED: all constraints hold except collision.
 
-        A network that sees hands gets centred hands, and hands across outlines: as a last resort
-        tilted ones too. To one that sees edges a hand across an outline is a last resort.
+        A network that sees hands also gets centred grasps and outline grasps, and as a last resort
+        tilted outline grasps. A network that sees edges gets outline grasps only as a last resort.
         """
         scene, options, gripper = self.scene, self.options, self.gripper
         points, margin = scene.cloud.points, options.collision.margin
@@ -198,7 +198,7 @@ class Sampler:
         return candidates, outcome
 
     def _spread(self, counts: Int64) -> Int64:
-        """Further approach points, `counts` (O,) on each of the objects; rows of the cloud."""
+        """Rows of more approach points in the cloud, `counts` (O,) on each of the objects."""
         number, chosen = self.scene.object_of_point[self._rows], [self._rows[:0]]
         for which, count in zip(self._objects[counts > 0], counts[counts > 0], strict=True):
             mine = self._rows[number == which]
@@ -216,9 +216,9 @@ class Sampler:
 def distinct_hands(
     T_cloud_hand: Float32, first: Bools, gripper: Gripper, options: DetectOptions
 ) -> Bools:
-    """Hands (E,) that non-maximum suppression keeps whatever their scores; `first` come first.
+    """Hands (E,) that remain after non-maximum suppression without scores; `first` take precedence.
 
-    Those within 4 mm and 10 degrees of each other share one score.
+    Only one of the hands within 4 mm and 10 degrees of each other is scored.
     """
     rule = options.suppression
     near = 0.0 if rule is None else min(0.004, rule.translation)
@@ -230,7 +230,7 @@ def distinct_hands(
 
 
 def random_rows(rows: Int64, limit: int, rng: np.random.Generator) -> Int64:
-    """At most `limit` of ascending rows, at random."""
+    """At most `limit` rows, chosen at random from ascending rows and kept in order."""
     return rows if len(rows) <= limit else np.sort(rng.choice(rows, limit, replace=False))
 
 

@@ -20,7 +20,7 @@ class BallBatch:
 
     points: Tensor  # (P, 3) float32, centred on their own ball's approach point
     normals: Tensor  # (P, 3) float32
-    neighbors: Tensor  # (P, k) int64, rows of `points` in the same ball, the own row included
+    neighbors: Tensor  # (P, k) int64, rows of `points` in the same ball, the point's own included
     ball_of_point: Tensor  # (P,) int64, ascending, 0..num_balls-1, none of them empty
     contact: Tensor  # (E,) int64, rows of `points`: the contact point of each edge grasp
     approach: Tensor  # (E, 3) float32, outward approach direction u, unit length
@@ -41,7 +41,7 @@ class BallBatch:
         ball = np.searchsorted(balls, candidates.approach_index)
         contact = np.searchsorted(keys, ball * size + candidates.contact_index)
         centred = cloud.points[crop.ball_rows] - cloud.points[balls][crop.ball_of_point]
-        # The nearest points of the same ball, the point itself first; it fills up small balls.
+        # The nearest points of the same ball, the point itself first; it also pads small balls.
         neighbors = np.repeat(np.arange(len(centred))[:, None], k, axis=1)
         for start, stop in pairwise(crop.start.tolist()):
             points = centred[start:stop]

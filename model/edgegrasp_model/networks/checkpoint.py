@@ -1,6 +1,6 @@
 """Checkpoints: a network's weights and metadata in one safetensors file.
 
-The file's metadata holds one JSON text under the key `edgegrasp`; nothing in it is ever executed.
+The file's metadata contains JSON under the key `edgegrasp`; nothing in it is ever executed.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ from edgegrasp_model.networks.vn_edgegrasp import VNEdgeGraspNet
 
 _METADATA_KEY = "edgegrasp"
 _FORMAT = 1
-MAX_DIFFERENCE = 0.05  # mean difference of the reference logits, share of their range
+MAX_DIFFERENCE = 0.05  # mean difference of the reference logits, as a share of their range
 NETWORKS: dict[Architecture, Callable[[NetworkConfig], nn.Module]] = {
     "edgegrasp": EdgeGraspNet,
     "vn-edgegrasp": VNEdgeGraspNet,
@@ -43,7 +43,7 @@ def save_checkpoint(path: Path, network: nn.Module, metadata: CheckpointMetadata
     del values["digest"]
     text = json.dumps(values, sort_keys=True)
     partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(save(tensors, metadata={_METADATA_KEY: text}))  # readable as other files
+    partial.write_bytes(save(tensors, metadata={_METADATA_KEY: text}))  # save_file sets mode 600
     partial.replace(path)
 
 
@@ -57,15 +57,15 @@ def load_checkpoint(path: Path) -> tuple[nn.Module, CheckpointMetadata]:
             raise ValueError(f"format: got {written!r}. This version reads {_FORMAT}.")
         metadata = CheckpointMetadata(**values)
         if metadata.tensors_digest not in ("", _digest(tensors)):
-            raise ValueError("the weights are not those it was written with")
+            raise ValueError("the weights differ from those that were written")
         if not all(tensor.isfinite().all() for tensor in tensors.values()):
-            raise ValueError("the weights hold NaN or infinity")
+            raise ValueError("the weights contain NaN or infinity")
         with torch.device("meta"):
             network = NETWORKS[metadata.network.architecture](metadata.network)
         network.load_state_dict(tensors, assign=True)
     except (OSError, SafetensorError, LookupError, TypeError, ValueError, RuntimeError) as error:
         raise InvalidCheckpoint(
-            f"checkpoint: got {path}, of which weights or edgegrasp metadata are unusable "
+            f"checkpoint: got {path}, whose weights or edgegrasp metadata are unusable "
             f"({error!r}). Restore the file from a copy, or write it again with `edgegrasp train` "
             "or `edgegrasp import-checkpoint`."
         ) from error
@@ -74,7 +74,7 @@ def load_checkpoint(path: Path) -> tuple[nn.Module, CheckpointMetadata]:
 
 
 def check_reference_logits(network: nn.Module, metadata: CheckpointMetadata) -> None:
-    """Raise InvalidCheckpoint unless the network gives the stored logits, up to near ties."""
+    """Raise InvalidCheckpoint unless the network gives the stored logits, within MAX_DIFFERENCE."""
     found = np.asarray(reference_logits(network))
     expected = np.asarray(metadata.reference_logits or found)
     tolerance = MAX_DIFFERENCE * np.ptp(expected) + 1e-3
@@ -86,7 +86,7 @@ def check_reference_logits(network: nn.Module, metadata: CheckpointMetadata) -> 
 
 
 def reference_logits(network: nn.Module) -> list[float]:
-    """The logits of a network for a fixed synthetic batch, whatever its architecture."""
+    """The logits of a network of any architecture for a fixed synthetic batch."""
     config: NetworkConfig = network.config  # type: ignore[assignment]
     device = next(network.parameters()).device
     kind: type[HandBatch | BallBatch] = HandBatch if config.architecture == "hand" else BallBatch

@@ -10,7 +10,7 @@ HAND_DESCRIPTION_SIZE = 87  # numbers
 Architecture = Literal["edgegrasp", "vn-edgegrasp", "hand"]
 Count = Annotated[int, Field(gt=0, strict=True)]
 Metres = Annotated[float, Field(gt=0.0, lt=1.0)]
-# Layers of each part of the paper's networks; the classifier may be as deep as it likes.
+# Layers of each part of the paper's networks; the classifier may have any number.
 _LAYERS = {"conv_widths": 3, "global_widths_1": 3, "global_widths_2": 2}
 
 
@@ -25,7 +25,7 @@ class NetworkConfig:
     classifier_widths: tuple[Count, ...] = ()  # hidden layers
     hand_widths: tuple[Count, ...] = ()  # of `hand`: shared MLP before the maximum over the points
     hand_points: Count = 128  # of `hand`: points around the fingers
-    # Of `hand`: numbers it reads of each hand description, the first.
+    # Of `hand`: how many numbers of each hand description it reads, from the first.
     description_size: Annotated[Count, Field(le=HAND_DESCRIPTION_SIZE)] = 61
     k: Count = 16  # neighbours in the graph, the point itself included
     crop_radius: Metres = 0.05  # of the balls

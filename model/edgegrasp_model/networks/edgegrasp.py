@@ -62,7 +62,7 @@ class PointNetConv(nn.Module):
         weight, output = self.hidden.weight, layers.packed_linear(self.output.weight)
         u = torch.cat((features, batch.points), dim=1)
         u = layers.by_chunks(layers.packed_linear(weight, self.hidden.bias), u)  # (P, width)
-        # The bias is the same for all neighbours: added once, after the maximum.
+        # The bias is the same for all neighbours, so it is added once, after the maximum.
         here, pooled = batch.points @ weight[:, -3:].t(), []  # (P, width)
         for neighbors, own in layers.in_chunks(layers.CONVOLVED, batch.neighbors, here):
             there = layers.gather_rows(u, neighbors)  # (p, k, width)
@@ -72,7 +72,7 @@ class PointNetConv(nn.Module):
 
 
 class GlobalFeature(nn.Module):
-    """One feature per ball: twice an MLP and a maximum over the ball, joined to each point."""
+    """One feature per ball: an MLP and a maximum, joined to each point; then both again."""
 
     def __init__(self, inputs: int, widths_1: tuple[int, ...], widths_2: tuple[int, ...]) -> None:
         super().__init__()

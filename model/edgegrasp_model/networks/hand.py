@@ -1,12 +1,12 @@
-"""HandNet: scores edge grasps from what each hand sees in its own frame.
+"""HandNet: scores edge grasps from the points near each hand, in the hand's own frame.
 
-A PointNet over the points around the fingers, beside a description of the hand. Where the paper's
-network shares one ball among all its edge grasps and has to learn what a rotation does, this one
-sees each edge grasp in the frame of its own hand: invariant under rotations, translations and
-reflections of the whole scene by construction. The numbers of the description say how many points
-the hand would hit, what lies between its fingers, from where that was seen, how the hand is
+It is a PointNet over the points around the fingers, combined with a description of the hand. The
+paper's network shares one ball among all its edge grasps and has to learn what a rotation does.
+This network sees each edge grasp in the frame of its own hand, so it is invariant under rotations,
+translations and reflections of the whole scene by construction. The description contains how many
+points the hand would hit, what lies between its fingers, from where that was seen, how the hand is
 oriented to gravity and support, how much of the space around it the camera did not see, the hand's
-own measures, and the visible extent of the object around it.
+own dimensions, and the visible extent of the object around it.
 """
 
 from dataclasses import dataclass
@@ -36,14 +36,14 @@ HANDS_AT_A_TIME = 64  # hands at a time, so that the work stays in cache
 
 # The description
 AXIS_RADIUS = 0.001  # metres from the approach axis, on which the approach point itself lies
-SLAB_THICKNESS = 0.004  # metres; thickness of the first layer each finger would meet
+SLAB_THICKNESS = 0.004  # metres; thickness of the first layer each finger would touch
 MIN_FACING = 0.7  # cosine from which a normal faces a finger
 ABOVE_CAMERA = 0.001  # metres over the camera
 # Metres beyond the pads' sides, the open fingers' inner faces, the palm and the tips.
 BESIDE_PADS, OUTSIDE_FINGERS, BEHIND_PALM, BEYOND_TIPS = 0.027, 0.06, 0.026, 0.012
 UNKNOWN_HEIGHT = 0.10  # metres; heights are clipped here, and unknown ones get this value
 HEIGHT_NUMBERS = slice(58, 61)  # numbers that are heights over the support plane
-UNSEEN_NUMBERS = slice(65, 67)  # unseen metres outward from what each finger meets first
+UNSEEN_NUMBERS = slice(65, 67)  # unseen metres outward from what each finger touches first
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class HandBatch:
 
     description: Tensor  # (E, F) float32, F at least what the network reads
     points: Tensor  # (E, P, 6) float32, positions and normals around the fingers, hand frame
-    point_count: Tensor  # (E,) int64, how many of the P there are; zeros follow
+    point_count: Tensor  # (E,) int64, how many of the P are points; zeros follow
 
     @classmethod
     def of_hands(
@@ -63,7 +63,7 @@ class HandBatch:
         num_points: int,
         description_size: int = HAND_DESCRIPTION_SIZE,
     ) -> Self:
-        """The view of each candidate's hand, with at most `num_points` points."""
+        """Describe each candidate's hand and its surroundings, with at most `num_points` points."""
         hands = candidates.T_cloud_hand
         view = hand_views(around.cloud, hands, gripper)
         side = np.ones(len(hands), dtype=np.float32)
@@ -95,7 +95,7 @@ class HandBatch:
 
 
 class HandNet(nn.Module):
-    """E edge grasps, P points around the fingers of each."""
+    """Scores E edge grasps, with P points around the fingers of each."""
 
     mean: Tensor  # (F,) of the training data's descriptions
     std: Tensor  # (F,)
@@ -110,7 +110,7 @@ class HandNet(nn.Module):
         self.classifier = layers.mlp((inputs, *config.classifier_widths, 1))
 
     def forward(self, batch: HandBatch, left_out: torch.Generator | None = None) -> Tensor:
-        """Logits (E,) of success; in training `left_out` draws what dropout removes."""
+        """Logits (E,) of success; in training, `left_out` draws the inputs that dropout removes."""
         known = batch.description[:, : self.config.description_size]
         description = (known - self.mean) / self.std  # (E, F)
         encoder, chunks = layers.packed(self.point_encoder, layers.FAST), []
@@ -156,7 +156,7 @@ def _pool(features: Float32, count: Int64, pooled: Float32) -> None:
 
 
 def describe_hands(
-    around: Surroundings,  # what they look at
+    around: Surroundings,  # of the hands
     candidates: Candidates,  # E candidates
     gripper: Gripper,  # fingers open to its maximum
     view: HandView,  # of the same candidates
@@ -181,7 +181,7 @@ def describe_hands(
     ups = np.broadcast_to(up / np.linalg.norm(up), toward.shape)
     length, swing = gripper.tip_z - gripper.palm_z, gripper.max_tip_z - gripper.tip_z
     thick = gripper.finger_thickness
-    measures = gripper.max_opening, length, gripper.pad_half_width, thick, swing  # of a finger
+    measures = gripper.max_opening, length, gripper.pad_half_width, thick, swing  # of the gripper
     columns = [
         *seen.T,
         *np.einsum("ed,edk->ke", toward, mirrored),  # 0 where the camera is unknown
@@ -211,11 +211,11 @@ class _Hand(NamedTuple):
     inner: np.float32  # y of that finger's inner face
     palm: np.float32  # z
     tip: np.float32
-    end: np.float32  # z of the fingertips at their most forward
+    end: np.float32  # greatest z of the fingertips while closing
 
 
 def _stance(around: Surroundings, candidates: Candidates, gripper: Gripper) -> list[Float32]:
-    """The edge itself, and the hand's orientation and height over gravity and support plane."""
+    """The edge itself, the hand's orientation to gravity, and its height over the support plane."""
     cloud, support, up = around.cloud, around.support, around.up / np.linalg.norm(around.up)
     pose = candidates.T_cloud_hand
     contact = cloud.points[candidates.contact_index]  # (E, 3)
@@ -239,7 +239,7 @@ def _stance(around: Surroundings, candidates: Candidates, gripper: Gripper) -> l
 def _look_from_each(
     view: HandView, normals: Float32, axes: Float32, side: Float32, cut: Bools, hand: _Hand
 ) -> tuple[Float32, Float32, Float32]:
-    """Look from hands with axes (E, 3, 3), the x of which is mirrored where `side` (E,) is -1.
+    """Describe points in the frames of hands with axes (E, 3, 3), x mirrored if `side` (E,) is -1.
 
     Returns 37 numbers (E, 37): those of `_count_hits`, those of `_measure_between`, and how many
     points between the fingers lie where the workspace cuts objects off, `cut` (N,), all counts n as
@@ -287,7 +287,7 @@ def _count_hits(x: Float32, y: Float32, z: Float32, hand: _Hand, hits: Float32) 
 def _in_any(
     boxes: Float32, x: Float32, y: Float32, z: Float32, around: float, behind: float
 ) -> Bools:
-    """Which points lie in one of some boxes, grown around (not behind) and lengthened behind."""
+    """Which points lie in any of the boxes, grown by `around`, but at the back by `behind`."""
     inside = np.zeros(len(x), dtype=np.bool_)
     grown, longer = np.float32(around), np.float32(behind)
     for b in range(len(boxes)):
@@ -303,11 +303,11 @@ def _in_any(
 def _measure_between(points: Float32, normals: Float32, hand: _Hand, numbers: Float32) -> None:
     """Extent, middle and normals of points (3, P), z from the palm, that the fingers would touch.
 
-    Those between the pads: their number; greatest, least and mean x, y and z. All, up to three
-    pads wide: their number; greatest, least and mean x. Between the pads: the mean size of the
-    normals' x and y, and their mean z; how many face each finger; the mean y of the normals on
-    either side of the hand's axis. Of what each finger meets first: number, mean y of the normals,
-    mean z and mean x.
+    Points between the pads: their number; greatest, least and mean x, y and z. All points, in a
+    strip three pads wide: their number; greatest, least and mean x. Points between the pads: mean
+    absolute x and y and mean z of the normals; how many face each finger; mean y of the normals on
+    either side of the hand's axis. Points that each finger touches first: number, mean y of the
+    normals, mean z and mean x.
     """
     length = hand.end - hand.palm
     between = np.flatnonzero(np.abs(points[0]) < hand.half)
@@ -351,7 +351,7 @@ def _mean(values: Float32) -> float:
 
 @compiled("contract")
 def _runs_along(y: Float32, ends: Float32, runs: Float32) -> None:
-    """The longest empty stretch of y, and the gapless length of what each finger touches first.
+    """The longest gap along y, and the length up to a gap of what each finger touches first.
 
     Also the greatest and the least y, which stay 0 without points.
     """
@@ -376,11 +376,11 @@ def _runs_along(y: Float32, ends: Float32, runs: Float32) -> None:
 def _around_fingers(
     view: HandView, normals: Float32, T_cloud_hand: Float32, side: Float32, box: Float32, limit: int
 ) -> tuple[Float32, Int64]:
-    """The points of hands (E, 4, 4) in a box around their fingers; x as `side` (E,) has it.
+    """The points in a box around the fingers of hands (E, 4, 4); x is multiplied by `side` (E,).
 
     `box` (3, 3) are its corners and the origin, between the fingertips. At most `limit` points are
-    kept of each hand, spread evenly over the cloud's order. Returns (E, limit, 6) positions in
-    metres and normals, in hand frames, zeros behind the last; and their number (E,).
+    kept for each hand, spread evenly over the cloud's order. Returns (E, limit, 6) positions in
+    metres and normals, in hand frames, zeros after the last; and their number (E,).
     """
     points, count = np.zeros((len(side), limit, 6), np.float32), np.zeros(len(side), np.int64)
     low, high, origin = box

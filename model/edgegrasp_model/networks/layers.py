@@ -21,12 +21,12 @@ Layer = Callable[[Tensor], Tensor]
 
 # Products of fewer rows are summed in an order that depends on their number.
 MIN_ROWS = 32
-# For networks that bear its rounding, where the processor multiplies it at twice the speed.
+# For networks that tolerate its rounding, on processors that multiply it twice as fast.
 FAST = torch.bfloat16 if torch.cpu._is_avx512_bf16_supported() else torch.float32
 ROWS = 512  # points at a time: 1,024 channels of them stay in cache
 CONVOLVED = 128  # points at a time in a graph convolution, each with its neighbours
 EDGE_ROWS = 256  # edge grasps at a time
-# Weights packed for oneDNN, for one version of each.
+# Weights packed for oneDNN, with the version of the weight that was packed.
 _PACKED: MutableMapping[Tensor, tuple[int, Tensor]] = WeakTensorKeyDictionary()
 
 
@@ -59,7 +59,7 @@ def gather_rows(values: Tensor, index: Tensor) -> Tensor:
 
 
 def row_linear(values: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """F.linear of values (M, ..., C)."""
+    """F.linear of values (M, ..., C); in inference, no row's result depends on other rows."""
     if torch.is_grad_enabled() or values.device.type != "cpu":
         return F.linear(values, weight, bias)
     if len(weight) == 1:  # a matrix-vector product, whose order of summation depends on its size
@@ -82,16 +82,16 @@ def packed_linear(
     """A linear layer for many chunks of rows in one forward pass, by oneDNN on x86.
 
     It maps (M, ..., C) to (M, ..., outputs); oneDNN sets up again for each number of rows M. The
-    weight (outputs, C) is any part of a matrix; `rectified`: a ReLU follows. There it multiplies,
-    and returns, numbers of the type `dtype`.
+    weight (outputs, C) may be a part of a matrix; `rectified`: a ReLU follows. oneDNN multiplies
+    and returns numbers of the type `dtype`.
     """
-    # On processors without AVX it is unmeasured.
+    # The speed of oneDNN on processors without AVX is unmeasured.
     avx = torch.backends.cpu.get_cpu_capability().startswith("AVX")
     there = avx and torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
     if len(weight) == 1 or not there or not float32_inference(weight):
         then: Layer = torch.relu_ if rectified else nn.Identity()
         return lambda values: then(row_linear(values, weight, bias))
-    # Changes of an inference tensor are not counted.
+    # Inference tensors do not count their changes.
     version = -1 if weight.is_inference() else weight._version
     if version < 0 or _PACKED.get(weight, (-1, weight))[0] != version:
         reordered = torch.ops.mkldnn._reorder_linear_weight(weight.detach().to(dtype).contiguous())
@@ -104,7 +104,7 @@ def packed_linear(
 
 
 def packed(mlp: nn.Sequential, dtype: torch.dtype = torch.float32) -> Layer:
-    """The linear layers of an MLP as by `packed_linear`, with their ReLUs."""
+    """The linear layers of an MLP, each made by `packed_linear`, with their ReLUs."""
     layers = [layer for layer in mlp if isinstance(layer, nn.Linear)]
     products = [
         packed_linear(layer.weight, layer.bias, rectified=layer is not layers[-1], dtype=dtype)
@@ -129,7 +129,7 @@ class BallChunk(NamedTuple):
 
 
 def ball_chunks(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[BallChunk]:
-    """Split values (P, ...) of a batch's points into chunks, one alone except in inference."""
+    """Split values (P, ...) of a batch's points into chunks, but into one if not in inference."""
     rows = rows if float32_inference(values) else len(values)
     chunks = []
     for number, (part, ball_of_row) in enumerate(in_chunks(rows, values, batch.ball_of_point)):
@@ -154,7 +154,7 @@ def in_chunks(rows: int, *values: Tensor) -> list[tuple[Tensor, ...]]:
 
 
 def by_chunks(layer: Layer, values: Tensor, rows: int = ROWS) -> Tensor:
-    """A layer that maps the rows of values (M, ...) one by one."""
+    """Apply a layer that maps rows independently to values (M, ...), chunk by chunk."""
     return torch.cat([layer(part) for (part,) in in_chunks(rows, values)])[: len(values)]
 
 

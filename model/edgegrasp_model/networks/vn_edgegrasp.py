@@ -18,7 +18,7 @@ from edgegrasp_model.networks import layers
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
 
-_TINY = 1e-7  # keeps the division finite where a direction vanishes; the reference's value
+_TINY = 1e-7  # keeps the division finite where a direction vanishes; as in the reference system
 VN_CONVOLVED = 32  # points at a time in a graph convolution, each with its neighbours
 VN_ROWS = 256  # points at a time in the global layers
 
@@ -100,7 +100,7 @@ class VNPointNetConv(nn.Module):
 
 
 class VNGlobalFeature(nn.Module):
-    """One feature per ball: twice a vector MLP and a maximum, joined to each point."""
+    """One feature per ball: a vector MLP and a maximum, joined to each point; then both again."""
 
     def __init__(self, inputs: int, widths_1: tuple[int, ...], widths_2: tuple[int, ...]) -> None:
         super().__init__()
@@ -138,7 +138,7 @@ class VNBallMaximum(nn.Module):
     def forward(
         self, chunks: list[layers.BallChunk], layer: Callable[[layers.BallChunk], Tensor]
     ) -> Tensor:
-        """Maps `both` (p, 3, 2 width), which a layer gives of each chunk, to (B, 3, width)."""
+        """Maps `both` (p, 3, 2 width), which a layer gives for each chunk, to (B, 3, width)."""
         shape = chunks[-1].balls[-1] + 1, 3, self.reach.in_features
         furthest, best = torch.zeros(shape), torch.full(shape[::2], -torch.inf)
         for chunk in chunks:
@@ -186,13 +186,13 @@ def _with_reach(layer: nn.Linear, reach: nn.Linear) -> Tensor:
     """Weights of the vectors that a maximum chooses from, and of the directions that decide.
 
     A choice has no gradient, so training leaves the direction map at its random initialisation,
-    like the reference.
+    as in the reference system.
     """
     return torch.cat((layer.weight, (reach.weight @ layer.weight).detach()))
 
 
 def relu(both: Tensor) -> Tensor:
-    """Removes from each vector its part against its direction, if any: (M, 3, 2C) to (M, 3, C)."""
+    """Remove each vector's component against its direction, if any: (M, 3, 2C) to (M, 3, C)."""
     if layers.float32_inference(both):
         result, alone = torch.empty(len(both), 3, both.shape[2] // 2), np.arange(len(both))[:, None]
         nowhere, offset = np.zeros((len(both), 3), np.float32), np.zeros(both.shape[2], np.float32)
@@ -205,7 +205,7 @@ def relu(both: Tensor) -> Tensor:
 
 
 def _convolved(u: Tensor, offset: Tensor, output: layers.Layer, batch: BallBatch) -> Tensor:
-    """The furthest (P, 3, C) of the messages of each point's neighbours, in a reused buffer."""
+    """The furthest (P, 3, C) of the messages from each point's neighbours; reuses one buffer."""
     (count, k), width = batch.neighbors.shape, len(offset) // 2
     points, neighbors = batch.points.numpy(), batch.neighbors.numpy()
     hidden = torch.zeros(VN_CONVOLVED * k, 3, width)
@@ -222,7 +222,7 @@ def _convolved(u: Tensor, offset: Tensor, output: layers.Layer, batch: BallBatch
 
 
 def _furthest(both: Tensor, dim: int) -> Tensor:
-    """The furthest along a dimension before the last two; the first one on ties."""
+    """The furthest vectors along a dimension before the last two; the first one on ties."""
     vectors, directions = both.chunk(2, dim=-1)
     with torch.no_grad():
         reach = (vectors * directions).sum(dim=-2, keepdim=True)  # (..., 1, C)
@@ -252,7 +252,7 @@ def _gathered_relu_rows(
 
 @_compiled
 def _furthest_rows(both: Float32, bounds: Int64, best: Float32, result: Float32) -> None:
-    """The furthest vectors of the rows between each two of `bounds`, if beyond `result`."""
+    """Write the furthest vectors between consecutive `bounds` to `result`, if beyond `best`."""
     width = result.shape[2]
     furthest = np.empty(width, np.int32)
     for i in range(len(bounds) - 1):
