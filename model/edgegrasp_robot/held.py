@@ -18,22 +18,22 @@ from edgegrasp_model.scene.support import heights_over
 from edgegrasp_results import DetectedObject, Grasp
 from edgegrasp_robot.surroundings import FOOT_HEIGHT, VOXEL_SIZE, Load, moved
 
-WAY_STEP = 0.005  # metres along the way
+WAY_STEP = 0.005  # metres between the positions that are checked
 TOUCHING = 0.01  # metres; points nearer to the held object already touch it
 CONTACT_DISTANCE = 0.003  # metres between points that touch
-STRAY_SHARE = 0.1  # share of the held points that meet others where masks end and readings stray
+STRAY_SHARE = 0.1  # share of held points that may touch others: masks and readings have errors
 MAX_SINKING = 0.001  # metres that the held object may go down toward the support
-MAX_HIDDEN_FOOT = 0.03  # metres that the foot of an object may be hidden from the camera
+MAX_HIDDEN_FOOT = 0.03  # metres of the foot of an object that may be hidden from the camera
 RELEASE_HEIGHT = 0.005  # metres over a region's bottom at which the hand lets go
 TURNS_IN_REGION = 8  # of an object about the vertical, in a region
-PLACE_SHARES = (0.0, -0.5, 0.5, -1.0, 1.0)  # of the room that a region leaves, to each side
+PLACE_SHARES = (0.0, -0.5, 0.5, -1.0, 1.0)  # of the free space in a region, to each side
 
 
 class Held(NamedTuple):
     """What a grasp holds, cloud frame."""
 
-    points: Float64  # (H, 3) those of its object and those between the fingers
-    others: Float64  # (V, 3) those that it does not touch already
+    points: Float64  # (H, 3) points of its object and points between the fingers
+    others: Float64  # (V, 3) points that it does not already touch
 
 
 def held_by(grasp: Grasp, scene: Scene, gripper: Gripper) -> Held:
@@ -56,9 +56,9 @@ def can_leave(
     held: Held,
     scene: Scene,
     way: Floats,  # (3,) metres, cloud frame
-    collision: Collision,  # obstacles beside the cloud
+    collision: Collision,  # obstacles in addition to the cloud
 ) -> bool:
-    """Whether what is held can go along a straight way without meeting anything seen."""
+    """Whether what is held can move straight along `way` without touching anything visible."""
     if not len(held.points):
         return True
     ends = np.concatenate([held.points, held.points + way])
@@ -109,14 +109,14 @@ def load_of(
 def places_for(
     place: Place,
     load: Load,
-    voxels: Float64,  # (V, 3) base frame, what is seen around it
-    obstacles: SolidBoxes,  # base frame, beside it
+    voxels: Float64,  # (V, 3) base frame, what is visible around the load
+    obstacles: SolidBoxes,  # base frame, in addition to the voxels
     scene: Scene,
     T_base_cloud: Float64,
 ) -> Iterator[Float64]:
-    """Poses T_base_box (4, 4) in which a load meets nothing, a region's middle first.
+    """Poses T_base_box (4, 4) in which a load touches nothing, a region's middle first.
 
-    Neither voxels, obstacles nor the support, into which its foot would be pressed.
+    It must not touch voxels or obstacles, and its foot must not be pressed into the support.
     """
     T_cloud_base = np.linalg.inv(T_base_cloud)
     in_box = moved(np.linalg.inv(load.T_base_box), load.points)
@@ -125,7 +125,7 @@ def places_for(
         if foot < -RELEASE_HEIGHT:
             if place.region is None or foot < -FOOT_HEIGHT:
                 continue
-            pose[2, 3] -= foot  # of a region whose bottom is a little too low
+            pose[2, 3] -= foot  # the region's bottom is slightly too low
         off, half = load.above_its_foot
         around = np.abs(moved(np.linalg.inv(pose), voxels) - (0.0, 0.0, off))
         if (around < half + VOXEL_SIZE / 2).all(axis=1).any():

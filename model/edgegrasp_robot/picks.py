@@ -1,4 +1,4 @@
-"""Which grasps an arm reaches, and its motion there: inverse kinematics, paths, trajectories."""
+"""Which grasps an arm reaches, and its motion to them: inverse kinematics, paths, trajectories."""
 
 import time
 from collections import Counter
@@ -26,21 +26,21 @@ from edgegrasp_robot.robot import GROUP, Robot
 from edgegrasp_robot.surroundings import HELD_NAME, Load, Surroundings, carrying, surrounded
 
 MAX_TRIED = 200  # most grasps that are tried with the arm, in their order
-MAX_PLACES = 6  # in a region, that the arm may be asked for with one grasp
-MIN_LEVEL = 0.9  # least cosine between the base's z and up with which a region is allowed
+MAX_PLACES = 6  # in a region, that are tried with the arm for one grasp
+MIN_LEVEL = 0.9  # least cosine between the base's z and up at which a region is allowed
 EXTRA_GRASPS = 4  # grasps tried beyond top_k, as some may get no motion
 LINE_STEP = 0.025  # metres between poses of a straight motion
-MAX_JUMP = 1.0  # most radians that a joint turns between two of them
+MAX_JUMP = 1.0  # most radians that a joint turns between two of these poses
 MAX_OFF_LINE = 0.002  # most metres between the hand and its straight line
 LIMIT_SHARE = 0.99  # share of the limits that is used, as splines overshoot a little
 STEP_SECONDS = 0.01  # seconds between the rows of a trajectory
 TRAJECTORY_CHECK_STEP = 0.005  # radians between the joints that are checked along a trajectory
-PATH_CHECK_STEP = 0.03  # along a path; finer where its trajectory touches something after all
-PATH_SECONDS = 1.0  # of a request, for searches that find no path; others take milliseconds
+PATH_CHECK_STEP = 0.03  # along a path; finer if its trajectory touches something after all
+PATH_SECONDS = 1.0  # for a request's searches that find no path; others take milliseconds
 LIMIT_SLACK = 1e-3  # radians or metres by which encoders may be beyond a limit
-IK_RESTARTS = 2  # of the inverse kinematics, from joints at random
+IK_RESTARTS = 2  # of the inverse kinematics, from random joints
 TRAVEL_COST = 0.02  # cost, as a share of a score, per radian of the joint that turns most
-FAILURES = ["out_of_reach", "arm_collision", "no_place"]  # the last that holds is counted
+FAILURES = ["out_of_reach", "arm_collision", "no_place"]  # the last that applies is counted
 NO_REACH = "no grasp is within the arm's reach; see counts."
 
 
@@ -59,7 +59,7 @@ def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
         fix = f"{robot.joint_names[row]} moves between {low:g} and {high:g}: send where it is."
         raise InvalidRequest(f"options.robot.joints.{row}", f"{joints[row]:g}", fix)
     if options.collision.mode == "ignore":
-        fix = "Send avoid or penalise: an arm needs hands without a collision."
+        fix = "Send avoid or penalise: an arm needs collision-free hands."
         raise InvalidRequest("options.collision.mode", "'ignore' beside a robot", fix)
     if options.gripper not in (None, robot.gripper.name):
         fix = f"Leave it out: the robot {robot.name!r} has a {robot.gripper.name!r}."
@@ -75,11 +75,11 @@ def plan_picks(
     robot: Robot,
     until: float = float("inf"),  # when to stop, on `time.monotonic()`
 ) -> Detection:
-    """Plan the arm's way to grasps, and put reachable grasps first.
+    """Plan the arm's motion to grasps, and put reachable grasps first.
 
     Returns the detection with `top_k` grasps: those with a trajectory, then others within reach,
-    then those there was no time for, then those out of reach; the better ones first, and at like
-    scores the nearer ones. InvalidRequest: the arm collides where the options put it.
+    then those not tried in time, then those out of reach; better ones first, and nearer ones first
+    at similar scores. InvalidRequest: the arm collides at the joints in the options.
     """
     asked = options.robot
     assert asked is not None
@@ -133,7 +133,7 @@ class _Pick:
 
 
 class _PutDown(NamedTuple):
-    """How an object is put down: joints (J,) along straight ways, and what the hand carries."""
+    """How an object is put down: joints (J,) along straight lines, and what the hand carries."""
 
     back: Sequence[Float64]  # away from the grasp
     down: Sequence[Float64]  # to the place
@@ -164,7 +164,7 @@ class _Arm:
         near = np.maximum(robot.lower, self._start - np.pi)
         far = np.minimum(robot.upper, self._start + np.pi)
         drawn = np.random.default_rng(options.seed).uniform(near, far, (IK_RESTARTS, len(near)))
-        self._drawn = list(drawn)  # joints to start from where the given ones lead nowhere
+        self._drawn = list(drawn)  # joints to start from if the given ones find no solution
         self._T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
         up = scene.frame.directions_in_cloud((0.0, 0.0, 1.0))
         self._up = self._T_base_cloud[:3, :3] @ up
@@ -174,7 +174,7 @@ class _Arm:
             raise InvalidRequest("options.robot.place.region", value, fix)
 
     def reach_some(self, grasps: Iterator[Grasp], wanted: int, until: float) -> list[_Pick]:
-        """The next picks, as many as it takes for some to be within reach, or time allows."""
+        """The next picks, until `wanted` of them are within reach or time is up."""
         picks: list[_Pick] = []
         while wanted > 0 and time.monotonic() < until and (grasp := next(grasps, None)):
             picks.append(self._reach_either_way(grasp))
@@ -182,7 +182,7 @@ class _Arm:
         return picks
 
     def _reach_either_way(self, grasp: Grasp) -> _Pick:
-        """Reach a grasp, or the same of a hand turned by 180 degrees: the nearer first."""
+        """Reach a grasp with the hand as given or turned by 180 degrees; the nearer one first."""
         if not grasp.collision_free:
             return _Pick(grasp, ArmPlan(reachable=False), "hand_collision")
         T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand
@@ -210,12 +210,12 @@ class _Arm:
 
     def _reach(
         self,
-        poses: Floats,  # (S, 4, 4) T_base_hand along a straight way
-        starts: Sequence[Float64],  # joints (J,) to find others from
-        first: core.Scene,  # in which its begin must touch nothing
-        along: core.Scene,  # in which the whole of it must
+        poses: Floats,  # (S, 4, 4) T_base_hand along a straight line
+        starts: Sequence[Float64],  # joints (J,) from which the inverse kinematics start
+        first: core.Scene,  # in which the start of the line must be collision-free
+        along: core.Scene,  # in which the whole line must be collision-free
     ) -> tuple[list[Float64], str]:
-        """Joints (J,) at the poses, each near the one before, or none; and how it ended."""
+        """Joints (J,) at the poses, each near the one before, or none; and the outcome."""
         outcome = "out_of_reach"
         for start in starts:
             line: list[Float64] = []
@@ -239,7 +239,7 @@ class _Arm:
             return pick
         timed = [first, *(self._timed(straight, way, True) for way in (pick.line, back))]
         if (put := pick.put) is not None:
-            # From the end of the retreat over the place, down, and back with an empty hand.
+            # From the end of the retreat to above the place, down, and back with an empty hand.
             T_base_hand = self._T_base_cloud @ pick.grasp.T_cloud_hand
             with carrying(self._robot, put.around, put.load, T_base_hand) as scene:
                 over = self._free_motion(scene, put.back[-1], put.down[0])
@@ -262,7 +262,7 @@ class _Arm:
         return replace(pick, plan=replace(pick.plan, trajectory=trajectory))
 
     def _with_place(self, pick: _Pick, place: Place) -> _Pick | None:
-        """Add how the object is put down, in the first place within reach; None: in none."""
+        """Add how the object is put down, in the first place within reach; None: there is none."""
         grasp, rules = pick.grasp, self._options.collision
         if grasp.object in self._without_place:
             return None
@@ -298,7 +298,7 @@ class _Arm:
         return None
 
     def _retreat(self, pick: _Pick, held: Held | None = None) -> list[Float64]:
-        """Joints along the retreat, on which the held points touch nothing; none: there is none."""
+        """Joints along the retreat if the held points touch nothing on it, else an empty list."""
         rules = self._options.collision
         T_base_hand = self._T_base_cloud @ pick.grasp.T_cloud_hand
         back = rules.retreat_length == 0.0 or rules.retreat_direction == "back"
@@ -325,11 +325,11 @@ class _Arm:
     def _free_path(
         self, scene: core.Scene, start: Float64, end: Float64, step: float
     ) -> list[Float64]:
-        """Joints between which linear joint motions are collision-free; none: there are none."""
+        """Joints between which linear joint motions are collision-free; empty: none were found."""
         names, seed = self._robot.joint_names, self._options.seed % 2**31
         options = RRTOptions(GROUP, 3000, rrt_connect=True, collision_check_step_size=step)
         begin = time.monotonic()
-        # Nodes alone are no limit: none are added where every way is blocked. Zero is without end.
+        # A limit of nodes is not enough: a blocked search adds none. A time of zero means no limit.
         options.max_planning_time = max(1e-3, min(self._path_seconds / 3, self._until - begin))
         planner = RRT(scene, options)
         planner.setRngSeed(seed)
@@ -392,7 +392,7 @@ def _kept(detection: Detection) -> int | None:
 def _rank(
     pick: _Pick, joints: Float64, options: DetectOptions, kept: int | None
 ) -> tuple[int, float]:
-    """Reachable grasps first, of them the kept one; by score and motion, or in the order asked."""
+    """Sort key: tier, then the kept grasp, then score and motion unless another order is asked."""
     if kept is not None and pick.grasp.id == kept:
         return pick.tier, -np.inf
     if pick.plan.pregrasp_joints is None or options.order != "score":

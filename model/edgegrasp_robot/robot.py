@@ -31,7 +31,7 @@ ROBOT_FOLDER = Path(__file__).parent / "robots"
 GROUP, HAND = "arm", "edgegrasp_hand"  # names in the planner's model
 DEFAULT_ACCELERATION = 2.0  # per second squared: acceleration limit if none is given
 MOVING = ("revolute", "continuous", "prismatic")
-MAX_TURN = 20 * np.pi  # radians, limit of a joint either way; larger numbers are degrees
+MAX_TURN = 20 * np.pi  # radians, limit of a joint either way; larger numbers are likely degrees
 IK = SimpleIkOptions(
     GROUP, max_iters=20, max_time=10.0, max_restarts=0, step_size=1.0,
     max_linear_error_norm=5e-4, max_angular_error_norm=1e-3, check_collisions=False,
@@ -51,16 +51,16 @@ class HandPose(Strict):
 
 
 class RobotFile(Strict):
-    """The fields of a robot file; radians, or metres of sliding joints, and seconds."""
+    """The fields of a robot file; radians (metres for sliding joints) and seconds."""
 
     urdf: str  # URDF or xacro; a path beside this file, or package://
     srdf: str = ""  # SRDF with links that may touch; empty: none
     packages: tuple[str, ...] = ()  # folders that hold packages
-    base_frame: str  # link that T_base_cloud of a request speaks of
-    flange_frame: str  # link that the gripper is on; all beyond is left out
+    base_frame: str  # link that is the base in a request's T_base_cloud
+    flange_frame: str  # link that carries the gripper; everything beyond it is left out
     gripper: str  # name of a gripper that ships, or its file
     T_flange_hand: HandPose
-    home: Joints = ()  # where the arm touches nothing of itself; empty: near zero
+    home: Joints = ()  # joints at which the arm does not touch itself; empty: near zero
     max_velocity: Joints = ()  # of each joint; empty: the URDF's
     max_acceleration: Joints = ()  # of each joint; empty: DEFAULT_ACCELERATION each
 
@@ -81,15 +81,15 @@ class Robot:
     upper: Float64  # (J,)
     max_velocity: Float64  # (J,)
     max_acceleration: Float64  # (J,)
-    kinematics: Kinematics  # the same as numbers: as `edgegrasp.v1.Robot` has it
+    kinematics: Kinematics  # the arm in numbers, as in `edgegrasp.v1.Robot`
     model: "Model"
     scene: core.Scene  # for the free motion
-    straight: core.Scene  # for straight ways, on which the hand may touch what it grasps
-    carrying: core.Scene  # for the way to where an object is put
+    straight: core.Scene  # for straight motions, in which the hand may touch what it grasps
+    carrying: core.Scene  # for the motion that carries an object to its place
     ik: SimpleIk  # in a scene without shapes, where it takes a third of the time
 
     def joints_at(self, T_base_hand: Floats, start: Float64) -> Float64 | None:
-        """Joints (J,) that bring the hand there, found from others (J,); None: not found."""
+        """Joints (J,) that bring the hand to a pose, from start joints (J,); None: not found."""
         goal = core.CartesianConfiguration(self.base_frame, HAND, np.asfortranarray(T_base_hand))
         begin = core.JointConfiguration(self.joint_names, start)
         found = core.JointConfiguration(self.joint_names, start)
@@ -120,10 +120,10 @@ class Robot:
 class Model:
     """What the planner's scenes are built from."""
 
-    arm: str  # URDF without what is beyond the flange, and with the meshes' absolute paths
+    arm: str  # URDF without what is beyond the flange, with absolute paths of meshes
     urdf: str  # the same with the gripper's boxes and the robot file's limits
     links: list[str]  # those that have a shape
-    standing: list[str]  # those of them that no joint moves: they may touch what they stand on
+    standing: list[str]  # of these, links that no joint moves: they may touch what they stand on
     allowed: list[tuple[str, str]]  # pairs of links that may touch
 
     def scene(self, arm: RobotFile | Robot) -> core.Scene:
@@ -200,7 +200,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     scene, straight, carrying = (model.scene(file) for _ in range(3))
     for name, link in zip(links, shaped, strict=True):
         shapes = link.findall("collision")
-        if len(scene.getCollisionGeometryIDs(name)) < len(shapes):  # it skips wrong ones
+        if len(scene.getCollisionGeometryIDs(name)) < len(shapes):  # invalid ones are skipped
             fix = "Correct its size or scale."
             raise InvalidRobot(f"urdf: a <collision> of {name} is wrong. {fix}")
         for shape in shapes:
@@ -251,7 +251,7 @@ def touching(
     joints: Float64,  # a configuration in collision
     around: Sequence[str] = (),  # names of the obstacles
 ) -> str:
-    """The pair that touches at joints (J,), in words; the scene cannot be used afterwards."""
+    """The names of the pair that touches at joints (J,); the scene cannot be used afterwards."""
     for row, link in enumerate(model.links):
         for other in (*around, *model.links[row + 1 :]):
             scene.setCollisions(link, other, False)
@@ -330,7 +330,7 @@ def _chain(root: Element, file: RobotFile) -> list[Element]:
 
 
 def _check_joint(joint: Element) -> None:
-    """Raise InvalidRobot for a joint of the arm that cannot be planned with."""
+    """Raise InvalidRobot for a joint of the arm that the planner cannot use."""
     kind, limit = joint.get("type"), joint.find("limit")
     said = f"joint {joint.get('name')}"
     if joint.find("mimic") is not None or kind not in (*MOVING, "fixed"):
@@ -349,7 +349,7 @@ def _check_joint(joint: Element) -> None:
 
 
 def _cut_beyond(root: Element, flange: str) -> set[str]:
-    """Keep links and joints as far as the flange, without its shape; names the links from it on."""
+    """Remove the flange's shape and all beyond the flange; returns the flange and links beyond."""
     names = [str(link.get("name")) for link in root.findall("link")]
     carriers = {name: [_link(joint, "parent") for joint in _above(root, name)] for name in names}
     beyond = {name for name in names if flange in (name, *carriers[name])}
@@ -394,13 +394,13 @@ def _add_hand(root: Element, file: RobotFile, gripper: Gripper) -> None:
 
 def _set_limits(root: Element, joints: Sequence[Element], file: RobotFile) -> None:
     """Limit the joints' velocities and accelerations as the robot file does."""
-    root.set("version", "1.2")  # of URDF, which has accelerations from then on
+    root.set("version", "1.2")  # the first URDF version that has accelerations
     limits = [limit for joint in joints for limit in joint.findall("limit")]
     for name in ("velocity", "acceleration"):
         for limit, value in zip(limits, getattr(file, f"max_{name}"), strict=False):
             limit.set(name, str(value))
         most = [float(limit.get(name, "0")) for limit in limits]
-        if min(most, default=1.0) <= 0.0:  # some exporters of URDFs write 0
+        if min(most, default=1.0) <= 0.0:  # some URDF exporters write 0
             fix = "Give what each joint can do, above 0."
             raise InvalidRequest(f"max_{name}", f"{most}", fix)
 
@@ -414,7 +414,7 @@ def _check_meshes(urdf: Path, root: Element, packages: Sequence[str]) -> None:
         for mesh in link.findall("collision/geometry/mesh"):
             field, name = f"the mesh of {link.get('name')}", str(mesh.get("filename"))
             mesh.set("filename", str(_located(urdf, field, name, packages)))
-        for visual in link.findall("visual"):  # planning does not look at it
+        for visual in link.findall("visual"):  # not needed for planning
             link.remove(visual)
 
 

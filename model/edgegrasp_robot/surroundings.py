@@ -27,8 +27,8 @@ SELF_DISTANCE = 0.02  # metres; points this near to the arm are the arm itself
 MAX_VOXELS_INSIDE = 10  # voxels of objects that may lie inside the arm, given camera errors
 SUPPORT_SIZE = (6.0, 6.0, 0.5)  # metres, of the support
 LOW_BASE = -0.05  # metres over the support; a lower base does not stand on it
-FOOT_HEIGHT = 0.015  # metres of what is held, at its foot, that may touch what it is put on
-NEAR_HELD = 0.02  # metres from what is held, within which voxels are its own
+FOOT_HEIGHT = 0.015  # metres at the foot of a load that may touch what it stands on
+NEAR_HELD = 0.02  # metres from a load within which voxels belong to it
 GREY = np.ones(4)
 HELD_NAME = "what is held"
 
@@ -36,12 +36,12 @@ Obstacle = tuple[str, core.Box | core.OcTree, Float64]  # its name, shape and po
 
 
 class Load(NamedTuple):
-    """What a hand takes along, as an upright box; base frame, where it is grasped."""
+    """What a hand carries, as an upright box where it is grasped; base frame."""
 
     points: Float64  # (H, 3)
     T_base_box: Float64  # (4, 4) its z is up
     half: Float64  # (3,)
-    below: float  # metres by which it may extend below the box, where no camera looked
+    below: float  # metres by which it may extend below the box, where no camera sees
 
     @property
     def above_its_foot(self) -> tuple[float, Float64]:
@@ -55,20 +55,20 @@ class Surroundings(NamedTuple):
 
     own: set[int]  # numbers of objects that are the arm itself, as the camera sees it
     boxes: list[Obstacle]  # the support and the request's obstacles
-    voxels: Float64  # (V, 3) centers of those of the cloud and of unseen space, base frame
+    voxels: Float64  # (V, 3) centers of voxels of the cloud and of unseen space, base frame
 
     def all(self) -> list[Obstacle]:
         """Every obstacle."""
         if not len(self.voxels):
             return self.boxes
         # Columns of coal's octrees: centre, size, probability of being occupied, and the threshold;
-        # octomap allows no certainty.
+        # octomap does not allow a probability of 1.
         cells = np.tile([0.0, 0.0, 0.0, VOXEL_SIZE, 0.97, 0.5], (len(self.voxels), 1))
         cells[:, :3] = self.voxels
         return [*self.boxes, ("the cloud", core.OcTree(list(cells), VOXEL_SIZE), np.eye(4))]
 
     def without(self, load: Load) -> "Surroundings":
-        """The same once a load is taken away."""
+        """The surroundings without a load that is taken away."""
         inside = np.abs(moved(np.linalg.inv(load.T_base_box), self.voxels)) < load.half
         near = cKDTree(load.points).query(self.voxels, distance_upper_bound=NEAR_HELD)[0]
         own = inside.all(axis=1) | (near <= NEAR_HELD)
@@ -79,9 +79,9 @@ class Surroundings(NamedTuple):
 def carrying(
     robot: Robot, around: Surroundings, load: Load, T_base_hand: Floats
 ) -> Iterator[core.Scene]:
-    """A scene in which the hand holds a load, by its pose at the grasp; its foot may touch."""
+    """A scene in which the hand holds a load as at the grasp, without its foot, which may touch."""
     scene, (off, half) = robot.carrying, load.above_its_foot
-    # The planner takes the pose in the frame of the joint that the flange hangs on.
+    # The planner expects the pose in the frame of the joint that carries the flange.
     T_base_joint = scene.forwardKinematics(robot.home, robot.joint_names[-1], robot.base_frame)
     T_joint_hand = np.linalg.inv(T_base_joint) @ robot.hand_pose(robot.home)
     T_joint_box = T_joint_hand @ np.linalg.inv(T_base_hand) @ load.T_base_box
@@ -102,7 +102,7 @@ def surrounded(
     robot: Robot,
     scene: Scene,  # what the camera's cloud shows
     asked: RobotArm,  # where the robot is
-    boxes: Sequence[Box | OrientedBox],  # beside the cloud, cloud frame
+    boxes: Sequence[Box | OrientedBox],  # obstacles in addition to the cloud, cloud frame
 ) -> Iterator[Surroundings]:
     """Add the surroundings to the robot's scenes, and remove them afterwards; yields them.
 
@@ -145,7 +145,7 @@ def surrounded(
 def _standing_in(
     scenes: Sequence[core.Scene], robot: Robot, obstacles: Sequence[Obstacle]
 ) -> Iterator[None]:
-    """Add obstacles to scenes for a while; they may touch each other and links that never move."""
+    """Add obstacles to scenes temporarily; they may touch each other and links that never move."""
     T_root_base = robot.scene.forwardKinematics(robot.home, robot.base_frame)
     names = [name for name, _, _ in obstacles]
     still = combinations([*robot.model.standing, *names], 2)
@@ -165,9 +165,9 @@ def _standing_in(
 
 
 def _slab(support: SupportPlane, points: Floats, T_base_cloud: Float64) -> tuple[core.Box, Float64]:
-    """The support, a plane of the base frame, and its pose T_base_slab (4, 4).
+    """The support, a plane in the base frame, as a slab and its pose T_base_slab (4, 4).
 
-    A slab below the whole plane; of a support above the base, what points (N, 3) show of it.
+    The slab lies below the plane. If the plane is above the base, it covers only the points (N, 3).
     """
     upright = Rotation.align_vectors([support.normal], [[0.0, 0.0, 1.0]])[0].as_matrix()
     size, middle = np.array(SUPPORT_SIZE), np.zeros(3)
@@ -200,7 +200,7 @@ def _own_objects(robot: Robot, joints: Float64, scene: Scene, T_base_cloud: Floa
 
 
 def _near_robot(robot: Robot, joints: Float64, points: Float64, distance: float) -> Bools:
-    """Whether points (N, 3) of the base frame lie within a distance of the robot, (N,)."""
+    """Which points (N, 3) of the base frame lie within a distance of the robot, (N,)."""
     T_root_base = robot.scene.forwardKinematics(joints, robot.base_frame)
     options = core.RobotBodyFilterOptions(distance, num_threads=1)
     placed = np.ascontiguousarray(moved(T_root_base, points))
@@ -210,13 +210,13 @@ def _near_robot(robot: Robot, joints: Float64, points: Float64, distance: float)
 def _voxels(support: SupportPlane | None, points: Floats, T_base_cloud: Float64) -> Float64:
     """Centers (V, 3) of the voxels of points (N, 3), base frame, without the support's.
 
-    Their grid is the base's: it must not depend on which part of a cloud was selected.
+    Their grid is fixed to the base, so it does not depend on which part of a cloud was selected.
     """
     if support is not None:  # in single precision, since most of an image is support
         plane = np.append(support.normal, -support.offset)
         plane = (plane @ T_base_cloud).astype(points.dtype)
         height = points @ plane[:3] + plane[3]
-        if -support.offset < LOW_BASE:  # what is below is in its way too
+        if -support.offset < LOW_BASE:  # what lies below is in the arm's way too
             height = np.abs(height)
         points = points[height > VOXEL_SIZE / 2]
     cells = points @ (T_base_cloud[:3, :3].T / VOXEL_SIZE).astype(points.dtype)
@@ -226,7 +226,7 @@ def _voxels(support: SupportPlane | None, points: Floats, T_base_cloud: Float64)
 
 
 def _hidden(support: SupportPlane | None, voxels: Float64, viewpoints: Float64) -> Float64:
-    """Centers (U, 3) of voxels that others hide from every camera (W, 3), above the support."""
+    """Centers (U, 3) of voxels that `voxels` hide from every camera (W, 3), above the support."""
     steps = np.arange(VOXEL_SIZE, 2 * MAX_RANGE, VOXEL_SIZE)[:, None, None]
     hidden = []
     for eye in viewpoints:
@@ -239,9 +239,9 @@ def _hidden(support: SupportPlane | None, voxels: Float64, viewpoints: Float64) 
 
 
 def _centers(*groups: Floats, shifts: Sequence[float] = (0.0,)) -> Float64:
-    """Centers (V, 3) of the voxels in which each group of places (N, 3), in cells, has one.
+    """Centers (V, 3) of the voxels that contain places (N, 3), in cells, of every group.
 
-    Each place is one at every combination of the ascending shifts along the axes.
+    Each place counts at every combination of the ascending shifts along the axes.
     """
     columns = [np.ascontiguousarray(places.T) for places in groups]
     if not all(column.size for column in columns):
