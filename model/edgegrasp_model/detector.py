@@ -46,14 +46,14 @@ NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
 # In each round, an object with a grasp rated this high gets no further approach points.
 ENOUGH_SCORES = (1.0, ranking.SURE_SCORE, ranking.GOOD_SCORE, ranking.GOOD_SCORE)
 MAX_BALLS_AT_ONCE = 64
-MIN_TRAINING_HANDS = 20  # grippers in the last training run from which weights suit any gripper
+MIN_TRAINING_HANDS = 20  # weights last trained with at least this many grippers suit any gripper
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 PREFERRED_MODELS = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A request with its scene; each stage adds counts, warnings and seconds."""
+    """A request and its scene; each stage adds counts, warnings and seconds."""
 
     options: DetectOptions
     gripper: Gripper
@@ -74,7 +74,7 @@ class Prepared:
 
 
 class GraspDetector:
-    """Detects grasps with one network; holds no state between requests."""
+    """Detects grasps with one network; keeps no state between requests."""
 
     def __init__(
         self,
@@ -103,7 +103,7 @@ class GraspDetector:
         return cls(*load_checkpoint(path), device, grippers)
 
     def detect(self, cloud: object, options: DetectOptions | None = None) -> Detection:
-        """Detect grasps in a cloud; an empty list is an answer whose counts and warnings say why.
+        """Detect grasps in a cloud; if there are none, counts and warnings of the answer say why.
 
         The cloud, metres, is (N, 3), or (H, W, 3) with NaN holes, or a CloudInput; options and
         result are in its frame. InvalidRequest names a field, its value and the fix.
@@ -115,7 +115,7 @@ class GraspDetector:
         self,
         cloud: object,
         options: DetectOptions,
-        max_voxels: int = MAX_VOXELS,  # most that the cloud may have
+        max_voxels: int = MAX_VOXELS,  # most voxels that the cloud may have
         *,
         thin: bool = True,  # leave out rows and columns of large images
     ) -> Prepared:
@@ -162,8 +162,8 @@ class GraspDetector:
     def evaluate(self, prepared: Prepared) -> Sample | None:
         """Second stage: sample candidates and score them; None if there is no scene.
 
-        In rounds: around half of the approach points; around the other half, on objects without a
-        sure grasp; and twice around further ones on objects without a good grasp, as a last resort.
+        Round 1 uses half of the approach points, round 2 the other half on objects without a sure
+        grasp; rounds 3 and 4, a last resort, use more points on objects without a good grasp.
         """
         scene, scored = prepared.scene, None
         if scene is None or not scene.approach_allowed.any() or prepared.options.follows_only:
@@ -248,7 +248,7 @@ class GraspDetector:
         *,
         edges: object | None = None,  # (M, 2) rows of the cloud as sent: approach and contact point
         hand_poses: object | None = None,  # (M, 4, 4) T_cloud_hand; one of the two is given
-        max_voxels: int = MAX_VOXELS,  # most that the cloud may have
+        max_voxels: int = MAX_VOXELS,  # most voxels that the cloud may have
     ) -> Scoring:
         """Score the caller's edges or hand poses, in order (the paper's grasp evaluation function).
 
@@ -309,10 +309,10 @@ class GraspDetector:
         return evaluations
 
     def _scores(self, scene: Scene, contact: Int64, held: Floats) -> tuple[Floats, Floats]:
-        """Ratings and scores (E,), by the probability (E,) that each hand holds what is there.
+        """Ratings and scores (E,), from the probability (E,) that each hand holds what is there.
 
-        Ratings count whether the object of the contact, rows (E,) of the cloud, is real; scores are
-        ratings as outcomes of a robot rescaled them (Platt scaling), if there are any.
+        A rating also counts whether the object at the contact, row (E,) of the cloud, is real. A
+        score is the rating rescaled by outcomes of a robot (Platt scaling), if there are any.
         """
         number = scene.object_of_point[contact].tolist()
         rating = held * np.array([scene.confidence.get(which, 1.0) for which in number])
@@ -322,7 +322,7 @@ class GraspDetector:
         return rating, expit(scale * logit(rating) + shift)
 
     def _logits(self, prepared: Prepared, scene: Scene, candidates: Candidates) -> Float32:
-        """The network's logits (E,) of candidates: of all hands at once, or of some balls."""
+        """The network's logits (E,) of candidates: all hands at once, or a few balls at a time."""
         logits, network = np.empty(len(candidates), np.float32), self.metadata.network
         _, ball = np.unique(candidates.approach_index, return_inverse=True)
         part = np.zeros_like(ball) if self.sees_hands else ball // MAX_BALLS_AT_ONCE
@@ -420,7 +420,7 @@ class ModelCatalogue:
         for detector in self._detectors.values():
             check_reference_logits(detector.network, detector.metadata)
         cloud = np.concatenate([box, table])
-        self.get().detect(cloud, options)  # what others share with it is then warm too
+        self.get().detect(cloud, options)  # also warms what the others share with it
         self.pace = self._measure_pace(rng)
 
     def _measure_pace(self, rng: np.random.Generator) -> Pace:

@@ -1,4 +1,4 @@
-"""Errors that the model and the pipeline raise, all EdgeGraspErrors; and their words."""
+"""Errors that the model and the pipeline raise, all EdgeGraspErrors, and their messages."""
 
 import reprlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,7 +13,7 @@ Schema = TypeVar("Schema", bound=BaseModel)
 
 
 def parse(schema: type[Schema], fields: object, name: str) -> Schema:
-    """Check plain values against a schema; raises InvalidRequest for a field, under `name`."""
+    """Validate plain values with a schema; raises InvalidRequest, which names a field of `name`."""
     try:
         return schema.model_validate(fields)
     except ValidationError as error:
@@ -41,7 +41,7 @@ def parse(schema: type[Schema], fields: object, name: str) -> Schema:
 
 
 def _path(location: Sequence[str | int], fields: object, named: bool) -> list[str]:
-    """A location without names of unions' members; `named`: the last part is a field's name."""
+    """A location without the names of union members; `named`: the last part is a field's name."""
     path: list[str] = []
     here: Any = fields
     for place, part in enumerate(location):
@@ -68,7 +68,7 @@ _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 90  # characters
 
 
 class StartCollision(InvalidRequest):
-    """In the request's joints the arm touches itself or the scene."""
+    """The arm touches itself or the scene at the request's joints."""
 
 
 class UnknownModel(InvalidRequest):

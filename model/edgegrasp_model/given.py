@@ -14,15 +14,15 @@ from edgegrasp_model.results import NoGrasp
 from edgegrasp_model.scene.cloud import wrong_array
 from edgegrasp_model.scene.scene import Scene
 
-TOUCH_DEPTH = 0.004  # metres behind the outermost point; others there are touched first too
+TOUCH_DEPTH = 0.004  # metres behind the outermost point; points in between are touched first too
 
 
 @dataclass(frozen=True)
 class Given:
     """M edges or hand poses, of which E define an edge grasp."""
 
-    candidates: Candidates  # E of them; `pair` ascends and says which of the M each is
-    reason: list[NoGrasp | None]  # M: why it defines no edge grasp
+    candidates: Candidates  # E candidates; `pair`, ascending, is the row of each among the M
+    reason: list[NoGrasp | None]  # M: why each defines no edge grasp; None: it defines one
     T_cloud_hand: Float32 | None = None  # (E, 4, 4) as given, canonical frame
 
 
@@ -44,13 +44,13 @@ def check_hand_poses(poses: object) -> Float32:
     rigid = are_rigid(checked)
     if not rigid.all():
         fix = "Send 4 x 4 matrices of a rotation and a translation in metres, last row 0 0 0 1."
-        value = f"pose {int(np.argmin(rigid))}, which is no rigid transform"
+        value = f"pose {int(np.argmin(rigid))}, which is not a rigid transform"
         raise InvalidRequest("hand_poses", value, fix)
     return checked.astype(np.float32)
 
 
 def _checked(field: str, array: object, kinds: str, shape: tuple[int, ...], fix: str) -> Array:
-    """An array of 1 to MAX_CANDIDATES rows of a shape, and of one of the kinds of dtype."""
+    """Check for 1 to MAX_CANDIDATES rows of the given shape, with a dtype of the given kinds."""
     if (
         not isinstance(array, np.ndarray)
         or array.dtype.kind not in kinds
@@ -69,7 +69,7 @@ def from_edges(
     crop_radius: float,  # metres from the approach point to the contact, at most
     margin: float,  # metres above the support plane to which hands are retracted
 ) -> Given:
-    """Candidates of given edges, between the voxels that their rows belong to."""
+    """Candidates for given edges, between the voxels that contain their rows."""
     point = scene.point_of_row[edges]
     reason: list[NoGrasp | None] = [NoGrasp.NO_POINT] * len(edges)
     there = np.flatnonzero((point >= 0).all(axis=1))
@@ -88,17 +88,17 @@ def from_hand_poses(
     """The edge grasps nearest to hand poses (M, 4, 4), canonical frame; the poses stay as given.
 
     The contact point is the first that a closing finger touches, on the side whose normal is closer
-    to the closing direction: of the points within TOUCH_DEPTH of the outermost one between the
-    fingers, the one nearest to where the gripper puts its contacts. The approach point is the point
-    within `crop_radius` metres of it that is nearest to the hand's approach axis.
+    to the closing direction. It is chosen from the points within TOUCH_DEPTH of the outermost one
+    between the fingers, as the one nearest to where the gripper puts contact points. The approach
+    point is the point within `crop_radius` metres of it that is nearest to the approach axis.
     """
     view = hand_views(scene.cloud, T_cloud_hand, gripper)
     between = np.flatnonzero(gripper.between_fingers(view.position))
     hand, (x, y, z) = view.candidate[between], view.position[:, between]
     off_contact = x**2 + (z - gripper.contact_z_at(2 * np.abs(y))) ** 2
-    facing = np.full((2, len(T_cloud_hand)), -np.inf)  # (+y, -y): cosine of normal and finger
+    facing = np.full((2, len(T_cloud_hand)), -np.inf)  # (+y, -y): cosine of normal and y axis
     touched = np.zeros((2, len(T_cloud_hand)), dtype=np.int64)  # rows of `view`
-    half = np.zeros(len(T_cloud_hand), dtype=np.float32)  # metres to the outermost point between
+    half = np.zeros(len(T_cloud_hand), dtype=np.float32)  # metres from axis to outermost point
     for side, outward in enumerate((y, -y)):
         outermost = np.full(len(T_cloud_hand), -np.inf, dtype=np.float32)
         np.maximum.at(outermost, hand, outward)
@@ -111,7 +111,7 @@ def from_hand_poses(
         facing[side, hands] = np.einsum("ed,ed->e", normal, closing)
     side = facing.argmax(axis=0)
     contact = touched[side, np.arange(len(T_cloud_hand))]  # rows of `view`
-    approach = np.full(len(contact), -1, dtype=np.int64)  # rows of the cloud; -1: there is none
+    approach = np.full(len(contact), -1, dtype=np.int64)  # rows of the cloud; -1: none
     apart = np.linalg.norm(view.position - view.position[:, contact[view.candidate]], axis=0)
     near = np.flatnonzero((apart > MIN_EDGE_LENGTH) & (apart < 0.99 * crop_radius))
     hands, best = _least(view.candidate[near], (view.position[:2, near] ** 2).sum(axis=0))

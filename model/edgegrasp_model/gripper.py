@@ -1,4 +1,4 @@
-"""A parallel-jaw gripper: a small data file, or the same fields in a request."""
+"""A parallel-jaw gripper, from a small data file or from the same fields in a request."""
 
 import dataclasses
 import tomllib
@@ -16,8 +16,8 @@ from edgegrasp_model.errors import InvalidGripper, InvalidRequest
 from edgegrasp_model.options import DetectOptions, GripperGeometry, HandPart, Linkage
 
 GRIPPER_FOLDER = Path(__file__).parent / "grippers"
-APPROACH_LENGTH = 0.05  # metres of straight approach that must be free, or is described
-FINGER_LENGTH = 0.0465  # metres of finger length from the tips: as long as the Panda's
+APPROACH_LENGTH = 0.05  # metres of straight approach that is checked, and described to the network
+FINGER_LENGTH = 0.0465  # metres, of the Panda's fingers; the network sees longer ones as this long
 
 # Factors for the columns of a hand's pose that turn the hand by 180 degrees about its z.
 HALF_TURN = np.array([-1.0, -1.0, 1.0, 1.0], dtype=np.float32)
@@ -40,7 +40,7 @@ class Gripper:
 
     @cached_property
     def seen_palm_z(self) -> float:
-        """The palm's z, but at most FINGER_LENGTH behind the tips, as if the fingers were short."""
+        """The palm's z that the network sees: at most FINGER_LENGTH behind the tips."""
         return max(self.palm_z, self.tip_z - FINGER_LENGTH)
 
     @cached_property
@@ -75,7 +75,7 @@ class Gripper:
         return np.asarray(across & (z > self.palm_z) & (z < self.max_tip_z))
 
     def tip_advance(self, opening: ArrayLike) -> Floats:
-        """Metres along z that the fingertips have moved since it was open, by opening (...)."""
+        """Metres along z that the fingertips move between the open gripper and an opening (...)."""
         opening = np.asarray(opening)
         if self.swing is None:
             return np.zeros_like(opening, dtype=np.float64)
@@ -84,13 +84,13 @@ class Gripper:
         return np.asarray(np.sqrt(radius**2 - outward**2) - np.sqrt(radius**2 - reach**2))
 
     def furthest_advance(self, opening: ArrayLike) -> Floats:
-        """The greatest `tip_advance` until it has closed to an opening (...)."""
+        """The greatest `tip_advance` while the gripper closes to an opening (...)."""
         reach = 0.0 if self.swing is None else self.swing.reach
         upright = self.max_opening - 2 * reach  # the links point straight ahead there
         return self.tip_advance(np.maximum(opening, upright))
 
     def contact_z_at(self, opening: ArrayLike) -> Float32:
-        """Metres along z of a contact, inside the fingertips, by opening (...), metres."""
+        """Position of a contact along z, behind the fingertips, at an opening (...); metres."""
         return (self.contact_z + self.tip_advance(opening)).astype(np.float32)
 
     def boxes(self, opening: float) -> Float64:
@@ -106,7 +106,7 @@ class Gripper:
 
     @cached_property
     def open_boxes(self) -> Float64:
-        """`boxes` (B, 2, 3) of the open gripper, to be copied before a change."""
+        """`boxes` (B, 2, 3) of the open gripper; copy them before changing them."""
         return self.boxes(self.max_opening)
 
     def opened_to(self, opening: float) -> "Gripper":
@@ -170,7 +170,7 @@ def gripper_names() -> list[str]:
 
 
 def choose_gripper(options: DetectOptions, default: Gripper, own: Mapping[str, Gripper]) -> Gripper:
-    """The gripper of a request, `own` ones first, at its opening; raises InvalidRequest."""
+    """The gripper that a request names, `own` ones first, at its opening; raises InvalidRequest."""
     asked = options.gripper
     if asked is None:
         gripper = default

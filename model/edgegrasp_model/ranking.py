@@ -28,22 +28,22 @@ SURE_SCORE = 0.9  # score from which the order `highest` goes by height (the pap
 FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
 MAX_HIDDEN_DEPTH = 0.004  # metres of unseen space into which an object may extend
 FLAT_HEIGHT = 0.012  # metres of visible height below which the support may block grasps
-MAX_DRAWBACK, FAR = 0.02, 0.1  # most that each drawback takes off a rating; metres off the middle
-# Best hands that are compared; weight of the logarithm of how many good ones are around each; loss
-# of rating by which a good one counts 1/e as much.
+MAX_DRAWBACK, FAR = 0.02, 0.1  # largest deduction per drawback; metres off centre for all of it
+# How many of the best hands are compared; weight of the logarithm of the number of good hands
+# around each; rating difference at which a hand counts 1/e as much.
 COMPARED_HANDS, DENSITY_WEIGHT, RATING_SCALE = 100, 0.1, 0.02
-OUTSIDE_LOSS = 0.3  # of the rating of a hand that reaches out of the image
-# Hands that are judged together: metres and radians apart; weight of a hand's own logit; factor
+OUTSIDE_LOSS = 0.3  # subtracted from the rating of a hand that reaches out of the image
+# Hands whose logits are averaged: metres and radians apart; weight of a hand's own logit; factor
 # that calibrates the average.
 SIMILAR_DISTANCE, SIMILAR_ANGLE, OWN_WEIGHT, SHARPENING = 0.03, math.radians(30), 0.3, 1.3
 OUTCOMES = list(Outcome)
 
 
 def average_similar_hands(sample: Sample, scene: Scene, gripper: Gripper) -> Float32:
-    """The logits (E,) of a sample, averaged over hands that are alike.
+    """The logits (E,) of a sample, averaged over similar hands.
 
-    The best of many logits is too high by chance, and a robot's pose is never exact: where hands
-    like it slip, a hand slips too.
+    The best of many logits is too high by chance, and a robot's pose is never exact: a hand slips
+    where similar hands slip.
     """
     candidates, logits = sample.candidates, sample.logits
     number = scene.object_of_point[candidates.contact_index]
@@ -58,15 +58,15 @@ def select(
     scene: Scene,
     sample: Sample,  # E scored candidates
     score: Floats,  # (E,) probabilities
-    rating: Floats,  # (E,) the same before rescaling by a robot's outcomes; the order
+    rating: Floats,  # (E,) scores before rescaling by a robot's outcomes; they decide the order
     gripper: Gripper,
     options: DetectOptions,
     counts: dict[str, int],  # gets the number of candidates left after each step
 ) -> tuple[Int64, NDArray[np.int8]]:
     """Order the scored candidates, drop low scores and near duplicates, keep the first top_k.
 
-    A good grasp of each object comes before the second of any. Returns the rows to return,
-    best first, and codes (E,) of the outcomes.
+    One good grasp of each object comes before a second one of any object. Returns the rows that
+    are kept, best first, and codes (E,) of the outcomes.
     """
     candidates = sample.candidates
     hands, contact = candidates.T_cloud_hand, candidates.contact_index
@@ -88,7 +88,7 @@ def select(
     if (rule := options.suppression) is not None:
         near = rule.translation, rule.rotation
         order, dropped = non_max_suppression(T_cloud_tcp, order, *near)
-        if options.order == "score":  # of an object whose first one was near another object's
+        if options.order == "score":  # an object's first one may be suppressed by now
             order = objects_first(order, order, rating, scene.object_of_point[contact])
     order = order[: options.top_k]
     outcome[dropped] = OUTCOME_CODE[Outcome.SUPPRESSED]
@@ -98,14 +98,14 @@ def select(
 
 
 def densest_first(order: Int64, worth: Floats, T_cloud_tcp: Floats) -> Int64:
-    """The rows `order`, the best reordered by how many good hands surround each; worth (E,).
+    """The rows `order`, the best ones sorted by how many good hands surround each; worth (E,).
 
-    New noise makes another hand the best one, but good ones still surround the same hands.
+    Noise changes which hand is the best one, but hardly which hands good ones surround.
     """
     best = order[:COMPARED_HANDS]
     place, turn = T_cloud_tcp[best, :3, 3], T_cloud_tcp[best, :3, :3].reshape(-1, 9)
     trace, approach = turn @ turn.T, turn[:, 2::3] @ turn[:, 2::3].T
-    trace = np.maximum(trace, 2 * approach - trace)  # a hand turned by half is the same
+    trace = np.maximum(trace, 2 * approach - trace)  # half a turn about z changes nothing
     angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
     away = np.square(cdist(place, place) / SIMILAR_DISTANCE) + np.square(angle / SIMILAR_ANGLE)
     good = np.exp((worth[best] - worth[best].max(initial=0.0)) / RATING_SCALE)
@@ -118,9 +118,9 @@ def _drawbacks(
 ) -> Floats:
     """What to subtract from ratings (E,), so that noise does not decide between equal hands.
 
-    A hand should be vertical, near the middle of its object as seen from above, and close level and
-    across the line of sight, where both sides are seen; its object should be large. Above all it
-    should stay in the image.
+    A hand should be vertical and near the middle of its object as seen from above. It should close
+    horizontally and across the line of sight, where both sides are seen; its object should be
+    large. Above all, the hand should stay in the image.
     """
     T_cloud_tcp = T_cloud_hand @ gripper.T_hand_tcp
     _, row, size = np.unique(scene.object_of_point, return_inverse=True, return_counts=True)
@@ -137,7 +137,7 @@ def _drawbacks(
 
 
 def objects_first(order: Int64, liked: Int64, score: Floats, number: Int64) -> Int64:
-    """The rows `order`, the first good one of each object (E,) in `liked` brought to the front."""
+    """The rows `order`, with each object's first good row in `liked` moved to the front."""
     good = liked[score[liked] >= GOOD_SCORE]
     first = good[np.sort(np.unique(number[good], return_index=True)[1])]
     return np.concatenate([first, order[~np.isin(order, first)]])
@@ -155,7 +155,7 @@ def ranked(
     options: DetectOptions,
     clearance: Floats | None,  # (E,) for `clearance`
 ) -> tuple[Int64, Floats]:
-    """Rows in the order asked for, best first, and the worth (E,) of scores, which breaks ties."""
+    """Rows in the requested order, best first, and the worth (E,), which breaks ties."""
     collision_free = collision_free | (options.collision.mode == "ignore")
     if options.order == "score":
         score = score - _drawbacks(scene, contact_index, hands, gripper)
@@ -200,10 +200,10 @@ def grasps_in_cloud(
 
 
 def _touched_first(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> tuple[Float32, Bools]:
-    """Where the fingers of hands (E, 4, 4) touch first, and whether the object may go on unseen.
+    """Where the fingers of hands (E, 4, 4) touch first, and whether unseen space lies beyond.
 
-    Greatest and least y (E, 2) of the points between the open fingers, hand frame, 0 without any;
-    and which hands (E,) have unseen space beyond a finger.
+    Returns the greatest and least y (E, 2) of the points between the open fingers, hand frame, 0
+    if there are none; and which hands (E,) have unseen space beyond a contact.
     """
     view = hand_views(scene.cloud, T_cloud_hand, gripper)
     between = gripper.between_fingers(view.position)
@@ -282,7 +282,7 @@ def _upright_box(scene: Scene, held: Bools) -> tuple[Float32, Float32]:
     edges = edges[np.linalg.norm(edges, axis=1) > 0] if len(corners) > 1 else edges[:0]
     edges = np.concatenate([edges, [[1.0, 0.0]]])
     edges /= np.linalg.norm(edges, axis=1, keepdims=True)
-    # The smallest rectangle around them has a side along an edge of their hull.
+    # The smallest rectangle around points has a side along an edge of their convex hull.
     axes = np.stack([edges, np.stack([-edges[:, 1], edges[:, 0]], axis=1)], axis=1)  # (K, 2, 2)
     turned = np.einsum("kad,cd->kca", axes, corners)
     size = np.ptp(turned, axis=1)
@@ -300,7 +300,7 @@ def debug_info(
     scene: Scene,
     sample: Sample | None,  # all candidates and which of them (E) were scored; None: none
     score: Floats,  # (E,) probabilities
-    outcome: NDArray[np.int8],  # (E,) codes of what became of them
+    outcome: NDArray[np.int8],  # (E,) codes of their outcomes
     labels: Int64,  # (R,) of the rows of the cloud as sent
 ) -> DebugInfo:
     """The processed cloud and every candidate of a request."""

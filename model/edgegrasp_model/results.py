@@ -1,4 +1,4 @@
-"""Words of an answer, labels of its rows, and the least time of a detection."""
+"""Outcomes and labels in an answer, and the minimum processor time of a detection."""
 
 from enum import StrEnum
 from typing import NamedTuple
@@ -10,11 +10,11 @@ class Outcome(StrEnum):
     """The outcome of a candidate."""
 
     RETURNED = "returned"
-    DIRECTION = "direction"  # the hand would move in a way that is not allowed
+    DIRECTION = "direction"  # the hand would move in a direction that is not allowed
     SUPPORT = "support"  # it would go below the support plane
     NOT_CHECKED = "not-checked"  # dropped at random before the collision check
-    COLLISION = "collision"  # the hand would meet the cloud, the support or an obstacle
-    NOT_SCORED = "not-scored"  # beyond num_candidates: near another one, or dropped at random
+    COLLISION = "collision"  # the hand would hit the cloud, the support or an obstacle
+    NOT_SCORED = "not-scored"  # near another candidate, or dropped at random to keep num_candidates
     LOW_SCORE = "low-score"  # below min_score
     SUPPRESSED = "suppressed"  # near a better one
     BEYOND_TOP_K = "beyond-top-k"
@@ -23,7 +23,7 @@ class Outcome(StrEnum):
 class NoGrasp(StrEnum):
     """Why a given edge or hand pose defines no edge grasp."""
 
-    NO_POINT = "no-point"  # a point of it was removed: workspace, support plane or outlier
+    NO_POINT = "no-point"  # one of its points was removed: workspace, support plane or outlier
     TOO_SHORT = "too-short"  # approach and contact point coincide
     TOO_LONG = "too-long"  # the contact lies beyond half the opening
     NO_DIRECTION = "no-direction"  # the edge runs along the normal
@@ -36,7 +36,7 @@ class Ungraspable(StrEnum):
 
     TOO_WIDE = "too-wide"  # its visible part is wider than the hand opens, on all sides
     TOO_FLAT = "too-flat"  # most hands would cut into the support, or come from below
-    BLOCKED = "blocked"  # every hand would hit something or the support, or could in unseen space
+    BLOCKED = "blocked"  # every hand would hit something, or might hit something in unseen space
     HIDDEN = "hidden"  # no camera saw where it ends beyond the fingers
 
 
@@ -50,7 +50,7 @@ class Following(StrEnum):
 
 
 class Pace(NamedTuple):
-    """Least processor time of a detection, seconds; 0 where it is not measured."""
+    """Minimum processor time of a detection, seconds; 0 if it is not measured."""
 
     point: float = 0.0  # for each point of the cloud
     voxel: float = 0.0  # for each voxel in which grasps are searched

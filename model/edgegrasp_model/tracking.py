@@ -34,21 +34,21 @@ from edgegrasp_model.scene.scene import Scene, numbers_chosen
 from edgegrasp_model.scene.segment import BACKGROUND, UNDECIDED
 from edgegrasp_results import Evaluation, Grasp, Tracking
 
-SWITCH_MARGIN = 0.1  # of the score, by which another grasp must be better
+SWITCH_MARGIN = 0.1  # score difference by which another grasp must be better to replace it
 MIN_FOLLOWED_SCORE = 0.25  # score from which a followed grasp may stay the first
 ALLOWED_OVERLAP = 0.006  # metres by which the hand of a followed grasp may overlap the cloud
 SEARCH_MARGIN = 0.03  # metres around followed objects in which they are searched
-HIDING_SHARE = 0.3  # of the distance from the camera, at which something hides what is behind it
+HIDING_SHARE = 0.3  # of a place's distance from the camera; anything nearer hides the place
 MAX_FRAME_DISTANCE = 0.5  # metres from the cloud beyond which `previous` must be in another frame
 OUT_OF_VIEW_ANGLE, MAX_VIEW_DISTANCE = 0.1, 2.0  # radians beside the view; metres from the camera
 # Registration: in each step, points farther from the cloud than this are left out, metres.
 REGISTRATION_DISTANCES = (*(0.03,) * 4, *(0.015,) * 4, *(0.008,) * 4)
-SURFACE_SPACING = 0.004  # metres along a surface to its nearest point, where it continues
+SURFACE_SPACING = 0.004  # metres along a surface to its nearest point, unless it ends there
 TANGENT_WEIGHT = 0.3  # weight of distances beyond that, relative to 1 across the surface
 # Prior for no motion, in points: where the shape leaves motion undetermined, the object stays.
 STILL_PRIOR = (0.5,) * 3 + (0.3,) * 3
-LEAST_INFORMATION = 0.05  # of what a point says about a turn; less, as on a can, is noise
-MIN_REGISTERED_POINTS = 6  # points that say how an object moved
+LEAST_INFORMATION = 0.05  # per point, on a rotation; less, as about a can's axis, is noise
+MIN_REGISTERED_POINTS = 6  # points that registration needs
 FOUND_SHARE, WELL_SEEN_SHARE = 0.5, 0.75  # share of its points on the cloud: found; well seen
 # Points this near to an object's surface belong to it: metres, or spacings of the surface's points.
 OBJECT_REACH, REACH_SPACINGS = 0.012, 1.5
@@ -59,8 +59,8 @@ class Followed:
     """The objects of `previous` that were found again, by their numbers."""
 
     # (4, 4) T_now_before of each, cloud frame, and its number now: the same, or its segment.
-    moved: dict[int | None, tuple[Float64, int | None]]  # None: what is on no object stays
-    surface: dict[int, Float32]  # (K, 3) points, by numbers in the answer; taken anew if few fit
+    moved: dict[int | None, tuple[Float64, int | None]]  # None: grasps on no object stay
+    surface: dict[int, Float32]  # (K, 3) points, by numbers in the answer; new ones if few fit
     named: dict[int, int]  # numbers in the scene: numbers in the answer
     next_id: int
 
@@ -84,7 +84,7 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
         return options
     some = subsample(points, 2000)
     apart = np.asarray(cKDTree(some).query(np.array(places))[0])
-    if options.viewpoint is not None:  # what is out of view or hidden may be near the camera
+    if options.viewpoint is not None:  # unseen places need no points near them
         eye = np.reshape(options.viewpoint, (-1, 3)).mean(axis=0)
         aside, row = cKDTree(unit(some - eye)).query(unit(places - eye))
         distance = np.linalg.norm(places - eye, axis=1)
@@ -110,8 +110,8 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
 def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple[Scene, Followed]:
     """Find the objects of an earlier answer again.
 
-    `given`: the caller gave their numbers; `chosen`: the request leaves some of them out, and what
-    is left must not be taken for those.
+    `given`: the caller gave the objects' numbers; `chosen`: the request leaves objects out, and the
+    remaining ones must not be mistaken for them.
     """
     points, number = scene.points_in_cloud, scene.object_of_point
     seen = np.flatnonzero((number >= 0) | (chosen & (number == BACKGROUND)))
@@ -127,12 +127,12 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
     matches = [(*registered(before, cloud), row) for row, before in enumerate(places)]
     matches = [match for match in matches if match[1] >= FOUND_SHARE]
     placed = {row: places[row] @ T[:3, :3].T + T[:3, 3] for T, _, row in matches}
-    nearest = np.zeros(len(number), dtype=np.int64)  # row of the object that a point is nearest to
+    nearest = np.zeros(len(number), dtype=np.int64)  # row of the object nearest to each point
     if several := len(placed) > 1 and not previous.search:
         rows = np.repeat([*placed], [len(now) for now in placed.values()])
         tree = cKDTree(np.concatenate([*placed.values()]))
         nearest[seen] = rows[tree.query(cloud.points)[1]]
-    # Of two objects that match the same points, the better match is there.
+    # If two objects match the same points, the better match gets them.
     for T, share, row in sorted(matches, key=lambda match: -match[1]):
         now = placed[row]
         if np.median(number[near := seen[cloud.near(now)]]) < 0:
@@ -171,7 +171,7 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
 def only_chosen(
     scene: Scene, followed: Followed, choice: ObjectChoice | str, warnings: list[str]
 ) -> tuple[Scene, Followed]:
-    """Without the objects that a choice by numbers in the answer leaves out."""
+    """Leave out the objects that a choice does not name, by their numbers in the answer."""
     number = scene.object_of_point
     wanted = numbers_chosen(np.unique(number[number >= 0]), choice, warnings)
     held = np.isin(number, wanted)
@@ -186,7 +186,7 @@ def only_chosen(
 
 
 def merged(
-    found: list[Grasp],  # of this cloud alone, best first
+    found: list[Grasp],  # found in this cloud alone, best first
     followed: Followed,
     options: DetectOptions,
     scene: Scene,
@@ -216,7 +216,7 @@ def merged(
     outcome, first = untracked(previous).first, [one.id for one in previous.grasps[:1]]
     held = next((row for row in order if grasps[row].id in first), None)
     if held is not None and (worth := _worth(grasps[held], options)) >= MIN_FOLLOWED_SCORE:
-        # Without a search the others are the earlier answer's own, whose scores vary with noise.
+        # Without a search, all grasps are from the earlier answer; their scores vary with noise.
         better = previous.search and _worth(grasps[order[0]], options) > worth + SWITCH_MARGIN
         outcome = Following.REPLACED if better else Following.KEPT
         order = order if better else [held, *(row for row in order if row != held)]
@@ -235,7 +235,7 @@ def _order(
 ) -> list[int]:
     """Rows of grasps, best first, without duplicates of the first `kept` or of a better one.
 
-    The others are already in order.
+    The grasps after those are already in order.
     """
     if kept == 0:
         return list(range(len(grasps)))
@@ -269,14 +269,14 @@ def _worth(grasp: Grasp, options: DetectOptions) -> float:
 
 
 class Surface(NamedTuple):
-    """V points that are seen, cloud frame."""
+    """V visible points, cloud frame."""
 
     points: Float32  # (V, 3)
     normals: Float32  # (V, 3) unit
     tree: cKDTree
 
     def near(self, places: Float64) -> Int64:
-        """The points on an object, by K points (K, 3) of its surface."""
+        """Rows of the points on an object, found by K points (K, 3) of its surface."""
         spacing = float(np.median(cKDTree(places).query(places, k=[2])[0]))
         rows = self.tree.query_ball_point(places, max(OBJECT_REACH, REACH_SPACINGS * spacing))
         return np.unique(np.concatenate([np.asarray(one, dtype=np.int64) for one in rows]))
@@ -285,8 +285,8 @@ class Surface(NamedTuple):
 def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
     """An object's motion (4, 4) T_now_before, and the share of its points (K, 3) found there.
 
-    Iterative closest points (ICP), mostly across the surface, from the old pose; distances along it
-    count only where an object ends.
+    This is the iterative closest point algorithm (ICP), mostly point-to-plane, from the old pose;
+    distances along the surface count only where an object ends.
     """
     T = np.eye(4)
     if len(before) < MIN_REGISTERED_POINTS or len(cloud.points) < MIN_REGISTERED_POINTS:
@@ -306,13 +306,13 @@ def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
         length = np.linalg.norm(along, axis=1)
         along *= (np.maximum(length - SURFACE_SPACING, 0.0) / np.maximum(length, 1e-9))[:, None]
         arm = now[hit] - middle
-        moves = np.zeros((len(arm), 3, 6))  # of each point, by a turn and a shift
+        moves = np.zeros((len(arm), 3, 6))  # of each point, per rotation and translation
         moves[:, (1, 2, 0), (2, 0, 1)], moves[:, (2, 0, 1), (1, 2, 0)] = arm, -arm
         moves[:, :, 3:] = np.eye(3)
         rows, ends = np.einsum("kd,kdm->km", normal, moves), length > SURFACE_SPACING
         sides = moves[ends].reshape(-1, 6)
         system, stiff = rows.T @ rows + TANGENT_WEIGHT * sides.T @ sides + still, still.copy()
-        # What the points say about turns, whatever the shift: little about a can's axis, say.
+        # Information of the points on rotations, for any translation: little about a can's axis.
         alone = np.linalg.solve(system[3:, 3:], system[3:, :3])
         known, axes = np.linalg.eigh(system[:3, :3] - system[:3, 3:] @ alone)
         doubt = np.square(LEAST_INFORMATION * spread * len(arm)) / known

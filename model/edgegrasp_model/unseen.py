@@ -12,13 +12,13 @@ from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
 from edgegrasp_model.kernels import compiled, distance_behind
 
 MAP_CELL = 0.0022  # metres across a cell of the depth map, at the middle of the cloud
-SPLAT = 2  # cells around its own that a point covers, up to the next point of the cloud
+SPLAT = 2  # cells around its own that a point covers, to fill the gaps to the next points
 THICKNESS = 0.004  # metres behind a surface that still count as the surface
-UNKNOWN_DEPTH = 0.02  # metres farther behind at which space counts as fully unknown
+UNKNOWN_DEPTH = 0.02  # metres beyond THICKNESS at which space counts as fully unknown
 MAX_UNSEEN_DEPTH = 0.10  # metres behind a surface; distances are clipped here
-UNKNOWN_SHARE = 0.25  # unseen share of the way of a part of the hand that counts as a collision
+UNKNOWN_SHARE = 0.25  # unseen share of a hand part's swept space, from which the hand collides
 HAND_SLICES = 9  # of the hand, along y
-OUTSIDE_SHARE = 0.5  # of the way of a slice, from which a hand reaches out of the image
+OUTSIDE_SHARE = 0.5  # share of a slice's swept space, from which a hand reaches out of the image
 PLACES = 27  # places on the closing line, from beyond one finger to beyond the other
 NO_SURFACE = np.float32(np.inf)
 MIN_UP_SINE = 1e-3  # sine of the angle to up below which up cannot orient the map
@@ -33,10 +33,10 @@ class UnseenSpace(NamedTuple):
     """Unseen parts of E hands and of the space around them; the finger at +y is first."""
 
     parts: list[Float32]  # (E,) each: the unseen share of each of `probes`
-    ways: list[Float32]  # (E,) each: of the space that each finger sweeps on the approach
+    ways: list[Float32]  # (E,) each: unseen share of the space a finger sweeps on the approach
     depths: list[Float32]  # (E,) each: metres that each fingertip is behind a surface
     beyond: list[Float32]  # (E,) each: unseen metres outward from what each finger touches first
-    free: Float32  # (E,) metres of empty space between those two
+    free: Float32  # (E,) metres of empty space between what the two fingers touch first
 
 
 def unseen_space(
@@ -86,7 +86,7 @@ def leaves_image(
     T_cloud_hand: Float32,  # (E, 4, 4)
     gripper: Gripper,
 ) -> Bools:
-    """Which hands (E,) reach out of the image on the approach, where nobody knows what is there."""
+    """Which hands (E,) reach out of the image on the approach, into unknown surroundings."""
     places = np.stack(_palm_ways(gripper))  # (slices, S, 3)
     P_image_hand = P_image_cloud @ T_cloud_hand.astype(np.float64)  # (E, 3, 4)
     seen = P_image_hand[:, :, :3] @ places.reshape(-1, 3).T + P_image_hand[:, :, 3:]
@@ -132,7 +132,7 @@ def probes(gripper: Gripper) -> list[Float32]:
 
 @lru_cache(maxsize=16)
 def _ways(gripper: Gripper) -> list[Float32]:
-    """Points of the space that each finger sweeps behind its final place: each (S, 3)."""
+    """Points of the space that each finger sweeps behind its final position: each (S, 3)."""
     half, inner = gripper.pad_half_width, gripper.max_opening / 2
     root = min(low[2] for low, _ in gripper.finger.boxes)
     thick = gripper.finger_thickness
@@ -179,9 +179,9 @@ def visible_extents(
 ) -> Float32:
     """The visible size of the object between the fingers, and how far it extends beyond them.
 
-    Metres (E, NUM_EXTENTS): beyond each finger, of the whole object, then of what is as wide as
-    three pads and before the palm; along x and -x; ahead of the tips, behind the palm; length,
-    width, height.
+    Metres (E, NUM_EXTENTS): beyond each finger, of the whole object, then of its part in front of
+    the palm that is within a strip three pads wide; along x and -x; ahead of the tips, behind the
+    palm; length, width, height.
     """
     labels, groups = np.unique(number[contact_index], return_inverse=True)
     vertical = np.asarray(up, dtype=np.float64) / np.linalg.norm(np.asarray(up, dtype=np.float64))
@@ -194,7 +194,7 @@ def visible_extents(
         height = exact @ vertical
         flat = exact - exact.mean(axis=0) - (height - height.mean())[:, None] * vertical
         spread = np.linalg.eigvalsh(flat.T @ flat / len(flat))  # ascending; the first is along up
-        # Length and width of a box whose surface spreads as the points do, and their height.
+        # Length and width of an evenly filled rectangle with this variance, and the points' height.
         sizes[row, :2] = np.sqrt(12.0 * np.maximum(spread[:0:-1], 0.0))
         sizes[row, 2] = np.ptp(height)
     if len(labels) == 0:
@@ -217,7 +217,7 @@ def _extents(
     side: Float32,
     limits: Float32,
 ) -> Float32:
-    """All columns but the last three, 0 so far; the points of an object lie between its bounds."""
+    """All columns but the last three, which stay 0; objects begin and end at `bounds`."""
     inner, half, palm, tip = limits
     extents = np.zeros((len(group), NUM_EXTENTS), np.float32)
     for e in range(len(group)):
@@ -279,7 +279,7 @@ class DepthMap(NamedTuple):
 
 @compiled()
 def _cover(depth: Float32, cell: Int64, distance: Float32) -> None:
-    """Write distances (N,) into the cells (N, 2) around each point's, keeping the nearest."""
+    """Write distances (N,) into the cells around each point's cell (N, 2), keeping the nearest."""
     for n in range(len(cell)):
         for i in range(max(cell[n, 0] - SPLAT, 0), min(cell[n, 0] + SPLAT + 1, len(depth))):
             for j in range(max(cell[n, 1] - SPLAT, 0), min(cell[n, 1] + SPLAT + 1, len(depth))):
