@@ -111,7 +111,7 @@ def plan_picks(
                 missing -= pick.tier <= (0 if moves else 1)
         untried = [_Pick(grasp, ArmPlan(False), "untried") for grasp in waiting]
     picks = sorted([*picks, *untried], key=lambda pick: pick.tier)[: options.top_k]
-    return _told(detection, picks, failures, asked, time.perf_counter() - start)
+    return _reported(detection, picks, failures, asked, time.perf_counter() - start)
 
 
 @dataclass(frozen=True)
@@ -401,7 +401,7 @@ def _rank(
     return pick.tier, TRAVEL_COST * float(travel) - pick.grasp.score
 
 
-def _told(
+def _reported(
     detection: Detection,
     picks: Sequence[_Pick],
     outcomes: Counter[str],

@@ -10,10 +10,13 @@ from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
+import torch
 
 from edgegrasp_model.detector import ModelCatalogue
+from edgegrasp_model.networks import layers
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Grasp
@@ -158,12 +161,14 @@ Record = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 
 def answer(case: Case, catalogue: ModelCatalogue) -> Any:
-    """The detection or scoring of a case, without a server."""
+    """The detection or scoring of a case, without a server, in float32 on every processor."""
     cloud, asked = CloudInput(case.points, **case.beside), parse_options(case.options)
     detector = catalogue.get(asked.model)
-    if case.given:
-        return detector.score(cloud, asked, **case.given)
-    return detector.detect(cloud, asked)
+    slow = patch.object(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
+    with slow, patch.object(layers, "FAST", torch.float32):
+        if case.given:
+            return detector.score(cloud, asked, **case.given)
+        return detector.detect(cloud, asked)
 
 
 def record(answer: Any) -> Record:

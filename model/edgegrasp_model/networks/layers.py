@@ -26,8 +26,8 @@ FAST = torch.bfloat16 if torch.cpu._is_avx512_bf16_supported() else torch.float3
 ROWS = 512  # points at a time: 1,024 channels of them stay in cache
 CONVOLVED = 128  # points at a time in a graph convolution, each with its neighbours
 EDGE_ROWS = 256  # edge grasps at a time
-# Weights packed for oneDNN, with the version of the weight that was packed.
-_PACKED: MutableMapping[Tensor, tuple[int, Tensor]] = WeakTensorKeyDictionary()
+# Weights packed for oneDNN, with the version of the weight that was packed, and their type.
+_PACKED: MutableMapping[Tensor, tuple[object, Tensor]] = WeakTensorKeyDictionary()
 
 
 def shared_product(
@@ -92,10 +92,10 @@ def packed_linear(
         then: Layer = torch.relu_ if rectified else nn.Identity()
         return lambda values: then(row_linear(values, weight, bias))
     # Inference tensors do not count their changes.
-    version = -1 if weight.is_inference() else weight._version
-    if version < 0 or _PACKED.get(weight, (-1, weight))[0] != version:
+    state = None if weight.is_inference() else (weight._version, dtype)
+    if state is None or _PACKED.get(weight, (None, weight))[0] != state:
         reordered = torch.ops.mkldnn._reorder_linear_weight(weight.detach().to(dtype).contiguous())
-        _PACKED[weight] = version, reordered
+        _PACKED[weight] = state, reordered
     for_onednn, after = _PACKED[weight][1], "relu" if rectified else "none"
     added = None if bias is None else bias.to(dtype)
     return lambda values: torch.ops.mkldnn._linear_pointwise(

@@ -125,7 +125,7 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
         points, row = points[near], row[near]
         low, high = points.min(axis=0), points.max(axis=0)
     if (furthest := float(np.maximum(-low, high).max())) > MAX_DISTANCE:
-        value = f"points {furthest:.4g} m from the origin, where float32 rounds away millimetres"
+        value = f"points {furthest:.4g} m from the origin, where float32 is too coarse"
         fix = "Subtract an origin near the cloud from all positions, and add it to the grasps."
         raise InvalidRequest("cloud", value, fix)
     if len(points) < num_approach_points:
