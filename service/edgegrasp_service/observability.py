@@ -43,7 +43,7 @@ class Call:
     client: str = ""  # whose share of the server it uses: the token's name or the network
     is_admin: bool = False
     in_stream: bool = False  # one request of a stream
-    start: float = field(default_factory=time.monotonic)  # as the event loop's clock
+    start: float = field(default_factory=time.monotonic)  # the same clock as the event loop's
     deadline: float = float("inf")
     timeout: asyncio.Timeout | None = None  # ends it at its deadline; set once it is admitted
     refusal: EdgeGraspError | None = None  # why it was ended before its deadline
@@ -134,7 +134,7 @@ class JsonFormatter(logging.Formatter):
             "message": record.getMessage(),
         }
         line |= getattr(record, "fields", {})
-        if traceback := getattr(record, "traceback", ""):  # by a worker
+        if traceback := getattr(record, "traceback", ""):  # of an error in a worker
             line["exception"] = traceback
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
@@ -154,7 +154,7 @@ class LogQueue(logging.handlers.QueueHandler):
         self._writer.start()
 
     def prepare(self, record: logging.LogRecord) -> str:
-        """Format a record while its request is known."""
+        """Format a record in the task that logs it, which has the request id."""
         call = CALL.get()
         if call is not None and not hasattr(record, "fields"):
             record.fields = {"request_id": call.request_id}
@@ -175,7 +175,7 @@ class LogQueue(logging.handlers.QueueHandler):
         start = ""
         for line in iter(self._lines.get, None):
             written = write_line(self._stream, start + line)
-            start = "" if written else "\n"  # ends what was written of a line that is lost
+            start = "" if written else "\n"  # ends a line that was written in part
             self.dropped += not written
 
 
@@ -231,8 +231,8 @@ class Metrics:
         self._results = counter("stream_results", "results sent on streams", ("code",))
         self.workers_replaced = counter("workers_replaced", "worker processes that died")
         self._model_info = self._gauge("model_info", "loaded weights", MODEL_LABELS)
-        self.reloads = counter("reloads", "weights loaded anew", ("outcome",))
-        for outcome in ("succeeded", "failed"):  # at 0, so that the first one is an increase
+        self.reloads = counter("reloads", "reloads of the weights", ("outcome",))
+        for outcome in ("succeeded", "failed"):  # start at 0: the first reload is an increase
             self.reloads.labels(outcome)
 
     def count_call(self, call: Call) -> None:

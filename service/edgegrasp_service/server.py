@@ -31,10 +31,10 @@ from edgegrasp_service.worker.recording import check_outcomes
 logger = logging.getLogger(__name__)
 
 # Connections of HTTP
-HEALTH_PLACES = 16  # beside max_connections, never held by requests to /v1/
+HEALTH_PLACES = 16  # in addition to max_connections; never taken by requests to /v1/
 BACKLOG = 1024  # waiting to be accepted; beyond that a client retries after a second
 MAX_ACCEPTED_AT_ONCE = 16  # in one turn of the event loop
-KEEP_ALIVE_SECONDS = 75  # longer than clients keep theirs: no request meets a closing one
+KEEP_ALIVE_SECONDS = 75  # clients close earlier, so no request arrives on a closing connection
 
 NOTICE_SECONDS = 0.25  # seconds; requests that arrive this soon after a stop are still answered
 CLOSE_SECONDS = 0.5  # seconds for answers being sent, and for health watchers
@@ -42,7 +42,7 @@ REPEAT_SECONDS = 10.0  # seconds between log lines about the same socket error
 
 
 class Server:
-    """Both transports of a service, made in the running loop; InvalidSettings: a file is wrong."""
+    """Both transports; create it in the running event loop. Raises InvalidSettings."""
 
     def __init__(self, settings: Settings, nursery: Nursery | None = None) -> None:
         self._settings = settings
@@ -56,7 +56,7 @@ class Server:
         watch("ready", "1: requests are answered", lambda: service.ready)
         watch("requests_in_flight", "requests not yet answered", lambda: len(admission.calls))
         watch("requests_active", "requests that workers have", lambda: admission.at_work)
-        waiting = "requests let in that no worker has"
+        waiting = "admitted requests that no worker has yet"
         watch("queue_depth", waiting, lambda: len(admission.calls) - admission.at_work)
         watch("held_bytes", "bytes of bodies in the server", lambda: admission.held_bytes)
         watch("workers", "worker processes", lambda: len(self.pool.pids))
@@ -164,7 +164,7 @@ class _LoopErrors:
 def run(settings: Settings, nursery: Nursery | None = None) -> None:
     """Serve until SIGTERM or SIGINT; prints one line with both addresses when ready.
 
-    `nursery` loads already.
+    `nursery`, if given, is already loading the weights.
 
     Raises:
         AddressInUse: A port cannot be bound.
@@ -173,7 +173,7 @@ def run(settings: Settings, nursery: Nursery | None = None) -> None:
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     with contextlib.suppress(ValueError):  # the usual 1024 are too few for all connections
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    # For connections that do not shake hands, and hold no place until they have.
+    # A connection takes no place before its TLS handshake, so the handshake's time is limited.
     constants.SSL_HANDSHAKE_TIMEOUT = settings.read_seconds
     with contextlib.closing(start_logging(settings, sys.stderr)) as log:
         warn(settings)
@@ -229,7 +229,7 @@ def warn(settings: Settings) -> None:
         logger.warning("%s: others can reach this server without a token", settings.host)
     for folder in settings.weights:
         if folder.is_dir() and not any(folder.glob("*.safetensors")):
-            logger.warning("weights: %s holds no weights (*.safetensors)", folder)
+            logger.warning("weights: %s contains no weights (*.safetensors)", folder)
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -240,7 +240,7 @@ def _listen(host: str, port: int) -> socket.socket:
             raise InvalidSettings(f"host: got {host!r}. Give unix:FOLDER.")
         family, place = socket.AF_UNIX, f"{host.removeprefix(UNIX_PREFIX)}/http.sock"
         address = place
-        with socket.socket(socket.AF_UNIX) as trying:  # a stale socket goes
+        with socket.socket(socket.AF_UNIX) as trying:  # remove a stale socket
             if trying.connect_ex(place) == errno.ECONNREFUSED:
                 Path(place).unlink(missing_ok=True)
     try:
@@ -254,10 +254,10 @@ def _listen(host: str, port: int) -> socket.socket:
             raise InvalidSettings(f"host: got {host!r} ({error.strerror}). {fix}") from None
         raise AddressInUse("HTTP", place, str(error.strerror)) from None
     if family != socket.AF_UNIX:
-        # Connections inherit it; asyncio sets it only on its own sockets. Without it answers waited
-        # for 40 ms.
+        # Connections inherit it; asyncio sets it only on its own sockets. Without it, answers were
+        # delayed by 40 ms.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        # What nobody reads stays in this process, which counts it, and not in the kernel.
+        # Data that a client does not read stays in this process, which counts it.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, PIECE_BYTES)
     return listening
 

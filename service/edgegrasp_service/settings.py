@@ -40,11 +40,11 @@ class Settings(BaseModel):
     grpc_port: Port = 50051
     """port for gRPC; 0: any free port"""
     weights: tuple[Path, ...] = ()
-    """weights files or folders of them, besides those that ship"""
+    """weights files or folders of them, in addition to the built-in weights"""
     grippers: tuple[Path, ...] = ()
     """gripper files (.toml); a gripper has the name of its file"""
     robots: tuple[Path, ...] = ()
-    """robot files (.toml), or names of those that ship; needs the extra robot"""
+    """robot files (.toml), or names of built-in robots; needs the extra robot"""
     default_model: str = ""
     """weights used when a request does not name any; none: edgegrasp-plus"""
     device: str = Field("cpu", pattern=r"^(auto|cpu|cuda(:\d+)?)$")
@@ -90,11 +90,11 @@ class Settings(BaseModel):
     tls_key: Path | None = None
     """PEM file: key of the certificate"""
     tls_client_ca: Path | None = None
-    """PEM file: CAs of clients, which then need a certificate"""
+    """PEM file: CAs for client certificates, which are then required"""
     token_file: Path | None = None
-    """bearer tokens, one per line, of which a request needs one; none: no token is needed"""
+    """file with bearer tokens, one per line; a request must send one; none: no token is needed"""
     admin_token_file: Path | None = None
-    """tokens that also permit reloading weights, one per line; none: only SIGHUP reloads"""
+    """file of tokens, one per line, that also permit reloads; none: only SIGHUP reloads weights"""
     grace_seconds: Wait = 10.0
     """time for requests in progress to finish when stopping"""
     playground: bool = True

@@ -158,7 +158,7 @@ class Running:
 
     @property
     def waiting(self) -> int:
-        """Requests let in that no worker has."""
+        """Admitted requests that no worker has yet."""
         admission = self.server.service.admission
         return len(admission.calls) - admission.at_work
 

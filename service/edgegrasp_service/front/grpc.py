@@ -1,6 +1,6 @@
 """The gRPC transport: methods on raw messages, health, reflection, checks around each call, limits.
 
-Every method is served as a stream in both directions, which is the same on the wire: a unary
+Every method is registered as a bidirectional stream, which looks the same on the wire. A unary
 method can then read its message when there is room for it, and knows when its answer was read.
 """
 
@@ -45,19 +45,19 @@ HEALTH_CHECK = f"/{HEALTH_SERVICE}/Check"
 STATES = health_pb2.HealthCheckResponse.ServingStatus
 REFLECTION = tuple(f"grpc.reflection.{version}.ServerReflection" for version in ("v1", "v1alpha"))
 
-MAX_WATCHERS = 64  # of health, and readers of the interface by reflection
-WATCH_SECONDS = 1.0  # seconds between two looks at the health
-STREAM_IDLE_SECONDS = 300.0  # for which a stream may stay open without a message
+MAX_WATCHERS = 64  # open health watches and reflection streams
+WATCH_SECONDS = 1.0  # seconds between two checks of the health
+STREAM_IDLE_SECONDS = 300.0  # seconds that a stream may stay open without a message
 STREAM_GRACE_SECONDS = 10.0  # seconds after which an idle stream yields its place to another one
-MAX_STREAM_FIELDS = 16  # in a message of a stream, which has three
-# By tag, those of a DetectGraspsStreamRequest.
+MAX_STREAM_FIELDS = 16  # fields read from one message of a stream; only three are defined
+# The fields of a DetectGraspsStreamRequest, by tag.
 STREAM_FIELDS = {0x0A: "request_id", 0x12: "request", 0x19: "timeout"}
 
 # Connections
 MAX_CALLS_PER_CONNECTION = 100  # calls of one connection at a time; further ones wait in the client
 LOOKAHEAD_BYTES = 2**20  # buffered bytes of a message that is not being read yet; 87,000 points
-SPARE_BYTES = 2**20  # an excess up to this is refused with field, value and fix
-SPARE_CONNECTIONS = 4  # times max_connections are accepted before the oldest are closed
+SPARE_BYTES = 2**20  # a message too long by up to this gets an error with field, value and fix
+SPARE_CONNECTIONS = 4  # gRPC accepts this many times max_connections; `trim` closes the surplus
 TRIM_SECONDS = 0.05  # seconds between two checks for too many connections
 DESCRIPTORS = Path("/proc/self/fd")
 LAST_RECEIVED = struct.Struct("52xI")  # of struct tcp_info: tcpi_last_data_recv, milliseconds
@@ -72,7 +72,7 @@ Behaviour = Callable[[Call, Any], Awaitable[None]]  # takes the call and its con
 class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in its stubs only
     """A grpc.aio server with the grasp service, health checks and reflection.
 
-    Each call is named, counted and logged. Must be made in the running event loop.
+    Each call gets a request id and is counted and logged. Create it in the running event loop.
 
     Raises:
         AddressInUse: The port cannot be bound.
@@ -92,7 +92,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
             "ListRobots": partial(self._list, "robots"),
             "ReloadModels": self._reload_models,
         }
-        # By path: what a method is called in metrics and the log, and what it does.
+        # By path: the method's name in metrics and the log, and its implementation.
         self._behaviours: dict[str, tuple[str, Behaviour]] = {
             **{f"/{SERVICE.full_name}/{name}": (name, does) for name, does in ours.items()},
             HEALTH_CHECK: ("HealthCheck", self._check_health),
@@ -102,7 +102,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
             self._behaviours[f"/{name}/ServerReflectionInfo"] = "Reflection", self._reflect
         self.server = aio.server(options=_bounds(service.settings))
         self.server.add_generic_rpc_handlers((self,))
-        # It has a queue of its own: no other calls come before it.
+        # The health check has its own queue, so that it does not wait for other calls.
         self.server.add_registered_method_handlers(  # type: ignore[attr-defined]
             HEALTH_SERVICE, {"Check": self._handler(HEALTH_CHECK)}
         )
@@ -166,7 +166,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                 await behave(call, context)
             except errors.Cancelled as error:
                 call.problem = errors.report(error)
-                # gRPC would keep the answer for as long as the connection.
+                # Otherwise gRPC would keep the answer until the connection closes.
                 _disconnect(self._port, network_of(address), port)
                 raise asyncio.CancelledError from None
             except aio.AbortError:
@@ -200,13 +200,13 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         """Answer the requests of one stream in their order; several are processed in parallel.
 
         A request is read only when fewer than `max_stream_requests` are unanswered; flow control
-        holds the client up. When it disconnects, requests in progress are cancelled.
+        makes the client wait. When it disconnects, requests in progress are cancelled.
 
         Raises:
-            NotReady: The server is stopping; what was read is answered before.
-            InvalidRequest: A message is no DetectGraspsStreamRequest.
-            RequestTimeout: No message came for long.
-            Overloaded: There is no place for the stream, or it was given to another client.
+            NotReady: The server is stopping; requests already read are answered first.
+            InvalidRequest: A message is not a DetectGraspsStreamRequest.
+            RequestTimeout: No message arrived for STREAM_IDLE_SECONDS.
+            Overloaded: There is no place for the stream, or another client got its place.
         """
         service = self._service
         ahead: deque[asyncio.Task[bytes]] = deque()  # unanswered requests
@@ -254,12 +254,12 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         await context.write(grasp_pb2.ReloadModelsResponse(models=models))
 
     async def _check_health(self, call: Call, context: Any) -> None:
-        """Answer unread: whatever service it asks about, there is one."""
+        """Answer without reading the message: all services have the same status."""
         status = STATES.SERVING if self._service.ready else STATES.NOT_SERVING
         await context.write(health_pb2.HealthCheckResponse(status=status))
 
     async def _watch_health(self, call: Call, context: Any) -> None:
-        """Tell the health and each change; raises NotReady once the server is stopping."""
+        """Send the health status and each change; raises NotReady once the server is stopping."""
         told: bool | None = None
         async with self._watchers.hold(call.client):
             while told is not False or not self._service.stopping.is_set():
@@ -408,7 +408,7 @@ def _bounds(settings: Settings) -> list[tuple[str, int]]:
         # Compressed messages are unpacked before their size is known: none are accepted.
         ("grpc.compression_enabled_algorithms_bitset", 1),
         ("grpc.so_reuseport", 0),
-        # One call is accepted per turn of the event loop: few may wait before a health check.
+        # One call is accepted per turn of the event loop; a health check waits for those ahead.
         ("grpc.max_concurrent_streams", MAX_CALLS_PER_CONNECTION),
         ("grpc.max_allowed_incoming_connections", SPARE_CONNECTIONS * settings.max_connections),
         ("grpc.server_handshake_timeout_ms", int(settings.read_seconds * 1000)),
@@ -436,13 +436,13 @@ def _connections(
                 continue
             one = duplicates.enter_context(socket.socket(fileno=os.dup(int(link.name))))
             if one.family != socket.AF_UNIX and one.getsockname()[1] == port:
-                host, its_port = one.getpeername()[:2]  # an OSError for the one that listens
+                host, its_port = one.getpeername()[:2]  # OSError for the listening socket
                 found.append((network_of(host), its_port, one))
     return found
 
 
 def _disconnect(port: int, owner: str, its_port: str) -> None:
-    """Shut down one client's connection to a port; one over a Unix socket cannot be told apart."""
+    """Shut down one client's connection to a port; over a Unix socket this does nothing."""
     with contextlib.ExitStack() as duplicates:
         for network, number, one in _connections(port, duplicates):
             if (network, str(number)) == (owner, its_port):
@@ -455,7 +455,7 @@ def _shut_down(connection: socket.socket) -> None:
 
 
 def _trim(port: int, most: int, duplicates: contextlib.ExitStack) -> None:
-    """Shut down the longest silent connections to a port of the clients that have most."""
+    """Shut down surplus connections to a port: the longest silent of the clients with the most."""
     found: defaultdict[str, list[tuple[int, socket.socket]]] = defaultdict(list)
     for owner, _, one in _connections(port, duplicates):
         info = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, LAST_RECEIVED.size)

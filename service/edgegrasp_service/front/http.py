@@ -35,16 +35,16 @@ logger = logging.getLogger(__name__)
 
 # Connections
 LINGER_SECONDS = 5.0  # seconds for a refused client to read its answer
-MANY_PIECES, SMALL_PIECE = 1024, 16  # more chunks than this, smaller than this, are refused
+MANY_PIECES, SMALL_PIECE = 1024, 16  # more chunks than this, if smaller on average, are refused
 
 # Pages
-MAX_PAGES_AT_ONCE = 16  # sent at a time
+MAX_PAGES_AT_ONCE = 16  # pages sent at a time
 PAGE_GRACE_SECONDS = 10.0  # seconds after which a page yields its place to another one
 
 ASSETS = "/docs/assets"  # of fastapi_offline
 PLAYGROUND = "/playground/"
 PLAYGROUND_FILES = Path(__file__).parents[1] / "playground"
-CONTENT_POLICY = (  # what a page may load, and who may show it
+CONTENT_POLICY = (  # what a page may load, and which sites may embed it
     "default-src 'none'; script-src 'self'{0}; style-src 'self'{0}; img-src 'self' data: blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
@@ -81,7 +81,7 @@ OPENAPI_DOCUMENT = json.loads(Path(grasp_pb2.__file__).with_name("openapi.json")
 
 
 class HttpMiddleware:
-    """ASGI middleware around the routes: request ids, tokens, limits of headers, errors."""
+    """ASGI middleware around the routes: request ids, tokens, header limits, errors."""
 
     def __init__(self, app: ASGIApp, service: GraspService) -> None:
         self._app = app
@@ -107,7 +107,7 @@ class HttpMiddleware:
                         (b"content-security-policy", POLICIES.get(path, POLICY).encode()),
                         (b"x-content-type-options", b"nosniff"),
                     ]
-                    # An answered request whose body is still arriving is not waited for.
+                    # If the answer comes before the end of the body, do not wait for the rest.
                     if arriving := has_body and "read" not in call.stages:
                         scope["state"]["linger"]()
                     if arriving or self._service.stopping.is_set():
@@ -129,7 +129,7 @@ class HttpMiddleware:
             except Exception as error:
                 if not isinstance(error, EdgeGraspError | HTTPException):
                     logger.exception("%s failed", method)
-                if call.code:  # half an answer is sent: the client must see that it is incomplete
+                if call.code:  # the answer has begun: the client must see that it is incomplete
                     call.problem, call.code = errors.report(error), ""
                     scope["state"]["abort"]()
                     await _disconnected(receive, call)
@@ -145,8 +145,8 @@ class HttpMiddleware:
         if count > MAX_HEADERS or size > most:
             fix = f"Send at most {MAX_HEADERS}, of {most} bytes."
             raise errors.HeadersTooLarge("headers", f"{count} entries of {size} bytes", fix)
-        # A name that a web page points at this server is refused. Nobody can register one without a
-        # dot, or with a number at its end.
+        # Prevent DNS rebinding: refuse names that a web page could have pointed at this server.
+        # Nobody can register a name without a dot, or one that ends in a number.
         host = headers.get("host", "")
         name = re.sub(r":\d*$", "", host).strip("[]").lower()
         allowed = [one.lower() for one in settings.allowed_hosts]
@@ -164,7 +164,7 @@ class HttpMiddleware:
 
 
 def create_router(service: GraspService, metrics: Metrics) -> Router:
-    """The routes. Starlette alone: the document is written by hand, and bodies are for workers."""
+    """The routes, in plain Starlette: workers parse the bodies, and openapi.json exists already."""
     settings = service.settings
 
     async def listed(name: str, request: Request) -> Response:
@@ -235,7 +235,7 @@ class _Work:
             while more:
                 message = await service.receive(receive(), len(body), start)
                 if message["type"] == "http.disconnect":
-                    raise errors.Cancelled("The client left before its request was whole.")
+                    raise errors.Cancelled("The client left before its request was complete.")
                 body += message.get("body", b"")
                 service.check_size(len(body))
                 more = message.get("more_body", False)
@@ -285,7 +285,7 @@ def _problem_response(call: Call, problem: errors.Problem) -> Response:
 def _error_response(call: Call, scope: Scope, error: Exception) -> Response:
     if not isinstance(error, HTTPException):
         return _problem_response(call, errors.report(error))
-    # Of the routing itself: no such path, no such method.
+    # Raised by the router: no such path, or no such method.
     detail = f"{scope['method']} {scope['path']}: {error.detail}. See /docs."
     problem = errors.Problem("http", detail, "", "", "", "", error.status_code)
     response = _problem_response(call, problem)
@@ -297,7 +297,7 @@ def _error_response(call: Call, scope: Scope, error: Exception) -> Response:
 
 
 class HttpProtocol(HttpToolsProtocol):
-    """Closes connections whose headers are too slow; refused clients can read why."""
+    """Closes connections whose headers arrive too slowly; refused clients can still read why."""
 
     def __init__(self, service: GraspService, places: Places, **arguments: Any) -> None:
         super().__init__(**arguments)
@@ -311,7 +311,7 @@ class HttpProtocol(HttpToolsProtocol):
         """Take a place, and wait for the first headers."""
         super().connection_made(transport)
         transport.max_size = PIECE_BYTES  # read in one turn of the event loop
-        self.on_message_begin()  # as far as limits are concerned
+        self.on_message_begin()  # starts the timer for the first headers
         try:
             owner = network_of(self.client[0] if self.client else "")
             self._place = self._places.take(owner, transport.abort)
@@ -332,13 +332,13 @@ class HttpProtocol(HttpToolsProtocol):
             self._refuse(errors.HeadersTooLarge("headers", f"{self._header_bytes} bytes", most))
 
     def on_message_begin(self) -> None:
-        """Prepare for a new request, whose headers must come in time."""
+        """Prepare for a new request, whose headers must arrive in time."""
         super().on_message_begin()
         self.scope["state"] |= {"abort": self.transport.abort, "linger": self._linger}
         self._pieces = self._body_bytes = 0
         if self._header_timer is None:
             seconds = self._settings.read_seconds
-            late = "headers", f"not whole in {seconds:g} s", "Send them at once."
+            late = "headers", f"not complete after {seconds:g} s", "Send them at once."
             self._header_timer = self.loop.call_later(
                 seconds, lambda: self._refuse(errors.RequestTimeout(*late))
             )
@@ -380,12 +380,12 @@ class HttpProtocol(HttpToolsProtocol):
         self._refuse(raised)
 
     def _refuse(self, error: EdgeGraspError) -> None:
-        """Send an error without the application, and close; no more if it is closing."""
+        """Send an error, bypassing the application, and close; does nothing if already closing."""
         if self.transport.is_closing():
             return
         pending = self.cycle is not None and not self.cycle.response_complete
         if pending and self.cycle.response_started:
-            self.transport.abort()  # it has half an answer
+            self.transport.abort()  # the client already has part of an answer
             return
         problem = errors.report(error)
         body = errors.problem_document(problem)
@@ -394,7 +394,7 @@ class HttpProtocol(HttpToolsProtocol):
             "content-type: application/problem+json\r\n"
             f"content-length: {len(body)}\r\nconnection: close\r\n"
         )
-        if pending:  # a call that the application counts
+        if pending:  # the application counts this call
             self.cycle.disconnected = True  # it can send nothing more
             self.cycle.message_event.set()
         else:
@@ -407,7 +407,7 @@ class HttpProtocol(HttpToolsProtocol):
         self.transport.close()
 
     def _linger(self) -> None:
-        """Leave the client time to read its answer, though more of its request is to come."""
+        """Give the client time to read its answer while the rest of its request still arrives."""
         self.transport = _LingeringTransport(self.transport)  # type: ignore[assignment]
         if self.cycle is not None:
             self.cycle.transport = self.transport

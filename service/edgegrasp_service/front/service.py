@@ -27,9 +27,9 @@ from edgegrasp_service.worker.recording import Recorder
 
 logger = logging.getLogger(__name__)
 
-MAX_HARMFUL = 1000  # requests remembered that killed workers
+MAX_HARMFUL = 1000  # remembered requests that killed workers
 HARMFUL_SECONDS = 600.0  # seconds for which a request that killed workers is refused
-LATEST_TIMES = 15  # service times, whose median is the pace; one slow request does not change it
+LATEST_TIMES = 15  # the median of the latest service times ignores a single slow request
 SEND_SECONDS = 1.0  # seconds for the errors of abandoned requests to be sent
 WAIT_FACTOR = 1.5  # the wait is estimated from a median, and half of the requests take longer
 
@@ -51,7 +51,7 @@ class GraspService:
         self.observers: list[Callable[[Call], None]] = [metrics.count_call, log_call]
         folder, most = settings.record_folder, settings.record_bytes
         self.recorder = None if folder is None else Recorder(folder, most, self.admission.hold)
-        # Requests that killed workers, by digest: until when they are remembered, dead workers.
+        # By digest of a request that killed workers: until when it is remembered, how many died.
         self._deaths: dict[bytes, tuple[float, int]] = {}
         self._reloads = metrics.reloads
         self._reloading = asyncio.Lock()
@@ -106,7 +106,7 @@ class GraspService:
 
         Raises:
             NotReady: Weights are not loaded yet, or the server is stopping.
-            Overloaded: The server is full, or its turn would come too late.
+            Overloaded: The server is full, or could not answer before the deadline.
             PayloadTooLarge: The body is over the limit.
             DeadlineExceeded: The deadline passed.
         """
@@ -212,10 +212,10 @@ class GraspService:
         Raises:
             PermissionDenied: The caller has no admin token.
             NotReady: The first weights are still loading, or the server is stopping.
-            ReloadFailed: Something cannot be used, and nothing was changed; or a reload is under
-                way.
+            ReloadFailed: A file cannot be used, and nothing was changed; or another reload is in
+                progress.
         """
-        if call is not None and not call.is_admin:  # however its path is spelled
+        if call is not None and not call.is_admin:  # here, so that no spelling of a path evades it
             raise errors.PermissionDenied(TOKEN_HEADER, "no token of an administrator", ADMIN_FIX)
         self.loaded()
         if self._reloading.locked():
@@ -265,15 +265,15 @@ class Admission:
     that holds the most loses a request to a client that would still hold fewer.
 
     Args:
-        workers: Requests worked on at a time.
-        max_waiting: Requests in the server beside those.
-        max_bytes: Of bodies held; a client holds at most half of them.
+        workers: Number of requests processed at a time.
+        max_waiting: Number of further requests in the server.
+        max_bytes: Total bytes of the bodies held; one client holds at most half of them.
     """
 
     def __init__(self, workers: int, max_waiting: int, max_bytes: int) -> None:
         self._workers, self._max_calls, self._max_bytes = workers, workers + max_waiting, max_bytes
         self.calls: list[Call] = []  # of the requests in the server, in the order they came
-        self._bytes_beside = 0  # held, but not by those
+        self._bytes_beside = 0  # held, but not for these requests
         self._freed = asyncio.Event()  # set when a request frees bytes or its place
         self.service_seconds: deque[float] = deque(maxlen=LATEST_TIMES)  # of workers' latest jobs
 
@@ -281,8 +281,8 @@ class Admission:
     async def admit(self, call: Call, size: int) -> AsyncIterator[None]:
         """Hold a place in the server for a request until its deadline.
 
-        The body of the context is cancelled at the deadline, on the event loop's clock. Waits until
-        there is room for `size`, the most bytes of the body. Raises as `GraspService.admit` does.
+        The body of the context is cancelled at the deadline, on the event loop's clock. Waits for
+        room for `size` bytes, the maximum of the request's body. Raises as `GraspService.admit`.
         """
         remaining = call.deadline - asyncio.get_running_loop().time()
         if remaining <= 0.0:
@@ -317,16 +317,16 @@ class Admission:
 
     @property
     def at_work(self) -> int:
-        """Number of requests that workers have."""
+        """Number of requests that workers are processing."""
         return sum(call.at_work for call in self.calls)
 
     @property
     def held_bytes(self) -> int:
-        """Bytes held, by requests or beside them."""
+        """Bytes held for requests, or reserved with `hold`."""
         return self._bytes_beside + sum(call.held_bytes for call in self.calls)
 
     def _refuse_latest(self, holder: str) -> bool:
-        """Refuse the latest request of a client that is not being worked on; false without one."""
+        """Refuse a client's latest request that no worker has; returns whether there is one."""
         for call in reversed(self.calls):
             if call.client == holder and not call.at_work:
                 held = sum(one.client == holder for one in self.calls)
@@ -360,15 +360,15 @@ class Admission:
     def _estimated_wait(self) -> float:
         """Estimated seconds until a worker begins a new request."""
         pace = statistics.median(self.service_seconds) if self.service_seconds else 0.0
-        ahead = sum("read" in call.stages for call in self.calls)  # others' bodies may be late
+        ahead = sum("read" in call.stages for call in self.calls)  # other bodies may arrive late
         return max(0, ahead + 1 - self._workers) * pace / self._workers
 
     def _overloaded(self, why: str) -> errors.Overloaded:
-        seconds = max(1, math.ceil(self._estimated_wait))  # as the header Retry-After has them
+        seconds = max(1, math.ceil(self._estimated_wait))  # the header Retry-After has integers
         return errors.Overloaded(f"The server is busy: {why}. Try again in {seconds} s.", seconds)
 
     async def _reserve(self, call: Call, size: int) -> None:
-        """Wait until the limits of all clients and of this client leave room for so many bytes."""
+        """Wait until `size` more bytes fit into the total limit and into the client's limit."""
         while True:
             held: Counter[str] = Counter()
             for one in self.calls:
@@ -408,7 +408,7 @@ class Places:
 
     def __init__(self, most: int, grace: float = 0.0, spare: int = 0) -> None:
         self._most, self._grace, self._spare = most + spare, grace, spare
-        self.taken: dict[Place, None] = {}  # the latest used at the end
+        self.taken: dict[Place, None] = {}  # the most recently used at the end
 
     def take(self, owner: str, on_eviction: Callable[[], None]) -> Place:
         """Take a place until `release`, or until it is evicted. Raises Overloaded."""
@@ -447,7 +447,7 @@ class Places:
 
     @asynccontextmanager
     async def hold(self, owner: str) -> AsyncIterator[Place]:
-        """Hold a place; Overloaded: there is none, or it was evicted, which cancels the body."""
+        """Hold a place; raises Overloaded if there is none, or on eviction, cancelling the body."""
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(None) as eviction:

@@ -1,4 +1,4 @@
-// The arm of a pick: its joints as /v1/robots has them, at rest and in motion.
+// The arm that executes a grasp, with its joints from /v1/robots, at rest and in motion.
 
 import * as THREE from "./vendor/three.module.min.js";
 
@@ -7,7 +7,7 @@ const THICK = 0.03; // metres, radius of a link as it is drawn
 const LOOK = new THREE.MeshStandardMaterial({ color: "#c9d3e3", transparent: true, opacity: 0.75 });
 
 export class Arm extends THREE.Group {
-  /** Stands in the cloud's frame; `T_base_cloud` is 16 numbers, row by row; `hand` is drawn at its end. */
+  /** An arm in the cloud's frame; `T_base_cloud` is 16 numbers, row by row; `hand` is drawn at its end. */
   constructor(robot, T_base_cloud, hand) {
     super();
     this.robot = robot;
@@ -23,7 +23,7 @@ export class Arm extends THREE.Group {
     last.add(hand);
   }
 
-  /** Bend to these joints. */
+  /** Move to these joint values. */
   bend(joints) {
     joints.forEach((value, row) => {
       const axis = new THREE.Vector3().fromArray(this.robot.axes, 3 * row);
@@ -32,10 +32,10 @@ export class Arm extends THREE.Group {
     });
   }
 
-  /** Follow a motion as fast as the arm would; `draw` draws each picture. */
+  /** Play a motion at the arm's speed; `draw` renders each frame. */
   play({ times, positions }, draw) {
     const start = performance.now();
-    const playing = (this.playing = Symbol()); // the newest one goes on
+    const playing = (this.playing = Symbol()); // an earlier motion stops
     const step = () => {
       if (this.playing !== playing || !this.parent) return;
       const seconds = (performance.now() - start) / 1000;
@@ -48,7 +48,7 @@ export class Arm extends THREE.Group {
   }
 }
 
-/** From a joint to the next one. */
+/** The link from a joint to the next joint, whose position is `end`. */
 function link(end) {
   const length = end.length();
   const mesh = new THREE.Mesh(new THREE.CapsuleGeometry(THICK, length), LOOK);
@@ -57,7 +57,7 @@ function link(end) {
   return mesh;
 }
 
-/** T_base_cloud, row by row, of a base on the support beside the objects, on the side of the camera. */
+/** T_base_cloud, row by row, of a base on the support, next to the objects and on the camera's side. */
 export function beside({ objects, support, up: upward }, eye) {
   const up = new THREE.Vector3(...upward);
   const middle = objects.reduce((sum, { center }) => sum.add(new THREE.Vector3(...center)), new THREE.Vector3());

@@ -1,5 +1,5 @@
-// Reads what the API takes - .npy, .npz, .ply, .pcd, .xyz, depth images - so that it can be shown.
-// What is sent to the server are the files themselves.
+// Reads the files that the API accepts - .npy, .npz, .ply, .pcd, .xyz, depth images - to show them.
+// The server receives the files themselves.
 
 import { PCDLoader } from "./vendor/PCDLoader.js";
 import { PLYLoader } from "./vendor/PLYLoader.js";
@@ -8,8 +8,8 @@ const CLOUD_ARRAYS = ["points", "normals", "colors", "segment_ids", "view_ids"];
 const FORMATS = ["npy", "npz", "ply", "pcd", "xyz"];
 
 /** A scene that can be shown and sent: `points` (N, 3), metres, NaN where there is no reading; `colors` (N, 3) from
- * 0 to 1, or null; `camera`, which is at the origin, or null; what is sent, a file `cloud` or else an `image` with depth,
- * intrinsics and depth_scale; and a `note` on where that file comes from, if it is not one of the user's.
+ * 0 to 1, or null; `camera`, which is at the origin, or null; the data to send, a file `cloud` or an `image` with
+ * depth, intrinsics and depth_scale; and a `note` on where that file comes from, if it is not one of the user's files.
  * @typedef {Object} Scene
  */
 /** The Scene of one cloud, or of a depth image with or without its colours, whose camera is given as text. */
@@ -37,7 +37,7 @@ export async function readScene(files, camera) {
   return { ...scene, points: position.array, colors: color ? fromLinear(color.array) : null };
 }
 
-/** The numbers of a text, separated by commas; NaN for a part that is none. */
+/** The numbers in a text, separated by commas; NaN for a part that is not a number. */
 export function listed(text) {
   return text.replace(/[[\]]/g, "").split(",").map((part) => (part.trim() ? Number(part) : NaN));
 }
@@ -46,7 +46,7 @@ function ending(file) {
   return file.name.split(".").pop().toLowerCase();
 }
 
-/** (N, 3) of an array (N, 3) or (H, W, 3). */
+/** The flat points of an array (N, 3) or (H, W, 3). */
 function points(array) {
   if (array.shape.at(-1) !== 3) throw new Error(`a cloud is (N, 3), this is (${array.shape}); a depth image needs its intrinsics beside it`);
   return Float32Array.from(array.values);
@@ -57,7 +57,7 @@ function readText(text) {
   return Float32Array.from(rows.filter((row) => row.length === 3).flat());
 }
 
-/** three.js makes colours linear; the page shows them as they are. */
+/** Undo three.js's conversion to linear colours: the page shows the colours of the file. */
 function fromLinear(values) {
   return values.map((v) => (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) - 0.055));
 }
@@ -83,7 +83,7 @@ async function readImages(images, camera) {
   return { name: depth.name, ...fromDepth(array, depth, pixels?.colors ?? null, camera) };
 }
 
-/** The fields of a Scene that a depth image (H, W) has. */
+/** The fields of a Scene made from a depth image (H, W). */
 function fromDepth(array, file, colors, { intrinsics, depth_scale }) {
   const given = listed(intrinsics);
   const [fx, fy, cx, cy] = given.length === 9 ? [0, 4, 2, 5].map((place) => given[place]) : given; // of a matrix
@@ -104,7 +104,7 @@ function fromDepth(array, file, colors, { intrinsics, depth_scale }) {
   return { points: found, colors, camera, cloud: null, image, note: "" };
 }
 
-/** Intrinsics are missing or wrong. */
+/** The camera's intrinsics are missing or wrong. */
 export class NeedsCamera extends Error {}
 
 async function readColors(file) {
@@ -122,7 +122,7 @@ async function readColors(file) {
   return { width, height, colors };
 }
 
-/** A greyscale PNG of 16 bits, which browsers would cut to 8. */
+/** Decode a 16-bit greyscale PNG, which browsers would reduce to 8 bits. */
 async function readDepthPng(buffer) {
   const view = new DataView(buffer);
   const [width, height] = [view.getUint32(16), view.getUint32(20)];

@@ -1,4 +1,4 @@
-// The page: what is asked, of the same API as anyone's, and what is shown of the answer.
+// The page: builds requests to the public API, and shows the answers.
 
 import { beside } from "./arm.js";
 import { NeedsCamera, listed, readScene } from "./files.js";
@@ -12,11 +12,11 @@ const REASONS = {
   suppressed: "near a better one", "beyond-top-k": "beyond top_k",
 };
 const BOX = ["center", "half_extents"];
-const FIELDS = { region: BOX, workspace: BOX, cone: ["direction"] }; // of shapes, typed as three numbers
+const FIELDS = { region: BOX, workspace: BOX, cone: ["direction"] }; // of each shape; three numbers each
 const $ = (id) => document.getElementById(id);
 const state = {
-  files: [], scene: null, answer: null, fresh: true, // answer: its grasps by score; fresh: the first of its scene
-  robots: [], shapes: {}, target: {}, objects: [], // of the request; target: options; objects: what it may be
+  files: [], scene: null, answer: null, fresh: true, // answer: grasps by score; fresh: the scene has no answer yet
+  robots: [], shapes: {}, target: {}, objects: [], // target: options of the request; objects: possible targets
   grippers: {}, gripper: null, chosen: null, busy: null, followed: null, // followed: `previous` of the next request
 };
 const view = picture();
@@ -61,12 +61,12 @@ async function openSample() {
   if (files && (await open(files))) await ask();
 }
 
-/** Read files and show them; whether that went well. */
+/** Read files and show them; returns whether that succeeded. */
 async function open(files) {
-  state.busy?.abort(); // its answer would be of another scene
+  state.busy?.abort(); // its answer would belong to another scene
   state.files = files;
   [state.answer, state.scene, state.fresh, state.target] = [null, null, true, {}];
-  if (!$("follow").checked) $("base").value = ""; // what is followed stays in its frame
+  if (!$("follow").checked) $("base").value = ""; // a followed scene keeps its frame
   const image = files.some(({ name }) => /\.png$/i.test(name));
   $("camera").hidden = !image;
   try {
@@ -123,7 +123,7 @@ function options() {
   return more ? { ...found, ...JSON.parse(more) } : found;
 }
 
-/** What the next image is to follow: a grasp of this answer, and its objects. */
+/** The option `previous` of the next request: a grasp of this answer, and its objects. */
 function previous(grasp) {
   const { tracking, objects } = state.answer;
   return {
@@ -197,7 +197,7 @@ function gripperOf(asked, model) {
   return state.grippers[asked.robot ? robot().gripper : asked.gripper || own] ?? state.grippers.panda;
 }
 
-/** What the API answers; its errors are thrown with their own words. */
+/** The API's answer; an error is thrown with the API's message. */
 async function call(path, { headers = {}, ...rest } = {}) {
   const token = $("token").value.trim();
   if (token) headers = { ...headers, authorization: `Bearer ${token}` };
@@ -218,7 +218,7 @@ function reach(...request) {
   });
 }
 
-/** Fill the list of models; whether the server answers. */
+/** Fill the lists of models and robots; returns whether the server answers. */
 async function listModels() {
   try {
     state.models = (await call("/v1/models")).models;
@@ -276,7 +276,7 @@ function line(grasp, row) {
   return item;
 }
 
-/** Show what the sliders let through. */
+/** Show the grasps that the sliders select. */
 function filter() {
   const [least, most] = [Number($("min_score").value), Number($("count").value)];
   $("min_score_value").textContent = least.toFixed(2);
@@ -337,7 +337,7 @@ function showReasons() {
   }));
 }
 
-/** The request as anyone would make it. */
+/** Show the same request as a curl command and as a Python program. */
 function showCode(asked) {
   const { cloud, image, note } = state.scene;
   const token = $("token").value.trim();
@@ -396,7 +396,7 @@ function isaacGrasps() {
   return JSON.stringify(rounded(file, 6), null, 1).replace('"format_version": 1,', '"format_version": 1.0,');
 }
 
-// The target: one object, or what is seen at a point
+// The target: one object, or the object at a point
 
 function showTargets() {
   const asked = state.target.objects?.include[0];
@@ -410,13 +410,13 @@ function showTargets() {
   }));
 }
 
-/** Ask for the grasps of a target: options; none: of all objects. */
+/** Ask for the grasps of a target, which is a set of options; empty: all objects. */
 function aim(target) {
   state.target = target;
   return ask();
 }
 
-/** Ask for the grasps of the object that is seen at a point, cloud frame. */
+/** Ask for the grasps of the object at a point, in the cloud frame. */
 function takePoint(point) {
   press(null);
   if (!point) return say("There is no point here; click on one of the cloud.", true);
@@ -426,7 +426,7 @@ function takePoint(point) {
   return aim({ near: rounded(point) });
 }
 
-// Shapes: region and workspace are boxes, the cone is one of directions
+// Shapes: region and workspace are boxes; the cone contains approach directions
 
 function setShape(name, shape) {
   if (shape) state.shapes[name] = shape;
@@ -438,7 +438,7 @@ function setShape(name, shape) {
   writeShape(name);
 }
 
-/** Put what the mouse made of a shape into its fields. */
+/** Copy a shape that was edited with the mouse into its fields. */
 function readShape(name) {
   Object.assign(state.shapes[name], view.shape(name));
   writeShape(name);
@@ -450,7 +450,7 @@ function writeShape(name) {
   for (const field of FIELDS[name]) $(`${name}_${field}`).value = shape[field].map((value) => +value.toFixed(4)).join(",");
 }
 
-/** Take a shape from its fields. */
+/** Set a shape from its fields. */
 function typeShape(name) {
   const shape = { ...state.shapes[name] };
   for (const field of FIELDS[name]) {
@@ -474,7 +474,7 @@ function takeDrawn(points) {
   say(`A box around ${points.length.toLocaleString("en")} points; move or resize it, then ask again.`);
 }
 
-/** Show which of the drawing and editing buttons is at work. */
+/** Show which of the drawing and editing buttons is active. */
 function press(button) {
   for (const each of document.querySelectorAll("[data-draw], [data-edit], #pick")) {
     each.setAttribute("aria-pressed", String(each === button));
@@ -524,7 +524,7 @@ for (const name of ["region", "workspace", "cone"]) {
 }
 document.addEventListener("click", ({ target, detail }) => {
   const { draw, edit, mode, clear, copy, look, save: kind } = target.dataset ?? {};
-  if (draw && state.scene && !detail) { // by the keyboard
+  if (draw && state.scene && !detail) { // pressed with the keyboard
     const around = view.boxAround([view.target ?? view.middle], draw === "region");
     setShape(draw, { ...around, half_extents: [0.05, 0.05, 0.05] });
     $(`${draw}_center`).focus();
@@ -552,7 +552,7 @@ for (const kind of ["dragover", "dragleave", "drop"]) {
   });
 }
 
-/** Files of the user: nothing of the sample's camera is theirs, but the next image is of the same camera. */
+/** Open the user's files; the camera's fields are kept only while following, which uses one camera. */
 async function take(files) {
   if (!files.length) return;
   if (!$("follow").checked) for (const field of ["intrinsics", "depth_scale", "viewpoint"]) $(field).value = "";
@@ -561,11 +561,11 @@ async function take(files) {
 }
 
 function copyText(text) {
-  const copied = navigator.clipboard?.writeText(text) ?? Promise.reject(); // no clipboard without TLS but on this machine
+  const copied = navigator.clipboard?.writeText(text) ?? Promise.reject(); // needs TLS, except on localhost
   return copied.then(() => say("Copied."), () => say("The browser does not allow copying.", true));
 }
 
-/** The numbers of a field; null where it is empty. */
+/** The numbers in a field; null if it is empty. */
 function typed(id, count) {
   const found = numbers($(id).value, count);
   if (found || !$(id).value.trim()) return found;

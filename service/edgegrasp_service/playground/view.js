@@ -1,6 +1,6 @@
-// What is seen: the cloud, the answer, and the shapes that the mouse edits.
+// The picture: the cloud, the answer, and the shapes that the mouse edits.
 //
-// Everything stands in `root`, which is turned so that the cloud's up is the picture's.
+// `root` contains everything; it is rotated so that the cloud's up direction points up in the picture.
 
 import * as THREE from "./vendor/three.module.min.js";
 import { OrbitControls } from "./vendor/OrbitControls.js";
@@ -10,16 +10,16 @@ import { TransformControls } from "./vendor/TransformControls.js";
 const UP = new THREE.Vector3(0, 0, 1);
 const MOST_POINTS = 500_000; // drawn; more would only hide each other
 const STEM = 0.04; // metres drawn behind the palm
-const NEAR = 10; // pixels from a hand or a point within which a click means it
+const NEAR = 10; // pixels; a click selects a hand or a point within this distance
 const CONE = 0.12; // metres, length of the approach cone
 const FRUSTUM = 0.06; // metres, length of the camera's pyramid
 const AXES = 0.1; // metres, length of the cloud's axes
 const HUES = { region: "#4cc9f0", workspace: "#f4f4f5", cone: "#ff9f1c" };
 const BOX = new THREE.BoxGeometry(1, 1, 1);
 const EDGES = new THREE.EdgesGeometry(BOX);
-const DARK = new THREE.LineBasicMaterial({ color: "#0a0d13" }); // hands stand out from things of any colour
+const DARK = new THREE.LineBasicMaterial({ color: "#0a0d13" }); // hands stand out from objects of any colour
 
-/** The colour of a score from 0 to 1: cyan to magenta, which things rarely have. */
+/** The colour of a score from 0 to 1: cyan to magenta, which objects rarely have. */
 export function colorOf(score) {
   const share = Math.min(Math.max(score, 0), 1);
   return new THREE.Color().setRGB(share, 1 - share, 1, THREE.SRGBColorSpace);
@@ -73,7 +73,7 @@ export class View {
     this._resize();
   }
 
-  /** Draw soon; many calls are one picture. */
+  /** Draw the next frame; many calls before it draw it once. */
   draw() {
     this._due ??= requestAnimationFrame(() => this._render());
   }
@@ -84,7 +84,7 @@ export class View {
     this._placeLabels();
   }
 
-  /** What is seen, as a PNG file. */
+  /** The picture as a PNG file. */
   picture() {
     this._render(); // a canvas can be read only in the task that drew it
     return new Promise((done) => this.canvas.toBlob(done));
@@ -144,7 +144,7 @@ export class View {
     this._showObjects([]);
   }
 
-  /** Draw points so large, pixels. */
+  /** Set the size of drawn points, in pixels. */
   setPointSize(size) {
     this.pointSize = size;
     const [points] = this.groups.cloud.children;
@@ -157,7 +157,7 @@ export class View {
     this.groups.frame.add(new THREE.AxesHelper(AXES));
     if (!this.eye) return;
     const { width, height, fx, fy } = camera ?? { width: 5, height: 4, fx: 5, fy: 5 };
-    const pyramid = new THREE.ConeGeometry(Math.SQRT1_2, 1, 4).rotateY(Math.PI / 4); // its tip goes to 0, open toward z
+    const pyramid = new THREE.ConeGeometry(Math.SQRT1_2, 1, 4).rotateY(Math.PI / 4); // tip at 0, open toward z
     const edges = new THREE.EdgesGeometry(pyramid.translate(0, -0.5, 0).rotateX(-Math.PI / 2));
     const frustum = new THREE.LineSegments(edges, new THREE.LineBasicMaterial({ color: "#f4f4f5" }));
     frustum.scale.set(width / fx, height / fy, 1).multiplyScalar(FRUSTUM);
@@ -166,11 +166,11 @@ export class View {
     this.groups.frame.add(frustum);
   }
 
-  /** Look at the objects from "camera", "top" or "side"; a camera that is not known is aslant. */
+  /** Look at the objects from "camera", "top" or "side"; "camera" is an oblique view if its position is unknown. */
   look(from) {
     const target = this._outside(this.target ?? this.middle);
     const eye = this._outside(this.eye ?? [0, 0, 0]);
-    const aside = eye.clone().sub(target).setZ(0); // cameras and robots are mostly there
+    const aside = eye.clone().sub(target).setZ(0); // most cameras and robots are on this side
     if (aside.length() < 0.1) aside.set(0.25, -0.7, 0);
     const far = Math.min(Math.max(1.9 * eye.distanceTo(target), 0.9), 1.5); // with the camera in view
     const [away, above] = { top: [0.001, far], side: [far, 0.02], camera: [0.75, 0.6] }[from];
@@ -181,12 +181,12 @@ export class View {
     this.draw();
   }
 
-  /** From the cloud's frame to the picture's. */
+  /** Transform a point from the cloud's frame to the picture's. */
   _outside(place) {
     return this.root.localToWorld(new THREE.Vector3(...place));
   }
 
-  /** Where a place of the cloud's frame is seen: pixels of the stage; z is over 1 behind the camera. */
+  /** Project a point of the cloud's frame to pixels of the stage; z exceeds 1 behind the camera. */
   _pixel(place) {
     const { clientWidth: width, clientHeight: height } = this.stage;
     const { x, y, z } = this.root.localToWorld(place.clone()).project(this.camera);
@@ -195,7 +195,7 @@ export class View {
 
   // The answer
 
-  /** Show the API's answer; look at what was found where it is the first of this scene. */
+  /** Show the API's answer; if it is the first of this scene, look at its objects. */
   showAnswer(answer, gripper, first) {
     this.gripper = gripper;
     this.hands = answer.grasps.map((grasp) =>
@@ -251,7 +251,7 @@ export class View {
     this.groups.plane.add(grid);
   }
 
-  /** Hands as thin lines, of poses `T_cloud_hand`: stem, palm and the fingers at their opening. */
+  /** Hands at poses `T_cloud_hand` as thin lines: stem, palm, and the fingers at their opening. */
   _lines(poses, width, look) {
     const [half, palm, tip] = [width / 2, this.gripper.palm_z, this.gripper.tip_z + this._advance(width)];
     const ends = [[0, palm - STEM], [0, palm], [-half, palm], [half, palm], [-half, palm], [-half, tip],
@@ -264,7 +264,7 @@ export class View {
     return new THREE.LineSegments(geometry, new THREE.LineBasicMaterial(look));
   }
 
-  /** How far swinging fingertips are ahead of where they are in the open gripper, metres. */
+  /** How far swinging fingertips advance along z compared with the open gripper, metres. */
   _advance(width) {
     const { swing, max_opening: open } = this.gripper;
     if (!swing) return 0;
@@ -273,7 +273,7 @@ export class View {
     return Math.sqrt(radius ** 2 - outward ** 2) - Math.sqrt(radius ** 2 - reach ** 2);
   }
 
-  /** The gripper's own boxes at a grasp, as collisions are checked with: the hand seen through, fingers not. */
+  /** The gripper's collision boxes at a grasp: the hand is transparent, the fingers are opaque. */
   _body(grasp, color) {
     const hand = new THREE.Group();
     const add = ([low, high], y, z, opacity) => {
@@ -301,7 +301,7 @@ export class View {
     this.draw();
   }
 
-  /** Draw one grasp's hand, both its points and the way in; null: none. */
+  /** Draw one grasp's hand, its approach and contact points and its approach direction; null: none. */
   choose(grasp) {
     const group = this.groups.chosen.clear();
     if (grasp) {
@@ -315,7 +315,7 @@ export class View {
     this.draw();
   }
 
-  /** Draw an arm of /v1/robots at its home; null: none. */
+  /** Draw an arm of /v1/robots in its home position; null: none. */
   showArm(robot, T_base_cloud) {
     this.groups.arm.clear();
     this.arm = null;
@@ -327,7 +327,7 @@ export class View {
     this.draw();
   }
 
-  /** Let the arm be at these joints, or follow a motion. */
+  /** Move the arm to these joint values, and stop its motion. */
   bendArm(joints) {
     if (!this.arm) return;
     this.arm.playing = null;
@@ -353,7 +353,7 @@ export class View {
 
   // Shapes to edit
 
-  /** Show a box (center, half_extents, quaternion) or the cone (direction, max_angle); null: take it away. */
+  /** Show a box (center, half_extents, quaternion) or the cone (direction, max_angle); null: remove it. */
   setShape(name, shape) {
     if (this.shapes[name]) {
       if (this.gizmo.object === this.shapes[name]) this.gizmo.detach();
@@ -381,7 +381,7 @@ export class View {
     return cone;
   }
 
-  /** What a shape is now: as `setShape` takes it, but for the cone's angle. */
+  /** The current shape, in the form that `setShape` takes, but without the cone's angle. */
   shape(name) {
     const made = this.shapes[name];
     if (name === "cone") return { direction: UP.clone().applyQuaternion(made.quaternion).toArray() };
@@ -392,7 +392,7 @@ export class View {
     };
   }
 
-  /** Let the mouse move, size or turn a shape; null: none. */
+  /** Let the mouse move, resize or rotate a shape; null: none. */
   edit(name, mode) {
     if (name && this.shapes[name]) {
       this.gizmo.attach(this.shapes[name]);
@@ -401,7 +401,7 @@ export class View {
     this.draw();
   }
 
-  /** The box around points of the cloud's frame, along its axes, or where `upright` the picture's. */
+  /** The box around points of the cloud's frame, along its axes, or along the picture's if `upright`. */
   boxAround(points, upright) {
     const turn = upright ? this.root.quaternion.clone() : new THREE.Quaternion();
     const box = new THREE.Box3();
@@ -416,14 +416,14 @@ export class View {
 
   // The mouse
 
-  /** Let the next drag draw a rectangle, whose points `tell.drawn` gets. */
+  /** Let the next drag draw a rectangle, and pass the points in it to `tell.drawn`. */
   startDrawing() {
     this.drawing = true;
     this.orbit.enabled = false;
     this.stage.classList.add("drawing");
   }
 
-  /** Let the next click mean a point of the cloud, which `tell.aimed` gets. */
+  /** Let the next click select a point of the cloud, and pass it to `tell.aimed`. */
   startAiming(on) {
     this.aiming = on;
     this.stage.classList.toggle("drawing", on);
@@ -458,7 +458,7 @@ export class View {
     });
   }
 
-  /** What lies under the mouse, nearest first. */
+  /** The intersections under the mouse, nearest first. */
   _under([x, y], objects) {
     const { clientWidth: width, clientHeight: height } = this.stage;
     const spread = 2 * Math.tan((this.camera.fov * Math.PI) / 360) / height; // of a pixel
@@ -475,13 +475,13 @@ export class View {
     return first ? this.hands.indexOf(first.object) : null;
   }
 
-  /** The point of the cloud that is seen at the mouse, cloud frame. */
+  /** The visible point of the cloud at the mouse, in the cloud frame. */
   _pointAt(place) {
     const [first] = this._under(place, this.groups.cloud.children);
     return first ? [...this.places.subarray(3 * first.index, 3 * first.index + 3)] : null;
   }
 
-  /** The points in a rectangle, pixels: of what is in front, and not of the plane. */
+  /** The nearest points in a rectangle in pixels, without those of the plane. */
   _within(start, end) {
     const box = new THREE.Box2().setFromPoints([new THREE.Vector2(...start), new THREE.Vector2(...end)]);
     const [grid] = this.groups.plane.children;
@@ -496,12 +496,12 @@ export class View {
       found.push({ distance: place.distanceTo(eye), point: place.toArray() });
     }
     found.sort((a, b) => a.distance - b.distance);
-    const nearest = found[Math.floor(found.length / 50)]?.distance ?? 0; // not a stray point
+    const nearest = found[Math.floor(found.length / 50)]?.distance ?? 0; // skips stray points
     return found.filter(({ distance }) => distance < nearest + 0.25).map(({ point }) => point);
   }
 }
 
-/** A shade for each z of a cloud without colours, so that its shape is seen. */
+/** A shade for each z of a cloud without colours, so that its shape is visible. */
 function greyOf(points) {
   const z = points.filter((value, i) => i % 3 === 2 && Number.isFinite(value)).sort();
   const [low, high] = [z[Math.floor(0.02 * z.length)], z[Math.floor(0.98 * z.length)]];

@@ -2,8 +2,8 @@
 
 Over HTTP a request is JSON, a point cloud file, or a form with parts, and an answer is JSON. A gRPC
 message is converted to the fields of the same request in JSON, so that one schema checks both.
-Every fault of a request is returned as a Problem. This module knows no event loops, connections or
-transports.
+Every error of a request is returned as a Problem. This module is independent of event loops,
+connections and transports.
 """
 
 import io
@@ -133,7 +133,7 @@ def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
             raise MemoryError(str(error)) from None
         problem = errors.report(error)
         facts.traceback = traceback.format_exc()
-        if work.options is not None:  # rows in it may be millions
+        if work.options is not None:  # its lists may have millions of rows
             facts.options = work.options.model_dump_json(exclude_defaults=True)[:2000]
     return Answer(b"", facts, problem)
 
@@ -150,7 +150,7 @@ class _Work:
     options: DetectOptions | None = None  # known once they are parsed
 
     def record_outcome(self) -> None:
-        """Append a tried grasp, the digest of its weights and the time to the outcomes' file."""
+        """Append a tried grasp, the digest of its weights and the time to the outcomes file."""
         kind, path = self.job.content_type, self.settings.outcomes_file
         if not kind.lower().startswith(JSON):  # foreign web pages cannot send it
             raise errors.UnsupportedMediaType("Content-Type", repr(kind[:40]), f"Send {JSON}.")
@@ -164,7 +164,7 @@ class _Work:
         recording.append_line(path, orjson.dumps(line) + b"\n")
 
     def detect(self, detector: Any, cloud: CloudInput, options: DetectOptions) -> Detection:
-        """Detect, and plan an arm's motions where the request names a robot."""
+        """Detect, and plan the arm's motions if the request names a robot."""
         asked, robot = options, None
         if asked.robot is not None:
             robots, name = load_robots(self.settings), asked.robot.name
@@ -250,8 +250,8 @@ def read_request(job: Job) -> dict[str, Any]:
     """The fields of a request.
 
     Returns:
-        The fields that were sent, as JSON, with bytes and arrays where a message has them, or as
-        File; `cloud` is a File; and `options`.
+        The fields that were sent, and `options`. A value is plain JSON, or a File (always for
+        `cloud`), or bytes or an array from a message.
 
     Raises:
         InvalidRequest: The body does not match its content type, has unknown fields or parts, or
@@ -294,7 +294,7 @@ def read_request(job: Job) -> dict[str, Any]:
 
 
 def write(transport: Transport, result: Detection | Scoring) -> bytes:
-    """A result as DetectionBody or ScoringBody, its floats exact float32 values; or as message."""
+    """Serialize a result as DetectionBody or ScoringBody, with exact float32, or as a message."""
     if transport == "http":
         return orjson.dumps(result, default=plain, option=orjson.OPT_PASSTHROUGH_DATACLASS)
     if isinstance(result, Detection):
@@ -376,7 +376,7 @@ def _parts(body: bytes, boundary: str, most: int) -> Iterator[tuple[str, str | N
     The format comes from a part's content type, else from its file name.
     """
     parser = MultiPartParser(
-        lambda **named: io.BytesIO(),  # type: ignore[arg-type]  # it is called so
+        lambda **named: io.BytesIO(),  # type: ignore[arg-type]  # always called with keywords
         max_form_memory_size=None,
         max_form_parts=most,
     )
@@ -416,7 +416,7 @@ def _fields_of_message(job: Job) -> dict[str, Any]:
 
 
 def _plain(value: Any, name: str) -> Any:
-    """A value as JSON has it, as bytes, or as File; `name` says where it is."""
+    """A value in its JSON form, as bytes, or as File; `name` is its path, for errors."""
     if not isinstance(value, Message):
         return value
     if len(unknown := UnknownFieldSet(value)):
@@ -492,7 +492,7 @@ def _gripper(message: grasp_pb2.GripperChoice, name: str) -> Any:
 
 
 def _tagged(message: Message, name: str) -> dict[str, Any]:
-    """The field of the oneof `kind` that is set, its name beside its fields."""
+    """The field of the oneof `kind` that is set: its name as `kind`, and its fields."""
     which = message.WhichOneof("kind")
     if which is None:
         return {}
@@ -507,7 +507,7 @@ def _unless_disabled(message: Message, name: str) -> dict[str, Any] | None:
     return None if fields.pop("disabled") else fields
 
 
-# Messages that JSON does not write field by field.
+# Messages whose JSON form is not an object with all of their fields.
 _FORMS: dict[type[Message], Callable[[Any, str], Any]] = {
     grasp_pb2.DetectGraspsRequest: _set_fields,
     grasp_pb2.ScoreGraspsRequest: _set_fields,

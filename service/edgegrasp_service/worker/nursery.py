@@ -42,7 +42,7 @@ def main(settings_json: str, load: Callable[[Settings], Any] | None = None) -> N
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the pool decides when to end
-    gc.disable()  # it would take a fifth of the start, and scan millions of lists of points later
+    gc.disable()  # it takes a fifth of the start-up, and would later scan millions of point lists
     from edgegrasp_service.worker.answer import load_catalogue  # takes most of the start
 
     pool, settings = socket.socket(fileno=0), Settings(**json.loads(settings_json))
@@ -69,7 +69,7 @@ def main(settings_json: str, load: Callable[[Settings], Any] | None = None) -> N
 
 
 def _tell_of_ended(pool: socket.socket) -> None:
-    with contextlib.suppress(OSError):  # there are no more
+    with contextlib.suppress(OSError):  # no children are left
         while (ended := os.waitpid(-1, os.WNOHANG))[0]:
             pool.send(ENDED.pack(*ended), socket.MSG_DONTWAIT)
 
@@ -79,7 +79,7 @@ def _loaded(pool: socket.socket, settings: Settings, load: Callable[[Settings], 
     try:
         return load(settings)
     except (EdgeGraspError, ModuleNotFoundError) as error:
-        with contextlib.suppress(OSError):  # another worker has told it
+        with contextlib.suppress(OSError):  # another worker has reported it already
             send(pool, Ready(os.getpid(), [], str(error)))
         sys.exit()
 
@@ -105,7 +105,7 @@ def _work(
                 return
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             send(pool, found)
-            del job, found  # otherwise they would add to the next request's
+            del job, found  # otherwise their memory would add to the next request's
             gc.collect()
 
 

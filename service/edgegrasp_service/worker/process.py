@@ -1,7 +1,7 @@
-"""Worker processes as the front has them: their messages, and the pool that runs jobs in them.
+"""Worker processes as the front sees them: their messages, and the pool that runs jobs in them.
 
 `WorkerPool` runs jobs, replaces dead processes and reloads. Its workers are forked by a `Nursery`,
-a process that runs `nursery.py`. A message has plain values as JSON, and a body as bytes.
+a process that runs `nursery.py`. A message consists of plain values as JSON and a body as bytes.
 """
 
 import asyncio
@@ -32,12 +32,12 @@ ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUM
 # Freed memory is kept for the next request: the system hands out new pages slowly.
 KEPT_MEMORY = {"MALLOC_TRIM_THRESHOLD_": str(2**26), "MALLOC_MMAP_THRESHOLD_": str(2**24)}
 
-MAX_DEATHS = 3  # dead workers after which a request is refused; a crash counts as so many
+MAX_DEATHS = 3  # dead workers after which a request is refused; a crash counts as this many
 CRASH_SIGNALS = {signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL}
 STATUS_SECONDS = 1.0  # seconds to learn how a worker ended
 START_SECONDS = 20.0  # seconds for a worker to fork, if it need not load
 BEAT_SECONDS = 3.0  # seconds between two checks that a worker is alive
-PULSE_SECONDS = 10.0  # seconds for it to answer
+PULSE_SECONDS = 10.0  # seconds for the worker to answer the check
 KILL_SECONDS = 0.5  # seconds that a worker may use to finish an abandoned job
 RETRY_SECONDS = 1.0  # seconds after a worker or the nursery failed to start
 
@@ -58,7 +58,7 @@ class Job:
 
     method: Method
     transport: Transport
-    body: bytes  # of HTTP, in the front a bytearray; or the serialized request message
+    body: bytes  # HTTP: the body, a bytearray in the front; gRPC: the serialized message
     remaining: float = 0.0  # seconds until its deadline at the time it was handed over
     content_type: str = ""  # HTTP: the header as sent
     query: str = ""  # HTTP: the query string, without the question mark
@@ -74,7 +74,7 @@ class Facts:
     grasps: int = 0  # returned, or evaluated if given by the caller
     seconds: dict[str, float] = field(default_factory=dict)  # of each stage, in order
     counts: dict[str, int] = field(default_factory=dict)  # what passed each stage
-    deaths: int = 0  # of workers, which the request caused
+    deaths: int = 0  # number of workers that the request killed
     options: str = ""  # options that differ from the defaults, as shortened JSON
     traceback: str = ""  # of an internal error
 
@@ -136,7 +136,7 @@ def receive(file: BinaryIO) -> Any:
 
 
 async def received(reader: asyncio.StreamReader) -> Any:
-    """As `receive`, in the front."""
+    """The same as `receive`, for the event loop of the front."""
     try:
         length, body_length = MESSAGE_HEADER.unpack(await reader.readexactly(MESSAGE_HEADER.size))
         return unpack(await reader.readexactly(length), await reader.readexactly(body_length))
@@ -156,13 +156,13 @@ async def _ready(reader: asyncio.StreamReader) -> Ready:
 
 
 class WorkerPool:
-    """Runs each job in a worker process of its own."""
+    """Runs each job in an idle worker process."""
 
     def __init__(
         self,
         settings: Settings,
         replaced: Callable[[], None],  # called for each worker that died
-        nursery: "Nursery | None",  # that loads already
+        nursery: "Nursery | None",  # one that is already loading
     ) -> None:
         self._settings = settings
         self.command: Sequence[str] = ()  # in place of NURSERY_COMMAND
@@ -173,7 +173,7 @@ class WorkerPool:
         self.size = settings.workers or len(os.sched_getaffinity(0))
         self._nursery: Nursery | None = None
         self._workers: set[_Worker] = set()
-        # Last in, first out: its caches are warm.
+        # Last in, first out: the caches of the latest worker are warm.
         self._idle: asyncio.LifoQueue[_Worker] = asyncio.LifoQueue()
         self._tasks: set[asyncio.Task[Any]] = set()
 
@@ -190,7 +190,7 @@ class WorkerPool:
     async def start(self) -> None:
         """Load weights and start workers; workers of an earlier start finish their request and end.
 
-        EdgeGraspError: weights cannot be used.
+        Raises EdgeGraspError if the weights cannot be used.
         """
         nursery = self._launched or Nursery(self._settings, self.command)
         self._launched = None
@@ -257,8 +257,8 @@ class WorkerPool:
         try:
             while True:
                 if worker not in self._workers:
-                    worker.close()  # there are newer ones
-                elif not worker.killed:  # its last answer may arrive after that
+                    worker.close()  # newer workers have replaced it
+                elif not worker.killed:  # the last answer may arrive after the kill
                     self._idle.put_nowait(worker)
                 answer = await received(worker.reader)
                 if answer is None:
@@ -313,7 +313,7 @@ class WorkerPool:
 
 
 class Nursery:
-    """The process that loads the weights and then forks workers; `command` in place of its own."""
+    """The process that loads the weights, then forks workers; `command` replaces its command."""
 
     def __init__(self, settings: Settings, command: Sequence[str] = ()) -> None:
         self._control, theirs = socket.socketpair()
@@ -322,7 +322,7 @@ class Nursery:
             words = [*(command or NURSERY_COMMAND), settings.model_dump_json()]
             self._process = subprocess.Popen(words, stdin=theirs.fileno(), env=environment)
         self._writer: asyncio.StreamWriter | None = None  # once it has loaded
-        # Whether each ended worker, by process id, ended by itself.
+        # By process id of an ended worker: whether it crashed or exited, not killed by the pool.
         self._crashed: defaultdict[int, asyncio.Future[bool]] = defaultdict(asyncio.Future)
 
     async def loaded(self) -> None:
@@ -376,7 +376,7 @@ class _Worker:
         self.ready = await _ready(self.reader)
 
     async def run(self, job: Job, deadline: float) -> Answer:
-        """Run a job until a deadline of the event loop's clock; if cancelled, soon kill it.
+        """Run a job until a deadline on the event loop's clock; if cancelled, kill the worker soon.
 
         The error of the answer is HarmfulRequest if the job killed the process, WorkerLost if it
         died for another reason.
@@ -385,7 +385,7 @@ class _Worker:
         answer = self.answer = loop.create_future()
         assert self._writer is not None
         try:
-            with contextlib.suppress(OSError):  # if it has died, that becomes the answer
+            with contextlib.suppress(OSError):  # the worker has died, which the answer reports
                 for part in pack(replace(job, remaining=deadline - loop.time())):
                     for place in range(0, len(part), PIECE_BYTES):
                         self._writer.write(memoryview(part)[place : place + PIECE_BYTES])
@@ -420,7 +420,7 @@ class _Worker:
 
 @contextlib.contextmanager
 def limited_memory(most: int) -> Iterator[None]:
-    """Limit this process to so many more bytes; allocations beyond that fail."""
+    """Limit this process to `most` bytes more than now; allocations beyond that fail."""
     before = resource.getrlimit(resource.RLIMIT_DATA)
     data_pages = int(Path("/proc/self/statm").read_text().split()[5])
     limit = data_pages * resource.getpagesize() + most

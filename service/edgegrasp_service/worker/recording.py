@@ -18,15 +18,15 @@ from edgegrasp_service.worker.process import Answer, Job, pack
 
 logger = logging.getLogger(__name__)
 
-MAX_LINE_BYTES = 4096  # bytes of an outcome, and more
-MAX_OUTCOMES_BYTES = 64 * 2**20  # bytes at which their file takes no more
+MAX_LINE_BYTES = 4096  # more than the bytes of one outcome
+MAX_OUTCOMES_BYTES = 64 * 2**20  # a file of outcomes larger than this takes no more
 
 
 class Recorder:
-    """Writes each request and its answer to a file TIME-ID.job, as the messages of a worker.
+    """Writes each request and its answer to a file TIME-ID.job, in the workers' message format.
 
     The oldest files are deleted beyond `most` bytes in total. `hold` reserves the bytes waiting to
-    be written and frees them (negative); requests it has no room for are not recorded.
+    be written and frees them (negative); a request for which there is no room is not recorded.
 
     Raises:
         InvalidSettings: The folder cannot be made or read.
@@ -94,8 +94,8 @@ class TriedGrasp(BaseModel):
 def append_line(path: Path, line: bytes) -> None:
     """Append a whole line or nothing; an incomplete last line is removed first.
 
-    Raises PayloadTooLarge where the file is full, DiskFull where the disk is, or it cannot be
-    written.
+    Raises PayloadTooLarge if the file is full, and DiskFull if the disk is full or the file cannot
+    be written.
     """
     try:
         with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o644), "r+b", buffering=0) as file:
