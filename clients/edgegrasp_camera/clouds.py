@@ -25,8 +25,8 @@ class CloudInput:
     normals: object | None = None  # like points, outward, any length; used as given
     colors: object | None = None  # like points; checked, but not used by any network
     segment_ids: object | None = None  # (N,) or (H, W) integers
-    view_ids: object | None = None  # (N,) or (H, W) integers: which of options.viewpoint saw it
-    viewpoint: Any = None  # as images and files have it: (x, y, z) of the camera, or of several
+    view_ids: object | None = None  # (N,) or (H, W) integers: index into options.viewpoint
+    viewpoint: Any = None  # (x, y, z) of the camera or of several, from images or the file
     warnings: tuple[str, ...] = ()  # warnings from reading it, for the answer
 
 
@@ -60,15 +60,15 @@ def too_many(count: int, max_points: int, field: str = "cloud") -> PayloadTooLar
 
 # Records of numbers: points of PLY and PCD files and of PointCloud2
 
-PCL_FIELDS = ("x", "y", "z", "normal_x", "normal_y", "normal_z", "rgb", "rgba")  # that are read
+PCL_FIELDS = ("x", "y", "z", "normal_x", "normal_y", "normal_z", "rgb", "rgba")  # all fields read
 
 
 def cloud_of_records(rows: Records) -> CloudInput:
-    """A cloud of points whose fields are named as PCL and ROS name them.
+    """A cloud of points whose fields have the names of PCL and ROS.
 
     Args:
         rows: (N,) or (H, W) with fields x, y, z; normal_x, normal_y, normal_z, and rgb or rgba
-            (packed in 4 bytes) or red, green, blue, where there are any.
+            (packed in 4 bytes) or red, green, blue, if present.
     """
     colors = _stacked(rows, "red", "green", "blue")
     for name in ("rgb", "rgba"):
@@ -82,7 +82,7 @@ def cloud_of_records(rows: Records) -> CloudInput:
 
 
 def _stacked(rows: Records, *names: str) -> Array | None:
-    """Fields of the rows side by side; None if one is missing."""
+    """Fields of the rows, stacked along a new last axis; None if one is missing."""
     if not {*names} <= {*(rows.dtype.names or ())}:
         return None
     return np.stack([rows[name] for name in names], axis=-1)
@@ -141,5 +141,5 @@ def _record(cloud: PointCloud2) -> np.dtype[Any]:
     size = cloud.point_step
     try:
         return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
-    except ValueError as error:  # a name that is there twice
+    except ValueError as error:  # a duplicate name
         raise InvalidRequest("point_cloud2.fields", str(error), fix) from None

@@ -12,15 +12,15 @@ from edgegrasp_camera import InvalidRequest
 from edgegrasp_camera.arrays import Array, Float32, Float64
 from edgegrasp_camera.clouds import CloudInput
 
-ENCODINGS = {"32FC1": "<f4", "64FC1": "<f8", "16UC1": "<u2"}  # as sensor_msgs/Image has them
-MILLIMETRE = 0.001  # metres for one unit of whole numbers
-FOCAL_LENGTH_RANGE = 0.1, 20.0  # shares of the image's size: 157 and 3 degrees
-MAX_OFF_CENTRE = 0.15  # share of the width or height that a principal point may lie off the middle
+ENCODINGS = {"32FC1": "<f4", "64FC1": "<f8", "16UC1": "<u2"}  # names from sensor_msgs/Image
+MILLIMETRE = 0.001  # metres per unit of integer depths
+FOCAL_LENGTH_RANGE = 0.1, 20.0  # shares of the image's size: fields of view of 157 and 3 degrees
+MAX_OFF_CENTRE = 0.15  # greatest offset of the principal point, as share of the width or height
 MAX_PIXEL_ASPECT = 1.5  # ratio of the focal lengths; no real pixel is that elongated
 
 
 class Intrinsics(NamedTuple):
-    """Of a camera without distortion, pixels."""
+    """Intrinsics of a camera without distortion, pixels."""
 
     fx: float
     fy: float
@@ -29,11 +29,11 @@ class Intrinsics(NamedTuple):
 
 
 class DepthView(NamedTuple):
-    """How a camera saw an image of depths."""
+    """The camera of a depth image: its intrinsics, pose and depth unit."""
 
     intrinsics: Intrinsics
     T_cloud_camera: Any = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))  # (4, 4)
-    depth_scale: float | None = None  # metres for one unit; None: 0.001 of whole numbers, 1 else
+    depth_scale: float | None = None  # metres per unit; None: 0.001 for integers, 1 for floats
 
 
 def intrinsics_of(value: Any) -> Intrinsics:
@@ -42,7 +42,7 @@ def intrinsics_of(value: Any) -> Intrinsics:
     The numbers are not checked.
 
     Raises:
-        ValueError: It is none of these.
+        ValueError: The value has none of these forms.
     """
     if isinstance(value, Mapping) and {*value} == {*Intrinsics._fields}:
         return Intrinsics(**value)
@@ -59,9 +59,9 @@ def intrinsics_of(value: Any) -> Intrinsics:
 def metres(depth: Array, scale: float | None = None, field: str = "depth") -> Float32:
     """Depths of an image (H, W) or (H, W, 1) in metres, (H, W); NaN where there is no reading.
 
-    No reading is 0, NaN or infinity. `scale` is metres for one unit; None: 0.001 of whole numbers,
-    1 of floats. Raises InvalidRequest, which names `field`, for what is no image of depths, and for
-    negative ones.
+    A missing reading is 0, NaN or infinity. `scale` is metres per unit; None: 0.001 for integers,
+    1 for floats. Raises InvalidRequest, which names `field`, if it is not a depth image or has
+    negative depths.
     """
     if depth.shape[2:] == (1,):
         depth = depth[..., 0]
@@ -69,10 +69,10 @@ def metres(depth: Array, scale: float | None = None, field: str = "depth") -> Fl
     if depth.ndim != 2 or 0 in depth.shape or not (whole or depth.dtype.kind == "f"):
         fix = "Send an image (H, W) of uint16 or of floats."
         raise InvalidRequest(field, f"shape {depth.shape}, dtype {depth.dtype}", fix)
-    with np.errstate(over="ignore"):  # infinite is no reading
+    with np.errstate(over="ignore"):  # infinity is a missing reading
         found = depth.astype(np.float32)
         found *= scale or (MILLIMETRE if whole else 1.0)
-    below = (found < 0) & (found > -np.inf)  # ROS and ZED have -inf where something is too near
+    below = (found < 0) & (found > -np.inf)  # ROS and ZED use -inf for surfaces that are too near
     if below.any():
         worst = float(found[below].min())
         raise InvalidRequest(field, f"{worst:g} m", "Send 0 or NaN where there is no reading.")
@@ -83,7 +83,7 @@ def metres(depth: Array, scale: float | None = None, field: str = "depth") -> Fl
 def unproject(depth: Float32, camera: Intrinsics, T_cloud_camera: Float64 | None = None) -> Float32:
     """The points (H, W, 3) of depths (H, W) in metres; NaN stays NaN.
 
-    They are in the frame of the pose (4, 4), without one in the camera's.
+    They are in the cloud frame of the pose (4, 4); without a pose, in the camera frame.
     """
     pose = np.eye(4) if T_cloud_camera is None else T_cloud_camera
     level = (np.arange(depth.shape[1]) - camera.cx) / camera.fx
@@ -103,12 +103,12 @@ def fuse_depth_images(depths: Sequence[Array], views: Sequence[Any]) -> CloudInp
 
     Args:
         depths: As for `metres`.
-        views: The camera of each, as DepthView has it.
+        views: The camera of each, with the fields of DepthView.
 
     Returns:
         A cloud whose rows are the pixels, image after image, NaN without a reading: (H, W, 3) for
-        one image, (1, N, 3) with the view of each point for several; its viewpoint is where the
-        cameras stand, and doubts about them are in its warnings.
+        one image, (1, N, 3) with the view of each point for several. Its viewpoint contains the
+        cameras' positions, and its warnings any doubts about the cameras.
 
     Raises:
         InvalidRequest: An array is not a depth image or does not fit its camera; names
@@ -138,10 +138,10 @@ def fuse_depth_images(depths: Sequence[Array], views: Sequence[Any]) -> CloudInp
 
 
 def _intrinsics_warnings(camera: Intrinsics, shape: tuple[int, ...], field: str) -> Iterator[str]:
-    """Doubts about intrinsics for images (H, W), as sentences; InvalidRequest: impossible ones."""
+    """Warnings of doubtful intrinsics for an image (H, W); raises InvalidRequest if impossible."""
     height, width = shape
     image = f"an image of {width} x {height} pixels"
-    fix = "Send those of this very image: where it was scaled, scaled with it. Do not crop it."
+    fix = "Send the intrinsics of this image; if it was scaled, scale them too. Do not crop it."
     axes = (("x", width, camera.fx, camera.cx), ("y", height, camera.fy, camera.cy))
     for axis, size, focal, centre in axes:
         if not -0.5 <= centre <= size - 0.5:
@@ -149,7 +149,7 @@ def _intrinsics_warnings(camera: Intrinsics, shape: tuple[int, ...], field: str)
         if not FOCAL_LENGTH_RANGE[0] <= focal / size <= FOCAL_LENGTH_RANGE[1]:
             raise InvalidRequest(f"{field}.f{axis}", f"{focal:g} for {image}", fix)
         if abs(centre - (size - 1) / 2) > MAX_OFF_CENTRE * size:
-            yield f"{field}: c{axis} {centre:g} lies far from the middle of {image}: is it theirs?"
+            yield f"{field}: c{axis} {centre:g} is far from the middle of {image}. Is it correct?"
     if not 1 / MAX_PIXEL_ASPECT <= camera.fx / camera.fy <= MAX_PIXEL_ASPECT:
         value = f"fx {camera.fx:g} and fy {camera.fy:g}"
         raise InvalidRequest(field, value, "Send fx, fy, cx, cy in this order, in pixels.")

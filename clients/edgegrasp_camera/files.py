@@ -27,28 +27,28 @@ from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
 
 MAX_HEADER = 65536  # bytes of a PLY or PCD header; each line takes 50 times its size to read
 MAX_NPY_HEADER = 1024  # bytes; deeply nested brackets would exhaust the memory of Python's parser
-MAX_CHUNKS = 4096  # of a PNG file, however small they are
-MAX_LINE = 65536  # most bytes of a line of numbers; reading it takes 15 times its size
+MAX_CHUNKS = 4096  # chunks of a PNG file, of any size
+MAX_LINE = 65536  # maximum bytes of a line of numbers; reading it takes 15 times its size
 MAX_UNPACKED = 256 * 2**20  # bytes; compressed data may claim a hundred times its own size
 MAX_MEMBERS = 64  # of an .npz file, which has 5 arrays at most
-ZIP_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others can take any memory
+ZIP_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others can take unlimited memory
 OBJECT_ADDRESS = re.compile(r" at 0x[0-9a-f]+")  # an object's address, in a library's message
 
 FIXES = {
     "npy": "Send what numpy.save(file, points) writes, points of shape (N, 3).",
-    "npz": "Send what numpy.savez(file, points=points) writes, or depth and intrinsics; beside "
-    "them may stand rgb, or normals, colors, segment_ids and view_ids.",
+    "npz": "Send what numpy.savez(file, points=points) writes, or depth and intrinsics; optional "
+    "arrays are rgb, or normals, colors, segment_ids and view_ids.",
     "ply": "Send a whole PLY file with vertices of float x, y, z.",
     "pcd": "Send a whole PCD file with the fields x, y and z.",
-    "xyz": "Send lines of three numbers: x y z in metres. Normals and colours go into a .ply file.",
+    "xyz": "Send lines of three numbers: x y z in metres. Use .ply for normals and colours.",
 }
 FILE_FORMATS = tuple(FIXES)
 NPZ_CLOUD = {"points", "normals", "colors", "segment_ids", "view_ids"}
-NPZ_IMAGE = {"depth", "intrinsics"}  # of a camera whose frame is the cloud's
+NPZ_IMAGE = {"depth", "intrinsics"}  # the cloud is in the camera frame
 
 
 def read_file(file_format: str, data: bytes, max_points: int) -> CloudInput:
-    """Read a point cloud file: its arrays, of whatever shape and dtype, in native byte order.
+    """Read a point cloud file: its arrays, of any shape and dtype, in native byte order.
 
     Points are (N, 3) for ply and xyz, (N, 3) or (H, W, 3) for pcd.
 
@@ -89,9 +89,9 @@ def _reading(field: str, file_format: str, size: int, fix: str) -> Iterator[None
 
 
 def read_npy(data: bytes, max_points: int, field: str = "cloud") -> Array:
-    """Read the array of an .npy file, of whatever shape and dtype, in native byte order.
+    """Read the array of an .npy file, of any shape and dtype, in native byte order.
 
-    A row, or a pixel, counts as one point; `field` is what the file is in the request.
+    A row or a pixel counts as one point; `field` is the name of the file in the request.
 
     Raises:
         InvalidRequest: The file is truncated, or not a .npy file of numbers.
@@ -191,7 +191,7 @@ def read_png(data: bytes, max_points: int, field: str) -> Array:
 
 
 def _read_header(data: bytes, last: re.Pattern[bytes]) -> tuple[list[list[str]], re.Match[bytes]]:
-    """The words of the header's lines, and the offset of its end."""
+    """The words of the header's lines, and the match of its last line."""
     end = last.search(data[:MAX_HEADER])
     if end is None:
         raise ValueError("no header")
@@ -213,7 +213,7 @@ def _record(fields: Iterable[tuple[str, str, int]], order: str) -> np.dtype[Any]
 def _read_records(
     body: bytes, record: np.dtype[Any], count: int, max_points: int, encoding: str
 ) -> Records:
-    """Read `count` records, after checking that the body holds as many."""
+    """Read `count` records, after checking that the body contains as many."""
     if count > max_points:
         raise too_many(count, max_points)
     if encoding == "binary_compressed":

@@ -1,7 +1,7 @@
 """Pictures of clouds and the grasps found in them, drawn without a screen.
 
-A picture is drawn through a pinhole camera: the one that took the cloud, over its image if there is
-one, or else one at the same position.
+A picture is drawn through a pinhole camera: the camera that took the cloud, over its image if there
+is one, or else a camera at the same position.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,13 +19,13 @@ from edgegrasp_camera.clouds import CloudInput
 PANDA_Z = (0.0658, 0.1122)  # metres along the hand's z: the palm's surface, the fingertips
 STEM_LENGTH = 0.03  # metres drawn behind the palm, to show the approach
 FORK_WIDTH = 0.005  # metres, thickness of a fork
-FORK_POINTS = (2.0, 7.0)  # the same in points, least and most
+FORK_POINTS = (2.0, 7.0)  # minimum and maximum of this thickness on paper, points
 HIDDEN_DEPTH = 0.006  # metres behind the cloud from which a fork is drawn as hidden
 MAX_DRAWN = 10  # grasps in a picture of a request
-SHOWN_DISTANCE = 0.4  # metres from these: what a picture of a cloud shows
+SHOWN_DISTANCE = 0.4  # metres around the grasps that a picture of a cloud shows
 MAX_LABELLED = 5  # grasps that are labelled with their rank
 CLOUD_PICTURE_SIZE = (960, 1280)  # rows and columns of a picture of a cloud without an image
-MIN_SHOWN_EXTENT = 0.25  # metres across, of what such a picture shows
+MIN_SHOWN_EXTENT = 0.25  # metres, minimum width of the scene in such a picture
 MAX_GAP_PIXELS = 8  # largest gap between points that is closed, pixels
 WIDTH, DPI = 10.0, 130  # inches, dots per inch
 CAPTION_INCHES = 0.75  # inches below the picture: title and scale
@@ -41,7 +41,7 @@ class View:
     """A pinhole camera: column = fx * x / z + cx, row = fy * y / z + cy in its own frame."""
 
     shape: tuple[int, int]  # rows and columns of its image
-    fx: float  # pixels, as the next three; negative where the cloud's z points backward
+    fx: float  # pixels, like the next three; negative if the cloud's z points backward
     fy: float
     cx: float
     cy: float
@@ -50,7 +50,7 @@ class View:
 
     @classmethod
     def of(cls, points: ArrayLike, eye: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Self:
-        """A camera at `eye` (3,) whose image holds most of the points (N, 3)."""
+        """A camera at `eye` (3,) whose image contains most of the points (N, 3)."""
         seen = np.asarray(points, dtype=np.float64)
         (rows, columns), position = CLOUD_PICTURE_SIZE, np.asarray(eye, dtype=np.float64)
         z = np.median(seen, axis=0) - position
@@ -95,7 +95,7 @@ class View:
         """(H, W) the row of the nearest point seen at each pixel; -1 where there is no point."""
         pixels, depth = self.project(points)
         seen = np.flatnonzero(np.isfinite(pixels).all(axis=1) & (depth > 0.0))
-        seen = seen[np.argsort(-depth[seen], kind="stable")]  # nearer ones over others
+        seen = seen[np.argsort(-depth[seen], kind="stable")]  # near points cover distant points
         rows, columns = self.shape
         column, row = np.clip(np.rint(pixels[seen]), -1e6, 1e6).astype(np.int64).T
         within = ((row >= 0) & (row < rows) & (column >= 0) & (column < columns)).sum()
@@ -104,7 +104,7 @@ class View:
         around = np.arange(-spread, spread + 1)
         column = np.add.outer(column, np.tile(around, len(around)))
         row = np.add.outer(row, np.repeat(around, len(around)))
-        image = np.full((rows + 1, columns + 1), -1)  # with a border, which takes what is outside
+        image = np.full((rows + 1, columns + 1), -1)  # with a border for points outside the image
         image[np.clip(row, -1, rows), np.clip(column, -1, columns)] = seen[:, None]
         return image[:-1, :-1]
 
@@ -147,7 +147,7 @@ class Picture:
     def _shaded(self, depth: Float64) -> Float64:
         """(H, W, 3) the cloud in greys."""
         rows, columns = self.view.shape
-        for _ in range(SMOOTHING_PASSES):  # over the noise of the camera
+        for _ in range(SMOOTHING_PASSES):  # removes the noise of the camera
             around = np.pad(depth, 1, mode="edge")
             parts = [around[y : y + rows, x : x + columns] for y, x in np.ndindex(3, 3)]
             near = [np.where(np.abs(part - depth) < HIDDEN_DEPTH, part, depth) for part in parts]
@@ -161,7 +161,7 @@ class Picture:
             self._axes.contour(mask, [0.5], colors="white", linewidths=1.0)
 
     def regions(self, options: Mapping[str, Any]) -> None:
-        """Draw the workspace and the boxes and balls of the regions of a request's options."""
+        """Draw the workspace and the boxes and spheres of the regions in a request's options."""
         workspace = options.get("workspace")
         drawn: list[Any] = [({"kind": "box", **workspace}, "-")] if workspace else []
         for name in ("approach_region", "contact_region"):
@@ -176,7 +176,7 @@ class Picture:
     def grasps(self, grasps: Sequence[Any], palm_and_tip: tuple[float, float] = PANDA_Z) -> None:
         """Draw a fork for every grasp, the best last, and the scale of their scores.
 
-        They have a score, a T_cloud_hand (4, 4) and a width in metres, as the server's have.
+        Like a server's grasps, they have a score, a T_cloud_hand (4, 4) and a width in metres.
         """
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import Normalize
@@ -216,22 +216,22 @@ class Picture:
                 self._axes.plot(x, y, color=shade, linewidth=width, alpha=alpha, solid_capstyle=cap)
 
     def save(self, path: Path | BinaryIO) -> None:
-        """Write it: a `.png` or `.jpg` file, whose folder must exist, or a PNG to a stream."""
+        """Write a `.png` or `.jpg` file, whose folder must exist, or a PNG to a stream."""
         self._figure.savefig(path)
 
 
 def draw_detection(
-    path: Path | BinaryIO,  # `.png` or `.jpg` file to write, or where to write a PNG
+    path: Path | BinaryIO,  # `.png` or `.jpg` file to write, or a stream for a PNG
     detection: Any,  # the answer, of a client or of a detector
     sent: CloudInput,  # the cloud of the request
     options: Mapping[str, Any],  # of the request: its regions are drawn
-    colors: Array | None = None,  # as `CloudInput.colors`; None: those of the cloud, if any
-    from_above: bool = False,  # whether to look from above, whatever the cloud
+    colors: Array | None = None,  # like `CloudInput.colors`; None: the cloud's colours, if any
+    from_above: bool = False,  # whether to draw any cloud from above
 ) -> None:
     """Write a picture of a request and the best of its grasps.
 
-    An organised cloud is drawn as its camera saw it, in its colours if given; any other cloud from
-    its viewpoint, or obliquely from above.
+    An organised cloud is drawn from its camera, in its colours if given; any other cloud is drawn
+    from its viewpoint, or obliquely from above.
     """
     points = np.asarray(sent.points)
     flat, shown, image = points.reshape(-1, 3), detection.grasps[:MAX_DRAWN], None
@@ -262,7 +262,7 @@ def draw_detection(
 
 
 def shaded(depth: Floats, fx: float, fy: float) -> Float64:
-    """Brightness (H, W), 0 to 1, of a depth image lit by a lamp over the camera.
+    """Brightness (H, W), 0 to 1, of a depth image lit from above the camera.
 
     `depth` is (H, W) metres along the line of sight, NaN where there is nothing; fx and fy pixels.
     """
@@ -278,8 +278,8 @@ def fork(
 ) -> Float64:
     """A gripper's outline as four line pieces (4, 2, 3), cloud frame: stem, palm, both fingers.
 
-    `width` is metres between the fingers' inner faces; `palm_and_tip` are metres along the hand's z
-    of the palm's surface and of the fingertips.
+    `width` is the distance between the fingers' inner faces in metres; `palm_and_tip` are the
+    positions of the palm's surface and of the fingertips along the hand's z, metres.
     """
     half, (palm, tip) = width / 2, palm_and_tip
     in_hand = [
@@ -293,7 +293,7 @@ def fork(
 
 
 def _lines_of(shape: Mapping[str, Any]) -> Iterator[Float64]:
-    """Edges of a box, or circles of a ball, as lines (K, 3); nothing of other shapes."""
+    """Edges of a box, or circles on a sphere, as lines (K, 3); nothing for other shapes."""
     kind = shape.get("kind")
     if kind == "sphere":
         angle = np.linspace(0, 2 * np.pi, 60)

@@ -36,44 +36,44 @@ class DetectorFlags(Connection):
     """The flags that choose a server, or a detector in this process."""
 
     server: str | None = None
-    """host:port (gRPC) or http://host:port; without it, in this process"""
+    """host:port (gRPC) or http://host:port; default: detect in this process"""
     weights: tuple[Path, ...] = ()
-    """Weights file or folder besides those that ship, without a server"""
+    """Weights file or folder, in addition to the built-in weights; only without --server"""
     grippers: tuple[Path, ...] = ()
-    """Gripper file (.toml), without a server"""
+    """Gripper file (.toml); only without --server"""
     device: str = "cpu"
-    """auto, cpu, cuda or cuda:N, without a server"""
+    """auto, cpu, cuda or cuda:N; only without --server"""
 
 
 class DetectFlags(DetectorFlags):
-    """The flags of `edgegrasp detect` besides the options of the detection."""
+    """The flags of `edgegrasp detect` other than the options of the detection."""
 
     depth: tuple[Path, ...] = ()
-    """Depth image in place of a cloud: .png of 16 bits, or .npy; repeatable"""
+    """Depth image instead of a cloud: 16-bit .png, or .npy; repeatable"""
     intrinsics: tuple[str, ...] = ()
     """Camera of --depth: fx,fy,cx,cy in pixels, or its 3 x 3 matrix as JSON"""
     pose: tuple[str, ...] = ()
     """Pose of the camera of each --depth in the cloud's frame: 4 x 4 matrix as JSON"""
     depth_scale: float | None = None
-    """Metres for one unit of --depth (0.001; for floats 1)"""
+    """Metres per unit of --depth (0.001; for floats 1)"""
     color: Path | None = None
-    """Colours of the same pixels: .png or .npy"""
+    """Colour image with the same pixels: .png or .npy"""
     mask: Path | None = None
-    """Grasp only where this is not 0: .png or .npy, same pixels"""
+    """Mask with the same pixels: grasp only where it is not 0; .png or .npy"""
     picture: Path | None = None
     """Picture of the best grasps to write, .png or .jpg"""
     robot: str | None = None
-    """Robot of the server by name; without --server, one that ships, or a file"""
+    """Name of a robot of the server; without --server: of a built-in robot, or a file"""
     joints: str | None = None
-    """The robot's joints now: j1,j2,… in radians"""
+    """The robot's current joints: j1,j2,… in radians"""
     base: str | None = None
-    """T_base_cloud, its 16 numbers row by row, or the 4 x 4 matrix as JSON"""
+    """T_base_cloud: 16 numbers row by row, or the 4 x 4 matrix as JSON"""
     place: str | None = None
     """Where to put the object, base frame: {"region": {"min": …, "max": …}} or T_base_object"""
     avoid_unseen: bool = False
-    """The arm avoids the space behind surfaces that no camera saw"""
+    """Whether the arm avoids the unseen space behind surfaces"""
     trajectory: Path | None = None
-    """JSON file to write the arm's motion to the best pick to"""
+    """JSON file to write: the arm's motion for the best pick"""
 
 
 @takes_flags(options=option_flags("robot", "previous"))
@@ -81,7 +81,7 @@ def detect(
     file: Annotated[
         Path | None, Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
     ] = None,
-    as_document: Annotated[bool, Option("--json", help="Print JSON, as the HTTP API.")] = False,
+    as_document: Annotated[bool, Option("--json", help="Print the HTTP API's JSON.")] = False,
     options_file: Annotated[
         Path | None, Option("--options", help="JSON file with options; flags override it.")
     ] = None,
@@ -91,7 +91,7 @@ def detect(
 ) -> None:
     """Find grasps in a point cloud file or a depth image, on a server or in this process.
 
-    Options are written as in query parameters of the HTTP API: numbers, words, x,y,z, or JSON.
+    Options have the form of the HTTP API's query parameters: numbers, words, x,y,z, or JSON.
 
     edgegrasp detect cloud.ply --viewpoint 0,0,0 --picture grasps.png
 
@@ -105,7 +105,7 @@ def detect(
     _check_outputs(asked, fields)
     images = _depth_images(file, asked)
     colors = None if asked.color is None else np.atleast_3d(pixels(asked.color))
-    if colors is not None:  # (H, W, 3); a grey image's are equal in all three
+    if colors is not None:  # (H, W, 3); a grey image gets three equal channels
         colors = colors[..., :3] if colors.shape[2] > 2 else colors[..., [0, 0, 0]]
     if asked.mask is not None:
         from edgegrasp_client import on_mask
@@ -128,7 +128,7 @@ def detect(
 
 @takes_flags()
 def models(*, asked: DetectorFlags) -> None:
-    """List the weights that can be used, here or on a server."""
+    """List the available weights, in this process or on a server."""
     names = (Column(name, no_wrap=True) for name in ("model", "architecture"))
     table = Table(*names, "parameters", "gripper", "device", box=box.SIMPLE)
     with Console(stderr=True).status("Loading weights…"), open_client(asked) as client:
@@ -142,7 +142,7 @@ def models(*, asked: DetectorFlags) -> None:
 def open_client(asked: DetectorFlags) -> AbstractContextManager[Any]:
     """A client of a server, or an OwnDetector if no server is given."""
     if asked.server:
-        # benchmark-real judges with the geometry of the server's grippers.
+        # benchmark-real needs --grippers too, to judge the server's grasps.
         alone = {"weights", "device"} | ({"grippers"} if isinstance(asked, DetectFlags) else set())
         for name in sorted(asked.model_fields_set & alone):
             raise ValueError(f"--{name}: got --server beside it. Set it at the server.")
@@ -160,7 +160,7 @@ class OwnDetector:
     robot: str | None = None  # a name or file, in place of the name in a request
 
     def detect(self, cloud: Any = None, **asked: Any) -> Any:
-        """Find grasps in a cloud, as `GraspClient.detect`; raises also as the detector."""
+        """Find grasps like `GraspClient.detect`; also raises the errors of the detector."""
         sent, parsed = decoded(cloud, asked)
         detector = self._catalogue.get(parsed.model)
         if parsed.robot is None:
@@ -173,7 +173,7 @@ class OwnDetector:
         return plan_picks(detection, prepared.scene, parsed, robot)
 
     def close(self) -> None:
-        """Do nothing; a client would close its connection."""
+        """Do nothing; there is no connection to close."""
 
     def models(self) -> "list[Model]":
         """The weights that are available."""
@@ -189,7 +189,7 @@ class OwnDetector:
 
 
 def decoded(cloud: Any, asked: Mapping[str, Any]) -> tuple[CloudInput, DetectOptions]:
-    """The cloud and the options of a request, as a server reads them."""
+    """The cloud and the options of a request, decoded as on a server."""
     from edgegrasp_client.requests import Request, cloud_file
 
     request = Request(cloud, asked)
@@ -235,7 +235,7 @@ def _robot_option(asked: DetectFlags) -> dict[str, Any]:
     if missing:
         raise ValueError(f"{missing[0]}: got nothing. Give {', '.join(given)} together.")
     joints = value_of_text("--joints", str(asked.joints))
-    joints = joints if isinstance(joints, list) else [joints]  # of an arm with one
+    joints = joints if isinstance(joints, list) else [joints]  # an arm with one joint
     pose = value_of_text("--base", str(asked.base))
     robot = {"name": asked.robot, "joints": joints, "T_base_cloud": pose}
     robot["avoid_unseen"] = asked.avoid_unseen
@@ -248,7 +248,7 @@ def _write_trajectory(file: Path, detection: Any) -> None:
     """Write the best pick and its trajectory; raises ValueError if there is none."""
     best = detection.best_pick
     if best is None or best.arm.trajectory is None:
-        raise ValueError(f"--trajectory: the arm has no way to any grasp ({_counts(detection)}).")
+        raise ValueError(f"--trajectory: the arm reaches no grasp ({_counts(detection)}).")
     motion = {**vars(best.arm.trajectory), "T_cloud_hand": best.T_cloud_hand, "width": best.width}
     file.write_text(json.dumps(motion, default=np.ndarray.tolist))
 

@@ -22,16 +22,16 @@ TOKEN_VARIABLE = "EDGEGRASP_CLIENT_TOKEN"
 
 
 class Connection(BaseModel, use_attribute_docstrings=True):
-    """The flags that say how to connect to a server."""
+    """The flags for the connection to a server."""
 
     timeout: float = 60.0
     """Seconds to wait for a server"""
     token_file: Path | None = None
     """File with the server's token; default: EDGEGRASP_CLIENT_TOKEN"""
     tls: bool = False
-    """TLS over gRPC, trusting this machine's authorities"""
+    """TLS over gRPC, trusting this machine's certificate authorities"""
     tls_ca: Path | None = None
-    """TLS, trusting the authorities in a PEM file"""
+    """TLS, trusting the certificate authorities in a PEM file"""
     tls_certificate: Path | None = None
     """Client certificate, PEM"""
     tls_key: Path | None = None
@@ -55,7 +55,7 @@ class Connection(BaseModel, use_attribute_docstrings=True):
 
 
 class Server(Connection):
-    """The flags of the server that a command is a client of."""
+    """The flags of a command that needs a server."""
 
     server: str = "127.0.0.1:50051"
     """The grasp server: host:port (gRPC) or http://host:port"""
@@ -91,7 +91,7 @@ def takes_flags(**groups: Flags) -> Callable[[Callable[..., None]], Callable[...
 
 
 def model_flags(
-    # The fields; those other than numbers, text, booleans and paths are given as JSON.
+    # Fields other than numbers, text, booleans and paths are given as JSON.
     model: type[BaseModel],
     leave_out: Sequence[str] = (),  # fields without a flag
     panel: str = "Options",  # heading of the flags in the help

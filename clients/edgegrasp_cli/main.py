@@ -14,13 +14,13 @@ try:
 except ModuleNotFoundError:
     sys.exit("edgegrasp: the command line is not installed. pip install 'edgegrasp[cli]'")
 
-# Command: its module after `edgegrasp_`, the extra it needs, one-line help. `generate-data` is
-# generate_data(). Those of `edgegrasp_lab` are the laboratory's.
+# Command: its module after `edgegrasp_`, the extra it needs, one-line help. Its function has the
+# command's name with underscores. `edgegrasp_lab` contains the laboratory's commands.
 COMMANDS = {
     "serve": ("cli.serve", "service", "Answer requests over HTTP and gRPC."),
     "detect": ("cli.detect", "service,view", "Find grasps in a cloud or a depth image."),
     "view": ("cli.serve", "service", "Look at a scene and its grasps in the browser."),
-    "models": ("cli.detect", "service", "List the weights that can be used."),
+    "models": ("cli.detect", "service", "List the available weights."),
     "robot": ("cli.robot", "robot,view", "Make a robot file from a URDF, and check one."),
     "mcp": ("cli.mcp", "mcp", "Serve grasps to language-model agents."),
     "open-inference": ("cli.open_inference", "open-inference", "Serve Open Inference clients."),
@@ -62,7 +62,7 @@ class LazyGroup(TyperGroup):
 
 
 def load_command(name: str) -> Any:
-    """Import a command; raises SystemExit where packages that it needs are not installed."""
+    """Import a command; raises SystemExit if packages that it needs are not installed."""
     module, _, _ = COMMANDS[name]
     try:
         found = importlib.import_module(f"edgegrasp_{module}")
@@ -112,13 +112,13 @@ def _common(
 def main() -> None:
     """Run the program; a full disk ends it with a message, a closed pipe without one."""
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # not every terminal knows every character
+        sys.stdout.reconfigure(errors="replace")  # a terminal may lack some characters
     try:
         try:
             app()
         finally:
-            if sys.stdout is not None:  # it was closed from the start
-                sys.stdout.flush()  # Python would at exit, with a traceback
+            if sys.stdout is not None:  # None: it was closed when the program started
+                sys.stdout.flush()  # at exit, Python would print a traceback
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         quiet = isinstance(error, BrokenPipeError)

@@ -1,7 +1,7 @@
-"""`edgegrasp mcp`: grasps for language-model agents, by the Model Context Protocol.
+"""`edgegrasp mcp`: grasps for language-model agents, over the Model Context Protocol.
 
-Runs as a client of a grasp server. An agent names files below one folder; answers are short enough
-for its context, and `visualize_grasps` returns a picture.
+Runs as a client of a grasp server. An agent names files in one folder; answers are short enough for
+its context, and `visualize_grasps` returns pictures.
 """
 
 import functools
@@ -31,15 +31,15 @@ if TYPE_CHECKING:
     from edgegrasp_client import Detection, GraspClient
     from edgegrasp_results import ArmPlan
 
-MAX_GRASPS = 20  # in one answer: some 5,000 characters
+MAX_GRASPS = 20  # in one answer: about 5,000 characters
 IDENTITY_POSE = [float(row == column) for row in range(4) for column in range(4)]  # T_base_cloud
 INSTRUCTIONS = (
     "Finds 6-DoF grasps of a parallel-jaw gripper in point clouds and depth images. Lengths are "
-    "metres, quaternions xyzw; poses are in the frame of the cloud, that of a depth image in its "
-    "camera's: x right, y down, z forward. Scores are probabilities that the grasp holds. To "
-    "grasp: open to `width`, go to `pregrasp_hand_position` in the orientation of the grasp, go in "
-    "straight, close. With `robot`, an arm of `edgegrasp_server_info`, grasps that it reaches come "
-    "first, each with `arm`: its joints there and the seconds of its motion. "
+    "metres, quaternions xyzw; poses are in the frame of the cloud, for a depth image in that of "
+    "its camera: x right, y down, z forward. Scores are probabilities that the grasp holds. To "
+    "grasp: open to `width`, go to `pregrasp_hand_position` in the orientation of the grasp, move "
+    "straight to the grasp, close. With `robot`, an arm of `edgegrasp_server_info`, reachable "
+    "grasps come first, each with `arm`: the joints at the grasp and the seconds of the motion. "
     "Read `warnings` before a robot moves."
 )
 
@@ -49,7 +49,7 @@ Matrix = Annotated[
 ]
 
 Arm = Annotated[
-    dict[str, Any] | None, Field(description="the arm; without T_base_cloud: in its base frame")
+    dict[str, Any] | None, Field(description="the arm; T_base_cloud is the identity by default")
 ]
 
 
@@ -75,7 +75,7 @@ def mcp(
     with asked.connect(asked.server) as client:
         tools = grasp_tools(client, folder.resolve())
         if http is None:
-            # A thread that waits for standard input would keep Python from ending.
+            # A thread that waits for standard input would prevent Python from exiting.
             signal.signal(signal.SIGINT, signal.SIG_DFL)
             tools.run()
         else:
@@ -135,10 +135,10 @@ class _Tools:
     ) -> str:
         """Grasps in a depth image (.png of 16 bits, or .npy), best first.
 
-        `intrinsics` are fx, fy, cx, cy in pixels. `mask_file` is an image of the same size that is
-        not 0 on what is to be grasped, as a segmenter gives it. `depth_scale` is metres for one
-        unit of the image (0.001 for whole numbers). With `T_base_camera` all that is asked and
-        answered is in the base frame.
+        `intrinsics` are fx, fy, cx, cy in pixels. `mask_file` is an image of the same size, such as
+        a segmentation, that is not 0 on the object to grasp. `depth_scale` is metres per unit of
+        the image (0.001 for integers). With `T_base_camera`, the request and the answer are in the
+        base frame.
         """
         image = (depth_file, intrinsics, mask_file, depth_scale, T_base_camera)
         asked = self._request(options, num_grasps, robot, image=image)
@@ -159,9 +159,9 @@ class _Tools:
     ) -> list[Any]:
         """Two pictures of the grasps in a cloud file or a depth image: from the camera, from above.
 
-        The best five carry their rank in the answer.
+        The best five are labelled with their rank in the answer.
 
-        Arguments are those of the tools that generate grasps; the same ones give the same grasps.
+        The arguments, and the grasps for them, are those of the tools that generate grasps.
         """
         from mcp.server.mcpserver import Image
 
@@ -184,7 +184,7 @@ class _Tools:
     def edgegrasp_health_check(self) -> str:
         """Whether the grasp server is reachable and answers requests."""
         ready = self._client.ready(timeout=5.0)
-        return "ready" if ready else "not there, or still loading its weights"
+        return "ready" if ready else "unreachable, or still loading its weights"
 
     def edgegrasp_server_info(self) -> str:
         """The weights that the option `model` can name, the robots, and the gripper of each."""
@@ -206,7 +206,7 @@ class _Tools:
         cloud_file: str | None = None,
         image: tuple[Any, ...] = (),  # in place of a cloud: file, intrinsics, mask, scale, pose
     ) -> dict[str, Any]:
-        """The arguments of `GraspClient.detect`; a tool's own ones come before its options."""
+        """The arguments of `GraspClient.detect`; a tool's arguments override its options."""
         from edgegrasp_client.requests import on_mask, plain_options
 
         if "top_k" in (options or {}):
@@ -238,7 +238,7 @@ class _Tools:
 
 
 def _tool(function: Callable[..., Any], folder: Path) -> "Tool":
-    """The tool, refusing unknown arguments and with a schema of its options."""
+    """The tool of a function; it refuses unknown arguments and has a schema of its options."""
     from mcp.server.mcpserver.tools.base import Tool
 
     # Compact text, since the SDK would send structured output twice, once indented.
@@ -258,14 +258,14 @@ def _tool(function: Callable[..., Any], folder: Path) -> "Tool":
 
 @functools.cache
 def _schema_of_options() -> tuple[dict[str, Any], dict[str, Any]]:
-    """The JSON Schema of options, without grippers as boxes, and what it refers to."""
+    """The JSON Schema of options, without grippers as boxes, and the definitions it uses."""
     document = resources.files("edgegrasp.v1").joinpath("openapi.json").read_text("utf-8")
     schemas = json.loads(document.replace("#/components/schemas/", "#/$defs/"))
     schemas = schemas["components"]["schemas"]
     options = schemas["DetectOptions"]
     options["properties"]["gripper"] = {"type": ["string", "null"], "description": "its name"}
     names = ["DetectOptions"]
-    for name in names:  # which grows by the objects in each
+    for name in names:  # grows by the definitions that each one uses
         named = dict.fromkeys(re.findall(r'"#/\$defs/(\w+)"', json.dumps(schemas[name])))
         names += [one for one in named if one not in names]
     definitions = {name: schemas[name] for name in names[1:]}
@@ -275,7 +275,7 @@ def _schema_of_options() -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _with_sentences(function: Callable[..., Any], folder: Path) -> Callable[..., Any]:
-    """Wrap a tool so that errors the caller can fix reach it, without the folder's path."""
+    """Wrap a tool so that the agent gets errors that it can fix, without the folder's path."""
     from mcp.server.mcpserver.exceptions import ToolError
 
     from edgegrasp_client import GraspClientError
@@ -327,7 +327,7 @@ def _short(found: "Detection") -> str:
 
 
 def _short_plan(plan: "ArmPlan") -> dict[str, Any]:
-    """The joints at each stop of an arm, and how long its motion takes."""
+    """The joints at each stop of an arm, and the duration of its motion."""
     found: dict[str, Any] = {"reachable": plan.reachable}
     for name in ("pregrasp_joints", "grasp_joints", "place_joints"):
         if (joints := getattr(plan, name)) is not None:

@@ -1,6 +1,6 @@
 """`edgegrasp open-inference`: the Open Inference Protocol v2 in front of a grasp server.
 
-Runs as a client of the server, in its own process: it gives the bytes of tensors their shape and
+Runs as a client of the server, in its own process: it converts the bytes of tensors to arrays and
 passes them on. The server's workers decode them.
 """
 
@@ -41,10 +41,10 @@ OUTPUTS = {  # fields of a Grasp
     "width": ("FP32", [-1]),  # metres
     "object": ("INT32", [-1]),  # -1: on no object
 }
-# Parameters of the protocol and of Triton's clients that say how to serve, not what to detect.
+# Parameters of the protocol and of Triton's clients about serving, which are not options.
 SERVING_PARAMETERS = {"binary_data_output", "headers", "priority", "timeout"}
 SERVING_PARAMETERS |= {"sequence_id", "sequence_start", "sequence_end"}
-STATUS: tuple[tuple[type[Exception], str, int], ...] = (  # the first that fits
+STATUS: tuple[tuple[type[Exception], str, int], ...] = (  # the first that matches applies
     (errors.UnknownModelError, "NOT_FOUND", 404),
     (errors.PayloadTooLargeError, "RESOURCE_EXHAUSTED", 413),
     (errors.InvalidRequestError, "INVALID_ARGUMENT", 400),
@@ -56,7 +56,7 @@ STATUS: tuple[tuple[type[Exception], str, int], ...] = (  # the first that fits
 )
 PARALLEL_CALLS = 32
 MAX_BODY_BYTES = 32 * 2**20
-MAX_SHORT_LISTS = 20_000  # in JSON; most lists hold numbers
+MAX_SHORT_LISTS = 20_000  # in JSON; most lists contain numbers
 
 Tensors = dict[str, Array]
 
@@ -66,15 +66,13 @@ def open_inference(
     host: Annotated[str, Option(help="Address to listen at.")] = "127.0.0.1",
     http_port: Annotated[int, Option(help="Port of REST.")] = 8080,
     grpc_port: Annotated[int, Option(help="Port of gRPC.")] = 8081,
-    name: Annotated[
-        str, Option(help="Model that stands for the server's default weights.")
-    ] = "default",
+    name: Annotated[str, Option(help="Model name for the server's default weights.")] = "default",
     *,
     asked: Server,
 ) -> None:
     """Answer the Open Inference Protocol v2 (KServe, Triton's clients) for a grasp server.
 
-    It does not require a token: let the gateway in front of it check tokens.
+    It does not require a token: put a gateway in front of it that checks tokens.
     """
     with asked.connect(asked.server) as client:
         models = Models(client, name, asked.timeout)
@@ -94,7 +92,7 @@ def refusal(error: errors.GraspClientError) -> tuple[str, int, str]:
 class Models:
     """The weights of a grasp server as models of the protocol; raises GraspClientErrors.
 
-    `default` names the server's default weights, beside their own name.
+    `default` is a second name for the server's default weights.
     """
 
     def __init__(self, client: GraspClient, default: str, timeout: float) -> None:
@@ -109,7 +107,7 @@ class Models:
         return [self._default, *(model.name for model in self._client.models())]
 
     def check(self, name: str, version: str = "") -> bool:
-        """True; refuses an unknown name or version."""
+        """Return True; raises UnknownModelError for an unknown name or version."""
         known = self.names()
         if name not in known:
             raise errors.UnknownModelError(f"No model {name!r}. Use one of: {', '.join(known)}.")
@@ -136,10 +134,10 @@ class Models:
         wanted: Sequence[str],
         timeout: float = math.inf,
     ) -> dict[str, Any]:
-        """Grasps of `points`, or of `depth` with `intrinsics`; parameters are options.
+        """Find grasps in `points`, or in `depth` with `intrinsics`; `parameters` are options.
 
-        `timeout` among them is in microseconds; `wanted` are names of outputs, empty: all. The
-        answer is as the protocol has it, with an array as the `data` of each output.
+        The parameter `timeout` is in microseconds; `wanted` are names of outputs, empty: all. The
+        answer has the protocol's form, with an array as the `data` of each output.
         """
         if version:
             self.check(name, version)
@@ -158,7 +156,7 @@ class Models:
             raise invalid("inputs", named, "Send points, or depth and intrinsics.")
         if unknown := sorted(set(wanted) - set(OUTPUTS)):
             raise invalid("outputs", unknown[0], f"Ask for {', '.join(OUTPUTS)}.")
-        plain_options(options)  # no other argument of the client
+        plain_options(options)  # refuses other arguments of the client
         seconds = min(timeout, self._timeout)
         micro = asked.get("timeout")
         if isinstance(micro, int | float) and micro > 0:
@@ -176,7 +174,7 @@ class Models:
 
 
 def tensor(name: str, datatype: str, shape: Any, data: Any) -> Array:
-    """A tensor of bytes, little-endian, or of nested or flat lists; raises InvalidRequestError."""
+    """An array from little-endian bytes or nested or flat lists; raises InvalidRequestError."""
     try:
         dtype = DTYPES[datatype]
         raw = isinstance(data, bytes)
@@ -192,8 +190,8 @@ def tensor(name: str, datatype: str, shape: Any, data: Any) -> Array:
 
 @contextmanager
 def grpc_server(models: Models, address: str) -> Iterator[int]:
-    """Serve `inference.GRPCInferenceService` while the context lasts; gives its port."""
-    # Of each call, the fields of its answer.
+    """Serve `inference.GRPCInferenceService` while the context lasts; yields its port."""
+    # For each call, a function that returns the fields of its answer.
     calls: dict[str, Callable[[Any, Any], dict[str, Any]]] = {
         "ServerLive": lambda *_: {"live": True},
         "ServerReady": lambda *_: {"ready": models.ready()},
@@ -314,7 +312,7 @@ def _http_infer(
         # Otherwise it could not be sent back.
         json.dumps(request.get("id", ""), allow_nan=False, ensure_ascii=False).encode()
         tensors: Tensors = {}
-        binary, start = bytes(body[head:]), 0  # tensors without `data`, one behind the other
+        binary, start = bytes(body[head:]), 0  # tensors without `data`, one after another
         for each in request["inputs"]:
             data = each.get("data")
             if data is None:

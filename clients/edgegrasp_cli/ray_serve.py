@@ -1,4 +1,4 @@
-"""The worker's function as a Ray Serve application, for several machines.
+"""A worker as a Ray Serve application, for several machines.
 
 serve run docker/ray/serve.yaml
 

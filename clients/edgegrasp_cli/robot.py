@@ -26,15 +26,15 @@ def add(
     base: Links,
     flange: Links,
     output: Annotated[Path, Option(help="Robot file to write, .toml.")],
-    gripper: Annotated[str, Option(help="Name of a gripper that ships, or its file.")] = "panda",
-    srdf: Annotated[str, Option(help="SRDF with links that may touch.")] = "",
-    packages: Annotated[list[str] | None, Option(help="Folder that holds packages.")] = None,
+    gripper: Annotated[str, Option(help="Name of a built-in gripper, or a file.")] = "panda",
+    srdf: Annotated[str, Option(help="SRDF with pairs of links that may touch.")] = "",
+    packages: Annotated[list[str] | None, Option(help="Folder that contains packages.")] = None,
 ) -> None:
     """Write a robot file for an arm's URDF, and check it.
 
     edgegrasp robot add my.urdf --base base_link --flange tool0 --output my.toml
     """
-    importlib.import_module("edgegrasp_robot")  # fails before there is a file
+    importlib.import_module("edgegrasp_robot")  # fails before the file is written
     if output.suffix != ".toml" or output.exists() or not output.parent.is_dir():
         fix = "Name a new file, .toml, in a folder that exists."
         raise ValueError(f"--output: got {str(output)!r}. {fix}")
@@ -61,10 +61,10 @@ def add(
 
 @robot.command()
 def check(
-    file: Annotated[Path, Argument(help="Robot file, .toml, or a name of one that ships.")],
-    picture: Annotated[Path | None, Option(help="PNG to write: the arm at its home.")] = None,
+    file: Annotated[Path, Argument(help="Robot file, .toml, or the name of a built-in robot.")],
+    picture: Annotated[Path | None, Option(help="PNG to write: the arm at home.")] = None,
 ) -> None:
-    """Load a robot file, print its facts, and draw the arm at its home.
+    """Load a robot file, print its facts, and draw the arm in its home position.
 
     edgegrasp robot check fr3 --picture fr3.png
     """

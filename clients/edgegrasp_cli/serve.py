@@ -21,7 +21,7 @@ from edgegrasp_service.settings import Settings, load_settings
 def serve(
     config: Annotated[
         Path | None,
-        Option(help="TOML file with settings, named as the flags, with _ for -.", metavar="FILE"),
+        Option(help="TOML file with settings: the flags' names, with _ for -.", metavar="FILE"),
     ] = None,
     print_config: Annotated[
         bool, Option("--print-config", help="Print the settings in effect as JSON, and stop.")
@@ -57,12 +57,12 @@ def view(
     file: Annotated[
         Path | None, Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
     ] = None,
-    depth: Annotated[Path | None, Option(help="Depth image: .png of 16 bits, or .npy.")] = None,
+    depth: Annotated[Path | None, Option(help="Depth image: 16-bit .png, or .npy.")] = None,
     intrinsics: Annotated[str | None, Option(help="Camera of --depth: fx,fy,cx,cy.")] = None,
     depth_scale: Annotated[
-        float | None, Option(help="Metres for one unit of --depth (0.001; for floats 1).")
+        float | None, Option(help="Metres per unit of --depth (0.001; for floats 1).")
     ] = None,
-    color: Annotated[Path | None, Option(help="Colours of the same pixels: .png or .npy.")] = None,
+    color: Annotated[Path | None, Option(help="Colour image, same pixels: .png or .npy.")] = None,
     viewpoint: Annotated[str | None, Option(help="Camera position of a cloud: x,y,z.")] = None,
     browser: Annotated[bool, Option(help="Whether to open a browser.")] = True,
 ) -> None:

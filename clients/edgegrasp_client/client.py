@@ -51,7 +51,7 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
             of a server on this machine: "unix:/run/edgegrasp/grpc.sock" for gRPC,
             "http+unix:/run/edgegrasp/http.sock" for REST.
         timeout: Seconds for one call with its retries, unless the call says otherwise.
-        retry: Whether to try again, after short random delays, if the server is away or busy or
+        retry: Whether to retry, after short random delays, if the server is unavailable or busy or
             lost the request's worker. Requests of a stream are sent once.
         token: For a server that requires one; send it over TLS only.
         tls: How to verify the server; None: gRPC is not encrypted, and "https://..." trusts the
@@ -87,8 +87,8 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
                 .npy, .npz, .ply, .pcd or .xyz file; or an object with the attributes of
                 sensor_msgs/PointCloud2.
             timeout: Seconds to wait; None: the client's own.
-            fields: As in RequestFields: depth images in place of a cloud, arrays beside it, and
-                options; those left out take the server's defaults.
+            fields: As in RequestFields: depth images instead of a cloud, arrays for its points, and
+                options; an option left out has the server's default.
         """
         request = Request(cloud, fields)
         return await self._retried(partial(self._transport.ask, Detection, request), timeout)
@@ -104,8 +104,8 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
     ) -> Scoring:
         """Score your own edges or hand poses (the paper's grasp evaluation function).
 
-        `edges` are (M, 2) integers, approach and contact point, rows of the cloud as sent; or give
-        `hand_poses`, (M, 4, 4) T_cloud_hand. Everything else is as for `detect`.
+        `edges` are (M, 2) integers: rows of the approach and contact point in the cloud as sent. Or
+        give `hand_poses`, (M, 4, 4) T_cloud_hand. Other arguments are those of `detect`.
 
         Returns:
             An evaluation for each edge or pose, in their order.
@@ -125,12 +125,12 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
         accepts them. Over REST, each request waits for the previous answer, on one connection.
 
         Args:
-            requests: Read as they can be sent, in a separate thread if they are no AsyncIterable;
-                an exception from it ends the stream after the earlier requests are answered.
+            requests: Read when they can be sent, in a separate thread if not an AsyncIterable; an
+                exception from it ends the stream after the earlier requests are answered.
             timeout: Seconds for each request without its own; None: the client's.
 
         Yields:
-            An answer to each request, in their order; the error of one does not end the stream.
+            An answer to each request, in order; an error in one does not end the stream.
 
         Raises:
             GraspClientError: The stream itself failed, so that no more answers come.
@@ -149,7 +149,7 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
     async def record_outcome(
         self, detection: Detection, grasp: Grasp, held: bool, *, timeout: float | None = None
     ) -> None:
-        """Tell a server with an `outcomes_file` what became of a grasp; REST only."""
+        """Report to a server with an `outcomes_file` whether a grasp held; REST only."""
         if held not in (True, False):
             raise invalid("held", repr(held), "Give True or False.")
         tried = {"model": detection.model, "score": float(grasp.score), "held": bool(held)}
@@ -178,14 +178,14 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
 
     def _seconds(self, timeout: float | None) -> float:
         """The timeout of a call; raises GraspClientError if it cannot be made any more."""
-        if self._closed or self._pid != os.getpid():  # a fork would read another's answers
+        if self._closed or self._pid != os.getpid():  # a fork would read its parent's answers
             raise errors.GraspClientError(CLOSED)
         return self._timeout if timeout is None else seconds_of(timeout)
 
     async def _retried(
         self, call: Callable[[float], Awaitable[Answer]], timeout: float | None
     ) -> Answer:
-        """Make a call, retrying while the server is away or busy and time is left."""
+        """Make a call, retrying while the server is unavailable or busy and time is left."""
         left = self._seconds(timeout)
         end = time.monotonic() + left
         attempt = 0
@@ -207,7 +207,7 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
 async def _sent(
     requests: AsyncIterable[StreamRequest], timeout: float
 ) -> AsyncIterator[tuple[str, Request, float]]:
-    """The requests with their own names and timeouts, or their numbers from 0 and the stream's."""
+    """Each request with its id (default: its number, from 0) and timeout (default: `timeout`)."""
     number = 0
     async for each in requests:
         seconds = timeout if each.timeout is None else each.timeout
@@ -268,7 +268,7 @@ class GraspClient(AbstractContextManager["GraspClient"]):
     def detect_stream(
         self, requests: Iterable[StreamRequest], *, timeout: float | None = None
     ) -> Iterator[StreamAnswer]:
-        """As `AsyncGraspClient.detect_stream`."""
+        """The same as `AsyncGraspClient.detect_stream`."""
         answers = self._client.detect_stream(requests, timeout=timeout)
 
         async def following() -> StreamAnswer | None:
@@ -306,7 +306,7 @@ def _run(work: Coroutine[Any, Any, Answer]) -> Answer:
 
 
 async def _from_thread(requests: Iterable[StreamRequest]) -> AsyncIterator[StreamRequest]:
-    """The requests, read in a daemon thread: waiting for one blocks nothing, not even exiting."""
+    """The requests, read in daemon threads: waiting for one blocks nothing, not even exit."""
     source = iter(requests)
 
     def read(found: "Future[StreamRequest | None]") -> None:

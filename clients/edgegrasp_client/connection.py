@@ -1,4 +1,4 @@
-"""Addresses, TLS, tokens, retries and refusals of a client; and a local server."""
+"""Addresses, TLS, tokens, retries and errors of a client; and a local server."""
 
 import math
 import random
@@ -15,10 +15,10 @@ from edgegrasp_client.errors import InvalidRequestError, OverloadedError, Server
 
 HTTP_OVER_UNIX = "http+unix:"
 
-# Retries of a call while the server is away, enough for a restart; fewer before its first answer,
-# as there is probably no server.
+# Retries of a call while the server is unavailable, enough for a restart; fewer before its first
+# answer, since there is probably no server.
 RETRIES, FEW_RETRIES = 8, 4
-FIRST_DELAY, LONGEST_DELAY = 0.1, 2.0  # seconds; each is twice the one before
+FIRST_DELAY, LONGEST_DELAY = 0.1, 2.0  # seconds; each delay is twice the previous one
 STOP_SECONDS = 15.0  # for a local server to drain
 LONGEST_TIMEOUT = 1e6  # seconds; gRPC cannot count much longer ones
 
@@ -43,13 +43,13 @@ def is_rest(address: str) -> bool:
 
 
 def is_local(address: str) -> bool:
-    """Whether an address is of this machine, which no proxy reaches."""
+    """Whether an address is on this machine, which is called without a proxy."""
     local = r"(https?://)?(localhost|127[.\d]*|\[::1\])(:|/|$)|unix:"
     return re.match(local, address) is not None
 
 
 def seconds_of(timeout: float) -> float:
-    """A timeout, cut to LONGEST_TIMEOUT; raises InvalidRequestError unless it is above 0."""
+    """A timeout, at most LONGEST_TIMEOUT; raises InvalidRequestError unless it is above 0."""
     try:
         seconds = float(timeout)
     except (TypeError, ValueError):
@@ -92,7 +92,7 @@ class Addresses(NamedTuple):
 def local_server(*flags: str, program: Sequence[str] = ()) -> Iterator[Addresses]:
     """Run `edgegrasp serve` with further flags on free ports while the context lasts.
 
-    `program` runs it; empty: the installed `edgegrasp`. Yields its addresses, once it is ready.
+    `program`, if given, replaces `edgegrasp`. Yields the addresses once the server is ready.
 
     Raises:
         ServerUnavailableError: It is not installed or does not start; its stderr says why.

@@ -3,10 +3,10 @@
 - Hand frames with other axes and origins (Contact-GraspNet, GraspNet, VGN).
 - Rotations as quaternions xyzw.
 - `moveit_msgs/Grasp` and `trajectory_msgs/JointTrajectory`, as dictionaries of their fields.
-- `isaac_grasp` YAML 1.0, as Isaac Sim's Grasp Editor and as Isaac ROS have it; needs the extra
-  `yaml`.
+- `isaac_grasp` YAML 1.0, in the dialects of Isaac Sim's Grasp Editor and of Isaac ROS; needs the
+  extra `yaml`.
 
-Pictures of the frames stand in docs/frames.md.
+docs/frames.md has pictures of the frames.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,13 +30,13 @@ _AXES = dict(zip(("x", "y", "z", "-x", "-y", "-z"), [*np.eye(3), *-np.eye(3)], s
 class HandFrame:
     """A frame fixed to the hand: the directions of its axes and its origin.
 
-    Turning a parallel-jaw hand by 180 degrees about the approach gives the same grasp, so that
-    `closing="x"` and `closing="-x"` are equally right.
+    Rotating a parallel-jaw hand by 180 degrees about the approach gives the same grasp, so
+    `closing="x"` and `closing="-x"` are both correct.
     """
 
-    approach: str  # its axis along the approach: x, -x, y, -y, z or -z
-    closing: str  # its axis along our y, the closing direction
-    origin_z: float = 0.0  # metres from our hand frame's origin to its own, along our z
+    approach: str  # the frame's axis along the approach: x, -x, y, -y, z or -z
+    closing: str  # the frame's axis along our y, the closing direction
+    origin_z: float = 0.0  # metres along our z from our hand frame's origin to the frame's
 
     def __post_init__(self) -> None:
         axes = self.approach, self.closing
@@ -45,10 +45,10 @@ class HandFrame:
 
     @property
     def T_hand_frame(self) -> Float64:  # noqa: N802
-        """Maps its coordinates to those of our hand frame, (4, 4)."""
+        """Maps the frame's coordinates to our hand frame's, (4, 4)."""
         approach, closing = _AXES[self.approach], _AXES[self.closing]
         transform = np.eye(4)
-        # Rows: our x, y and z axes in its coordinates.
+        # Rows: our x, y and z axes in the frame's coordinates.
         transform[:3, :3] = [np.cross(closing, approach), closing, approach]
         transform[2, 3] = self.origin_z
         return transform
@@ -64,14 +64,14 @@ VGN = HandFrame(approach="z", closing="y", origin_z=0.062)
 def graspnet_frame(tip_z: float, depth: float = 0.02) -> HandFrame:
     """GraspNet-1Billion (graspnetAPI): x the approach, y the closing direction.
 
-    `tip_z` is where the gripper's fingertips are, metres along our z (0.1122 for the Panda hand),
-    and `depth` that of the grasp there: metres from its origin to the fingertips.
+    `tip_z` is the position of the gripper's fingertips along our z in metres (0.1122 for the Panda
+    hand), and `depth` the grasp's depth in GraspNet: metres from its origin to the fingertips.
     """
     return HandFrame(approach="x", closing="y", origin_z=tip_z - depth)
 
 
 def to_frame(T_cloud_hand: ArrayLike, frame: HandFrame) -> Float64:
-    """Poses (..., 4, 4) of another frame on the hand, in the cloud, from those of ours."""
+    """Poses (..., 4, 4) of another frame on the hand, cloud frame, from poses of our hand frame."""
     return np.asarray(T_cloud_hand, dtype=np.float64) @ frame.T_hand_frame
 
 
@@ -118,17 +118,17 @@ def moveit_grasp(
         grasp: A grasp of the server's answer.
         frame_id: Name of the cloud's frame.
         name: The message's `id`.
-        stamp: When the cloud was taken, `sec` and `nanosec`: a frame that moves with the hand is
-            somewhere else later; None: 0, which is the latest.
+        stamp: Time of the cloud, `sec` and `nanosec`, needed if its frame moves with the hand;
+            None: 0, which means the latest transform.
         joints: The gripper's joints.
-        T_hand_link: (4, 4) pose in our hand frame of the end effector's parent link, whose pose
-            MoveIt wants, such as PANDA_LINK8; None: it is the hand frame.
+        T_hand_link: (4, 4) pose, in our hand frame, of the end effector's parent link, which MoveIt
+            moves to the grasp, such as PANDA_LINK8; None: it is the hand frame.
         approach_distance: Metres of straight approach.
         retreat_distance: Metres of straight retreat, back along the approach.
 
     Returns:
-        The message's fields, without those that are as in a new message; orientations are the four
-        fields x, y, z, w.
+        The message's fields, without those that keep the default of a new message; orientations
+        have the four fields x, y, z, w.
     """
     approach = np.asarray(grasp.approach_direction, dtype=np.float64)
     T_cloud_link = _matrix(grasp.T_cloud_hand) @ _matrix(T_hand_link)
@@ -148,8 +148,8 @@ def moveit_grasp(
 def joint_trajectories(motion: ArmTrajectory) -> list[Message]:
     """A motion as the fields of `trajectory_msgs/JointTrajectory`, to be executed one by one.
 
-    The first ends at the grasp, where the hand closes; where there is a place, the second ends
-    where it opens. Each begins and ends at rest; without a stamp, it is executed as it comes.
+    The first ends at the grasp, where the hand closes. With a place, the second ends where the hand
+    opens. Each begins and ends at rest; without a stamp, it is executed on arrival.
     """
     stops = [0, motion.grasp_row, motion.release_row, len(motion.times) - 1]
     return [
@@ -237,7 +237,7 @@ def read_isaac_grasps(text: str) -> list[IsaacGrasp]:
 
     Raises:
         ModuleNotFoundError: The extra `yaml` is not installed.
-        ValueError: It is not such a file; says which line or field.
+        ValueError: It is not such a file; the message names the line or field.
     """
     yaml = _yaml()
     try:
@@ -255,14 +255,14 @@ def read_isaac_grasps(text: str) -> list[IsaacGrasp]:
 
 
 def quaternion_from_matrix(rotation: ArrayLike) -> Float64:
-    """The unit quaternion (4,) x, y, z, w of a rotation (3, 3), its w not negative."""
+    """The unit quaternion (4,) x, y, z, w of a rotation (3, 3); w is not negative."""
     r = np.asarray(rotation, dtype=np.float64)
     x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
     multiples = np.empty((4, 4))  # of the quaternion, by 4x, 4y, 4z and 4w
     multiples[:3, :3] = r + r.T + (1.0 - np.trace(r)) * np.eye(3)
     multiples[:3, 3] = multiples[3, :3] = x, y, z
     multiples[3, 3] = 1.0 + np.trace(r)
-    longest = multiples[np.argmax(np.diag(multiples))]  # the most precise
+    longest = multiples[np.argmax(np.diag(multiples))]  # numerically the most precise row
     quaternion: Float64 = longest / np.linalg.norm(longest)
     return -quaternion if quaternion[3] < 0 else quaternion
 
@@ -292,7 +292,7 @@ def pose_fields(T: Array) -> Message:
 
 
 def _posture(joints: FingerJoints, opening: float) -> Message:
-    # Without a stamp, which would be the time to begin.
+    # A stamp would be the start time.
     point = {"positions": list(joints.at(opening).values())}
     return {"joint_names": list(joints.names), "points": [point]}
 
@@ -312,7 +312,7 @@ def xyz_fields(vector: Array) -> Message:
 
 
 def _isaac_grasp(name: str, fields: Any) -> IsaacGrasp:
-    try:  # 1e-05, without a point, is text to YAML: numbers are converted here
+    try:  # YAML reads 1e-05, which has no point, as text: convert numbers here
         x, y, z = fields["orientation"]["xyz"]
         rotation = matrix_from_quaternion([x, y, z, fields["orientation"]["w"]])
         T_object_gripper = np.eye(4)

@@ -24,7 +24,7 @@ class UnknownModelError(InvalidRequestError):
 
 
 class StartCollisionError(InvalidRequestError):
-    """In the request's joints the arm touches itself or the scene."""
+    """With the request's joints, the arm collides with itself or with the scene."""
 
 
 class PayloadTooLargeError(InvalidRequestError):
@@ -36,7 +36,7 @@ class AccessDeniedError(GraspClientError):
 
 
 class ServerUnavailableError(GraspClientError):
-    """No connection, a server that loads or stops, or a lost request; another try may help."""
+    """No connection, a server that is loading or stopping, or a lost request; retrying may help."""
 
 
 class OverloadedError(ServerUnavailableError):
@@ -48,7 +48,7 @@ class OverloadedError(ServerUnavailableError):
 
 
 class WorkerLostError(ServerUnavailableError):
-    """The worker process of the request died or was killed; the client asks once more."""
+    """The worker process of the request died or was killed; the client retries once."""
 
 
 class DeadlineError(GraspClientError):
@@ -60,4 +60,4 @@ class ServerFailedError(GraspClientError):
 
 
 class ProtocolError(GraspClientError):
-    """The answer is not from a grasp service; the address may be of another one."""
+    """The answer is not from a grasp service; the address may belong to another service."""

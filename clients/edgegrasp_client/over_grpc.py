@@ -35,7 +35,7 @@ CHANNEL_OPTIONS = (
 HEALTH_CHECK = "/grpc.health.v1.Health/Check"
 SERVING = b"\x08\x01"
 
-ACCEPT_SECONDS = 0.5  # for a server to accept a stream, before requests are sent all the same
+ACCEPT_SECONDS = 0.5  # seconds to wait for a server to accept a stream before sending requests
 ERROR_METADATA = "edgegrasp-error-bin"
 
 
@@ -83,7 +83,7 @@ class GrpcTransport:
 
         async def messages() -> AsyncIterator[grasp_pb2.DetectGraspsStreamRequest]:
             try:
-                # A write to a stream that is refused would hide why; Ray's are late to accept.
+                # Writing to a refused stream would hide the reason; Ray accepts streams late.
                 accepted = asyncio.ensure_future(call.initial_metadata())
                 await asyncio.wait([accepted], timeout=ACCEPT_SECONDS)
                 async for name, request, seconds in requests:
@@ -94,7 +94,7 @@ class GrpcTransport:
                     except GraspClientError as error:
                         refused.append(error)
                     yield sent(request_id=name, request=message, timeout=seconds)
-            except Exception as error:  # gRPC would only log it
+            except Exception as error:  # gRPC would log it and not raise it
                 failed.append(error)
 
         call = self._service.DetectGraspsStream(messages(), metadata=self._metadata)
@@ -142,7 +142,7 @@ class GrpcTransport:
 
 
 def _error_of(error: Any, address: str) -> GraspClientError:
-    """The exception for a failed call, as the server describes it or by its status code."""
+    """The exception for a failed call, from the server's ErrorDetail or from its status code."""
     code, message = error.code(), error.details() or ""
     metadata = dict(error.trailing_metadata() or ())
     try:
@@ -163,7 +163,7 @@ def _described(message: str, detail: grasp_pb2.ErrorDetail) -> GraspClientError:
 
 
 def message_of(request: Request) -> Any:
-    """The message of a request; raises InvalidRequestError for what no message can hold."""
+    """The message of a request; raises InvalidRequestError for a value that does not fit in it."""
     fields: dict[str, Any] = {"options": request.options, "depth_images": request.depth_images}
     for name, array in request.arrays.items():
         little_endian = array.astype(array.dtype.newbyteorder("<"), copy=False)
@@ -177,9 +177,9 @@ def message_of(request: Request) -> Any:
 
 
 def fill(message: Message, value: object, path: str = "") -> None:
-    """Fill a message, the field `path` of a request, from a value as in JSON.
+    """Fill a message, the field `path` of a request, from a value in JSON form.
 
-    InvalidRequestError: the message cannot hold the value. The server checks everything else.
+    Raises InvalidRequestError if the value does not fit. The server checks everything else.
     """
     message, value = _target(message, value, path)
     if not isinstance(value, Mapping):
@@ -219,7 +219,7 @@ def _known(message: Message) -> str:
 
 
 def _target(message: Any, value: Any, path: str) -> tuple[Any, Any]:
-    """What to fill, and with which fields; JSON writes some messages in another way."""
+    """The message to fill and its fields; some messages have another form in JSON."""
     names = [field.name for field in message.DESCRIPTOR.fields]
     fields = dict(value) if isinstance(value, Mapping) else {}
     match message.DESCRIPTOR.name:

@@ -1,4 +1,4 @@
-"""The REST transport: requests, answers and errors as HTTP carries them."""
+"""The REST transport: requests, answers and errors over HTTP."""
 
 import asyncio
 import base64
@@ -27,12 +27,12 @@ from edgegrasp_results import Detection
 
 MAX_QUERY_LENGTH = 4000  # characters; servers and proxies limit the length of an address
 KIND_PREFIX = "urn:edgegrasp:error:"
-# What statuses mean that come from something else, such as a proxy.
+# Kinds of errors for statuses that do not come from a grasp service, but e.g. from a proxy.
 FOREIGN_KINDS = {413: "payload-too-large", 429: "overloaded"}
 FOREIGN_KINDS |= dict.fromkeys((500, 502, 503, 504), "internal")
 
 Call = dict[str, Any]  # arguments of httpx's `request`
-Part = tuple[str | None, bytes, str]  # of a form: file name, content, media type
+Part = tuple[str | None, bytes, str]  # a part of a form: file name, content, media type
 
 
 class RestTransport:
@@ -45,7 +45,7 @@ class RestTransport:
         if address.startswith(HTTP_OVER_UNIX):
             socket, address = address.removeprefix(HTTP_OVER_UNIX), "http://localhost"
         context = _ssl_context(tls)
-        if is_local(address):  # a transport of its own asks no proxy
+        if is_local(address):  # with an explicit transport, httpx uses no proxy
             transport = httpx.AsyncHTTPTransport(verify=context, uds=socket)
         try:
             self._http = httpx.AsyncClient(
@@ -79,7 +79,7 @@ class RestTransport:
     async def detect_stream(
         self, requests: AsyncIterator[tuple[str, Request, float]]
     ) -> AsyncGenerator[StreamAnswer, None]:
-        """An answer to each of the named requests with their timeouts, one after the other."""
+        """An answer to each request, one after another; a request comes with its id and timeout."""
         async for name, request, seconds in requests:
             try:
                 yield StreamAnswer(name, await self.ask(Detection, request, seconds))
@@ -99,10 +99,10 @@ class RestTransport:
         await self._http.aclose()
 
     async def _call(self, read: Callable[[Any], Answer], call: Call, timeout: float) -> Answer:
-        """What is read of a call's answer; both sides give up after `timeout` seconds."""
+        """The parsed answer of a call; client and server give up after `timeout` seconds."""
         headers = {**call.get("headers", {}), "x-request-timeout": f"{timeout:.6g}"}
         asking = self._http.request(**call | {"headers": headers}, timeout=timeout)
-        try:  # httpx counts connecting, sending and each part of an answer anew
+        try:  # httpx restarts its timeout for connecting, sending and each part of an answer
             response = await asyncio.wait_for(asking, timeout)
         except (httpx.TimeoutException, asyncio.TimeoutError) as error:
             raise errors.DeadlineError(f"No answer in time ({type(error).__name__}).") from None
@@ -118,7 +118,7 @@ class RestTransport:
 
 
 def call_of(request: Request) -> Call:
-    """The call of a request; raises InvalidRequestError for what HTTP cannot carry.
+    """The HTTP call of a request; raises InvalidRequestError for a value that does not fit in it.
 
     Sends a point cloud file as the body and options as query parameters, or a form if there is
     more.
@@ -141,7 +141,7 @@ def call_of(request: Request) -> Call:
 
 
 def _image_parts(images: Sequence[Mapping[str, Any]]) -> dict[str, Part]:
-    """The parts of one image, whose depths are a file; of several, one of JSON."""
+    """The parts of one image, with the depths as a file; for several images, one JSON part."""
     if len(images) != 1:
         return {"depth_images": _json_part("depth_images", images)}
     camera = dict(images[0])
@@ -176,14 +176,14 @@ def _base64(value: object) -> str:
 
 
 def _described(problem: Mapping[str, Any]) -> errors.GraspClientError:
-    """The exception for a server's problem document; raises KeyError for another one's."""
+    """The exception for a server's problem document; raises KeyError for other documents."""
     said = (problem[name] for name in ("detail", "field", "value", "fix"))
     kind = problem["type"].removeprefix(KIND_PREFIX)
     return error_of_kind(kind, *said, retry_after=problem["retry_after"])
 
 
 def _foreign(response: httpx.Response) -> errors.GraspClientError:
-    """The exception for an answer from something else, such as a proxy."""
+    """The exception for an answer that is not from a grasp service, but e.g. from a proxy."""
     status, retry_after = response.status_code, response.headers.get("retry-after", "")
     seconds = float(retry_after) if retry_after.isdecimal() else None  # it may also be a date
     kind = "overloaded" if status == 503 and seconds is not None else FOREIGN_KINDS.get(status, "")
@@ -200,6 +200,6 @@ def _ssl_context(tls: Tls | None) -> ssl.SSLContext | bool:
         context = ssl.create_default_context(cafile=tls.ca)
         if tls.certificate is not None:
             context.load_cert_chain(tls.certificate, tls.key)
-    except OSError as error:  # also of a file that holds none
+    except OSError as error:  # also if a file contains no certificate
         raise invalid("tls", f"{tls} ({error})", "Give PEM files.") from None
     return context

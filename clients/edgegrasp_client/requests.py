@@ -1,7 +1,7 @@
-"""The request of a caller, checked as far as possible without the server, in the forms of the wire.
+"""A caller's request, checked as far as possible without the server, and its wire formats.
 
-Also helpers that build a request from a segmentation mask, or from an object's cloud and its
-scene's.
+Also helpers that build a request from a segmentation mask, or from the clouds of an object and its
+scene.
 """
 
 import io
@@ -24,7 +24,7 @@ from edgegrasp_camera.files import FILE_FORMATS
 from edgegrasp_client.connection import invalid, seconds_of
 from edgegrasp_client.options import DetectOptions
 
-SCENE_CELL = 0.005  # metres: the side of a cell in which the scene repeats the object
+SCENE_CELL = 0.005  # metres, side of a cell: scene points in the object's cells are left out
 DEPTH_ENCODINGS = {np.dtype(kind).name: name for name, kind in ENCODINGS.items()}  # by dtype
 
 
@@ -32,14 +32,14 @@ class DepthImage(TypedDict):
     """An image of a depth camera. Camera frame: x right, y down, z forward."""
 
     # (H, W), 0 or NaN where there is no reading: metres as float32 or float64, millimetres as
-    # uint16. Or the path of a file that holds it: .npy, or .png of 16 bits.
+    # uint16. Or the path of a file that contains it: .npy, or a 16-bit .png.
     depth: Array | str | PathLike[str]
-    # In pixels, the centre of the top left pixel is (0, 0): fx, fy, cx, cy in this order or by
+    # In pixels, with (0, 0) at the centre of the top left pixel: fx, fy, cx, cy in this order or by
     # name; or the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
     intrinsics: Intrinsics | Mapping[str, float] | Sequence[float] | Array
-    # (4, 4) camera to cloud, metres; left out: the cloud's frame is the camera's.
+    # (4, 4) camera to cloud, metres; default: the cloud frame is the camera frame.
     T_cloud_camera: NotRequired[Array | Sequence[Sequence[float]]]
-    # Metres that one unit of the depth is worth; None: 0.001 for integers, 1 for floats.
+    # Metres per unit of the depth; None: 0.001 for integers, 1 for floats.
     depth_scale: NotRequired[float | None]
 
 
@@ -57,19 +57,19 @@ ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
 
 
 class RequestFields(DetectOptions, total=False):
-    """What may come with a cloud: options, arrays, and images in its place; N rows of the cloud."""
+    """What a request may have besides a cloud of N rows: options and arrays, or depth images."""
 
-    # Views to fuse in place of a cloud; their cameras are the viewpoints, and the rows of the cloud
-    # their pixels, one image after the other.
+    # Views to fuse instead of a cloud; the viewpoints are the cameras' positions, and the rows of
+    # the cloud are the pixels, one image after another.
     depth_images: Sequence[DepthImage] | None
     normals: Array | None  # (N, 3) outward, of any length
     colors: Array | None  # (N, 3)
-    segment_ids: Array | None  # (N,) integers, which `segments` of a region name
-    view_ids: Array | None  # (N,) integers: which of several positions of `viewpoint` saw each row
+    segment_ids: Array | None  # (N,) integers, used by `segments` of a region
+    view_ids: Array | None  # (N,) integers: index into `viewpoint` of the camera that saw each row
 
 
 class Request:
-    """A cloud or depth images, with options and arrays; InvalidRequestError: a wrong one."""
+    """A cloud or depth images, with options and arrays; raises InvalidRequestError."""
 
     def __init__(
         self,
@@ -101,14 +101,14 @@ class Request:
 
 
 class StreamRequest(Request):
-    """One request of a stream; `cloud` and `fields` as of `GraspClient.detect`."""
+    """One request of a stream; `cloud` and `fields` are those of `GraspClient.detect`."""
 
     def __init__(
         self,
         cloud: Cloud | None = None,
         *,
         request_id: str = "",  # of the answer; empty: the number of the request, from 0
-        timeout: float | None = None,  # seconds until it is no longer wanted; None: the stream's
+        timeout: float | None = None,  # seconds until the answer is too late; None: the stream's
         **fields: Unpack[RequestFields],
     ) -> None:
         super().__init__(cloud, fields)
@@ -117,11 +117,11 @@ class StreamRequest(Request):
 
 
 def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options in JSON form: lists instead of arrays, without those that are None.
+    """Options in JSON form: lists instead of arrays, without options that are None.
 
     Masks stay (N,) bool arrays, which each transport packs.
 
-    For `suppression` and `support`, None has a meaning of its own: none.
+    `suppression` and `support` are kept if None, which disables them.
 
     Raises:
         InvalidRequestError: An option's name is unknown.
@@ -139,7 +139,7 @@ def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def option_of_text(value: Any) -> Any:
-    """The value of an option that another program gives: text that is JSON stands for its value."""
+    """The value of an option from another program: text that is valid JSON is parsed."""
     try:
         return json.loads(value) if isinstance(value, str) else value
     except (RecursionError, ValueError):
@@ -149,8 +149,8 @@ def option_of_text(value: Any) -> Any:
 def on_mask(mask: Array, options: Mapping[str, Any] | None = None) -> DetectOptions:
     """Options that allow approach and contact points only where a mask is not 0.
 
-    The mask is (H, W) or (H, W, C), for each pixel of the depth image or row of the cloud, as a
-    segmentation network gives it; transparency, the last of two or four channels, is ignored.
+    The mask is (H, W) or (H, W, C), for example from a segmentation network, with a value for each
+    pixel of the depth image or row of the cloud. The alpha channel of two or four is ignored.
     Regions in `options` are narrowed; points outside stay obstacles.
     """
     colors = mask[..., : 1 if mask.shape[2:] == (2,) else 3]
@@ -166,31 +166,31 @@ def on_mask(mask: Array, options: Mapping[str, Any] | None = None) -> DetectOpti
 def object_in_scene(
     object_points: ArrayLike, scene_points: ArrayLike
 ) -> tuple[Float32, NDArray[np.int32]]:
-    """Merge the cloud (N, 3) of an object with that of its scene, (M, 3), with it or without it.
+    """Merge the cloud (N, 3) of an object with the cloud (M, 3) of its scene.
 
-    Both are in metres and in one frame.
+    Both are in metres and in the same frame. The scene may contain the object.
 
     Returns:
-        `cloud` (K, 3) and `segment_ids` (K,) for `GraspClient.detect`: 1 the object, 0 the rest,
-        without the points of the scene that repeat the object.
+        `cloud` (K, 3) and `segment_ids` (K,) for `GraspClient.detect`: 1 the object, 0 the rest.
+        Points of the scene that repeat the object are left out.
     """
     clouds = [np.asarray(each, np.float32).reshape(-1, 3) for each in (object_points, scene_points)]
     wanted, scene = (each[np.isfinite(each).all(axis=1)] for each in clouds)
-    digits = np.array([2**42, 2**21, 1])  # one number of three, each below 5 km
+    digits = np.array([2**42, 2**21, 1])  # combines three cell indices; coordinates below 5 km
     cells = [np.floor(each / SCENE_CELL).astype(np.int64) @ digits for each in (wanted, scene)]
     rest = scene[~np.isin(cells[1], cells[0])]
     segment_ids = np.repeat(np.array([1, 0], np.int32), [len(wanted), len(rest)])
     return np.concatenate([wanted, rest]), segment_ids
 
 
-# The forms of the wire
+# Wire formats
 
 
 def cloud_file(cloud: Cloud) -> tuple[str, bytes]:
-    """The cloud as a file, its format first, which is one of FILE_FORMATS.
+    """The cloud as a file: its format, one of FILE_FORMATS, and its bytes.
 
-    Points (N, 3) become float32. An array of a wrong shape is sent as it is, and the server refuses
-    it.
+    Points (N, 3) become float32. An array of a wrong shape is sent unchanged, and the server
+    refuses it.
 
     Raises:
         InvalidRequestError: It is neither an array of numbers nor a readable file of a known
@@ -235,10 +235,10 @@ def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
     needed, known = DepthImage.__required_keys__, DepthImage.__annotations__
     if not isinstance(image, Mapping) or not needed <= set(image) <= set(known):
         found = ", ".join(map(str, image)) if isinstance(image, Mapping) else type(image).__name__
-        fix = "Give a mapping with depth and intrinsics, T_cloud_camera and depth_scale or not."
+        fix = "Give a mapping with depth and intrinsics, and optional T_cloud_camera, depth_scale."
         raise invalid(path, found[:80], fix)
     given = image.get("T_cloud_camera", np.eye(4))
-    pose = np.asarray(given, dtype=object)  # also rows of different lengths
+    pose = np.asarray(given, dtype=object)  # accepts rows of different lengths
     if pose.shape != (4, 4) or not all(isinstance(each, Real) for each in pose.flat):
         raise invalid(f"{path}.T_cloud_camera", repr(given)[:80], "Give a 4 x 4 matrix.")
     depth = _depth_fields(image["depth"], f"{path}.depth")
@@ -252,7 +252,7 @@ def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
 
 
 def _depth_fields(depth: object, path: str) -> dict[str, Any]:
-    """The fields of edgegrasp.v1.Depth; a .png file is sent as it is."""
+    """The fields of edgegrasp.v1.Depth; a .png file is sent unchanged."""
     fix = f"Give an (H, W) array of {', '.join(DEPTH_ENCODINGS)}, or a .png or .npy file of one."
     if isinstance(depth, str | PathLike):
         file = Path(depth)
@@ -282,7 +282,7 @@ def _depth_fields(depth: object, path: str) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray) and value.dtype == bool:
         return value.ravel()
-    if hasattr(value, "tolist"):  # also array.array, as rclpy has parameters
+    if hasattr(value, "tolist"):  # also array.array, which rclpy uses for parameters
         return value.tolist()
     if isinstance(value, Mapping):
         mask = value.get("mask")
@@ -295,7 +295,7 @@ def _plain(value: Any) -> Any:
 
 
 def _sent(name: str, array: object) -> Array:
-    """An array of the request as it is sent; raises InvalidRequestError where it is none."""
+    """An array of the request in the form that is sent; raises InvalidRequestError."""
     kind, row = ARRAYS[name]
     fix = f"Give an array of {kind} numbers, of shape ({', '.join(['N', *map(str, row)])})."
     if not isinstance(array, np.ndarray):

@@ -15,7 +15,7 @@ from edgegrasp_results import ArmTrajectory, Detection
 
 @dataclass(frozen=True)
 class Model:
-    """Weights a server has loaded."""
+    """Weights that a server has loaded."""
 
     name: str
     architecture: str
@@ -24,28 +24,28 @@ class Model:
     crop_radius: float  # metres
     voxel_size: float  # metres
     gripper: str
-    default: bool  # whether a request that names no model gets these
+    default: bool  # whether a request that names no model uses these weights
     hand_description: bool  # whether the network also sees the hand-frame description
-    device: str = ""  # its device: "cpu", or a GPU such as "cuda:0"
+    device: str = ""  # "cpu", or a GPU such as "cuda:0"
 
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """An arm with a gripper on it. J joints; radians and seconds, metres of sliding joints."""
+    """An arm with a gripper. J joints; radians and seconds, metres for sliding joints."""
 
     name: str
-    gripper: str  # which grasps are for
+    gripper: str  # name of the gripper that its grasps are for
     base_frame: str  # link that `T_base_cloud` refers to
     joint_names: list[str]  # J
-    home: Float64  # (J,) where it touches nothing of itself
+    home: Float64  # (J,) position without self-collision
     lower: Float64  # (J,) limits
     upper: Float64
     max_velocity: Float64
     max_acceleration: Float64
-    # (J + 1, 4, 4) the frame of each joint at 0 in that of the joint before, the first in the base
-    # frame; the last is the hand's in the last joint's
+    # (J + 1, 4, 4) pose of each joint's frame, at joint value 0, in the previous joint's frame; the
+    # first is in the base frame; the last is the hand's pose in the last joint's frame
     frames: Annotated[Float64, (-1, 4, 4)]
-    axes: Annotated[Float64, (-1, 3)]  # (J, 3) that it turns about or slides along, own frame
+    axes: Annotated[Float64, (-1, 3)]  # (J, 3) axis of rotation or sliding, in the joint's frame
     sliding: list[bool]  # J
 
 
@@ -58,7 +58,7 @@ class StreamAnswer:
     error: errors.GraspClientError | None = None
 
     def result(self) -> Detection:
-        """The detection; raises the error where there is none."""
+        """The detection; raises the error if there is none."""
         if self.detection is None:
             assert self.error is not None
             raise self.error
@@ -78,7 +78,7 @@ Answer = TypeVar("Answer")
 
 
 def field_of(answer: Any, name: str) -> Any:
-    """A field of a JSON object, which has it, or of a message; None if it is absent."""
+    """A field of a JSON object or of a message; None if a message lacks it."""
     if isinstance(answer, Mapping):
         return answer[name]
     absent = answer.DESCRIPTOR.fields_by_name[name].has_presence and not answer.HasField(name)
@@ -89,7 +89,7 @@ def read_as(kind: type[Answer], answer: Any) -> Answer:
     """An answer, or an object in one, as one of the dataclasses above."""
     fields = _fields(cast("Any", kind))
     values = {name: value(field_of(answer, name)) for name, value in fields}
-    if kind is ArmTrajectory:  # gRPC has rows one behind the other
+    if kind is ArmTrajectory:  # gRPC has the rows flattened
         for name in ("positions", "velocities"):
             values[name] = values[name].reshape(-1, len(values["joint_names"]))
     return cast("Callable[..., Answer]", kind)(**values)
@@ -97,25 +97,25 @@ def read_as(kind: type[Answer], answer: Any) -> Answer:
 
 @cache
 def _fields(kind: type[Any]) -> list[tuple[str, Callable[[Any], Any]]]:
-    """Each field of a dataclass, and how its value is read."""
+    """Each field of a dataclass, with the function that reads its value."""
     hints = get_type_hints(kind, include_extras=True)
     return [(name, _value(hint)) for name, hint in hints.items()]
 
 
 def _value(hint: Any) -> Callable[[Any], Any]:
-    """How a field of such a type is read; arrays in the shape of the annotation."""
+    """The function that reads a field of this type; arrays get the shape of the annotation."""
     parts = [part for part in get_args(hint) if part is not NoneType]
     if NoneType in get_args(hint):
         given = _value(parts[0])
         scalar = parts[0] in (bool, float, int, str) or is_dataclass(parts[0])
-        # Of lists, gRPC sends none.
+        # gRPC sends an absent list as an empty one.
         return lambda value: None if value is None or not (scalar or len(value)) else given(value)
     if is_dataclass(hint):
         return partial(read_as, cast("type[Any]", hint))
     if get_origin(hint) is list:
         one = _value(parts[0])
         return lambda value: [one(part) for part in value]
-    if get_origin(hint) is dict:  # in the order of the stages; those of a newer server come last
+    if get_origin(hint) is dict:  # in the order of the stages; unknown stages come last
         return lambda value: {
             name: value[name] for name in (*_STAGES, *sorted(value)) if name in value
         }
@@ -128,7 +128,7 @@ def _value(hint: Any) -> Callable[[Any], Any]:
     return lambda value: value
 
 
-# Kinds of errors that a server reports; the last of some are gRPC's codes, as a proxy sends them.
+# Kinds of errors that a server reports; some end with gRPC codes, which a proxy may send.
 _KINDS: dict[type[errors.GraspClientError], tuple[str, ...]] = {
     errors.InvalidRequestError: (
         *("invalid-request", "unsupported-media-type", "headers-too-large", "harmful-request"),

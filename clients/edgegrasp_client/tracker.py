@@ -12,49 +12,49 @@ from edgegrasp_client.client import GraspClient
 from edgegrasp_client.options import DetectOptions, Previous
 from edgegrasp_results import DetectedObject, Detection
 
-GRASPS_PER_OBJECT = 4  # grasps on one object, of which the first is the one to keep
+GRASPS_PER_OBJECT = 4  # grasps sent for the followed object; the first is the grasp to keep
 MAX_OBJECTS = 64  # objects that a request may name
-SEARCHED_SUPPORTS = ("auto", "ransac")  # kinds of support that are looked for
-MIN_SCORE_SHARE = 0.7  # share of a grasp's first score, below which others are looked for
+SEARCHED_SUPPORTS = ("auto", "ransac")  # kinds of support that the detector searches for
+MIN_SCORE_SHARE = 0.7  # search for other grasps below this share of the first score
 
 
 class GraspTracker:
-    """Sends with each image what the last answer said, so that the answer follows it.
+    """Sends parts of the last answer with each image, so that the new answer follows them.
 
-    Most answers only move the grasps along with their object, in a fraction of the time; now and
-    then, and where the score drops or the grasp is lost, others are looked for too.
+    Most answers only move the grasps along with their object, in a fraction of the time. At
+    intervals, and if the score drops or the grasp is lost, other grasps are searched for too.
 
     Args:
-        search_every: Images after which others are looked for.
-        **options: Those of `GraspClient.detect`; the tracker sets `previous`.
+        search_every: Number of images between two searches for other grasps.
+        **options: Options of `GraspClient.detect`; the tracker sets `previous`.
     """
 
     def __init__(self, search_every: int = 30, **options: Unpack[DetectOptions]) -> None:
         self._options: dict[str, Any] = dict(options)
         self._every = search_every
-        self._last: Detection | None = None  # with a grasp
+        self._last: Detection | None = None  # the last answer that has a grasp
         self._objects: dict[int, DetectedObject] = {}
         self._next_id = 0
-        self._since = 0  # images since others were looked for
-        self._score = 0.0  # of the first grasp then
-        self._searching = True  # in the request that is to be answered
+        self._since = 0  # images since the last search
+        self._score = 0.0  # of the first grasp at the last search
+        self._searching = True  # whether the current request searches
         self._reader: threading.Thread | None = None  # of `_images`
         self._images: object = None
 
     def follow(
         self, client: GraspClient, images: Iterable[Mapping[str, Any]]
     ) -> Iterator[tuple[Mapping[str, Any], Detection]]:
-        """Find grasps in one image after the other.
+        """Find grasps in one image after another.
 
-        `images` are what `GraspClient.detect` gets, such as {"depth_images": [image]}. Of those
-        that come while one is at work, only the latest is sent.
+        `images` are arguments of `GraspClient.detect`, such as {"depth_images": [image]}. Of the
+        images that arrive while one is being processed, only the latest is sent.
 
         Yields:
-            An image and its answer. Raises GraspClientError, and whatever `images` raises.
+            An image and its answer. Raises GraspClientError, and any error that `images` raises.
         """
         latest: queue.Queue[Any] = queue.Queue(1)
         stopped = threading.Event()
-        if self._reader is not None and images is self._images:  # it may still wait for one
+        if self._reader is not None and images is self._images:  # it may still wait for an image
             self._reader.join()
         self._images = images
         self._reader = threading.Thread(target=_read, args=(images, latest, stopped), daemon=True)
@@ -68,7 +68,7 @@ class GraspTracker:
                 yield image, detection
         finally:
             stopped.set()
-            with suppress(queue.Empty):  # the end of the images waits for its place
+            with suppress(queue.Empty):  # make room for the end of the images
                 latest.get_nowait()
 
     def options(self) -> DetectOptions:
@@ -106,7 +106,7 @@ class GraspTracker:
         self._next_id = tracking.next_id
         self._since += 1
         if not self._searching and (tracking.first == "lost" or not detection.grasps):
-            self._since = self._every  # perhaps a bad image: look once more for the same grasp
+            self._since = self._every  # perhaps a bad image: search for the same grasp once more
             return
         if self._searching:
             self._objects, self._since, self._last = {}, 1, None
@@ -119,7 +119,7 @@ class GraspTracker:
 
 
 def _read(images: Iterable[Any], latest: "queue.Queue[Any]", stopped: threading.Event) -> None:
-    """Keep the latest image in a queue of one; then None, or the error that there was."""
+    """Keep the latest image in a queue of one; at the end put None, or the error of the images."""
     end = None
     try:
         for image in images:

@@ -1,6 +1,6 @@
-"""The answer to one request, as made by the model and as read by the client.
+"""The answer to one request, made by the model and read by the client.
 
-The shape in an array's annotation is the client's.
+The shape in an array's annotation is the shape that the client returns.
 """
 
 from dataclasses import dataclass, field
@@ -16,13 +16,13 @@ from edgegrasp_camera.arrays import Float32, Float64, Int64
 class ArmTrajectory:
     """A timed motion of an arm: to the pregrasp, straight to the grasp, straight out. T rows.
 
-    With a place, it goes on to above it, straight down, and back. The gripper opens before
-    `pregrasp_row`, closes at `grasp_row` and opens at `release_row`; the arm rests at each.
+    With a place, the arm continues to above the place, straight down, and back. The gripper opens
+    before `pregrasp_row`, closes at `grasp_row` and opens at `release_row`; the arm rests at each.
     """
 
     joint_names: list[str]  # J
     times: Float64  # (T,) seconds from the start
-    positions: Float64  # (T, J) radians, metres of sliding joints
+    positions: Float64  # (T, J) radians, metres for sliding joints
     velocities: Float64  # (T, J) per second
     pregrasp_row: int
     grasp_row: int
@@ -36,9 +36,9 @@ class ArmPlan:
     reachable: bool  # pregrasp, grasp and place without a collision
     pregrasp_joints: Float64 | None = None  # (J,) if reachable
     grasp_joints: Float64 | None = None  # (J,) if reachable
-    trajectory: ArmTrajectory | None = None  # if it was asked for and found in time
+    trajectory: ArmTrajectory | None = None  # if requested and found in time
     place_joints: Float64 | None = None  # (J,) at the release; None without a place
-    T_base_place: Annotated[Float64, (4, 4)] | None = None  # (4, 4) the hand there, base frame
+    T_base_place: Annotated[Float64, (4, 4)] | None = None  # (4, 4) hand at release, base frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,19 +53,19 @@ class Grasp:
     approach_point: Float32  # (3,) p_a, metres, cloud frame
     contact_point: Float32  # (3,) p_c, metres, cloud frame
     approach_direction: Float32  # (3,) unit, the direction the hand moves; +z of the hand
-    collision_free: bool  # whether the open hand touches nothing at the grasp and on its way
+    collision_free: bool  # whether the open hand touches nothing, also on its approach and retreat
     clearance: float  # metres from the open hand at the grasp to the nearest surface; < 0: inside
     object: int | None = None  # number of the object that the contact is on; None: no object
     arm: ArmPlan | None = None  # None: no robot was given, or time ran out
-    id: int | None = None  # the same in all answers that follow it; None without `previous`
-    far_side_hidden: bool = False  # whether no camera saw where the object ends beside a finger
+    id: int | None = None  # the same in all answers that follow the grasp; None without `previous`
+    far_side_hidden: bool = False  # whether no camera saw the object's far side, next to a finger
 
     def pregrasp(self, distance: float = 0.05) -> Float32:
         """The hand's pose (4, 4) `distance` metres back, where the straight approach begins."""
         return self.retreat(distance)
 
     def retreat(self, distance: float = 0.1, direction: ArrayLike | None = None) -> Float32:
-        """The hand's pose (4, 4) after a straight retreat of so many metres.
+        """The hand's pose (4, 4) after a straight retreat of `distance` metres.
 
         `direction` is (3,), cloud frame, of any length but zero, such as the detection's `up`;
         None: back along the approach.
@@ -82,13 +82,13 @@ class FoundSupport:
 
     normal: Float32  # (3,) unit, pointing up from the support
     offset: float  # metres
-    residual: float | None  # metres, median distance of its points; None: none of it is seen
-    share: float  # of the seen surface that lies in it
+    residual: float | None  # metres, median distance of its points; None: the plane is not visible
+    share: float  # share of the visible surface that lies in it
 
 
 @dataclass(frozen=True)
 class GripperOutline:
-    """The gripper of the grasps, as needed for drawing it; metres along the hand's z."""
+    """The gripper of the grasps, for drawing; metres along the hand's z."""
 
     name: str
     palm_z: float  # the palm's surface between the fingers
@@ -101,15 +101,15 @@ class DetectedObject:
 
     number: int  # as in `Grasp.object`; the segment, if segment_ids were sent
     points: int  # its number of voxels in the processed cloud
-    center: Float32  # (3,) of the smallest upright box around them
-    half_extents: Float32  # (3,) of that box, along its own axes, the last of which is up
+    center: Float32  # (3,) of the smallest upright box around its points
+    half_extents: Float32  # (3,) of this box, along its own axes, the last of which is up
     quaternion: Float32  # (4,) x, y, z, w: rotates the box's axes into the cloud's
-    best_score: float | None  # of the grasps returned; None: it has none
-    confidence: float | None  # probability that it is an object; None: given by the caller
+    best_score: float | None  # of its returned grasps; None: it has no grasp
+    confidence: float | None  # probability that it is real; None: given by the caller
     # Why it has no good grasp: "too-wide", "too-flat", "blocked" or "hidden"; None: it has one, or
     # there is another reason.
     reason: str | None
-    # (K, 3) points by which `previous` finds it again; the client's are flat, as sent back.
+    # (K, 3) points to find it again with `previous`; flat in the client, as sent back.
     surface: Annotated[Float32, (-1,)] | None = None
 
 
@@ -131,10 +131,10 @@ class DebugInfo:
     contact_index: Int64  # (E,) p_c, rows of `points`
     T_cloud_hand: Annotated[Float32, (-1, 4, 4)]  # (E, 4, 4)
     score: Float32  # (E,) NaN: not scored
-    outcome: list[str]  # E of them: "returned", or why it was not
+    outcome: list[str]  # E outcomes: "returned", or why it was not
     support_plane: Float32 | None  # (4,) unit normal and offset, given or found, metres
-    # (R,) of each row of the cloud as sent, images row by row: the number of its object; -1: an
-    # obstacle; -2: the support; -3: no reading, cut off or below the support.
+    # (R,) for each row of the cloud as sent, images row by row: the number of its object; -1: an
+    # obstacle; -2: the support; -3: no reading, cropped or below the support.
     labels: Int64
 
 
@@ -150,7 +150,7 @@ class Detection:
     warnings: list[str] = field(default_factory=list)
     debug: DebugInfo | None = None  # if `debug` is set
     support: FoundSupport | None = None  # given or found
-    # (3,) unit, away from gravity, as it was used
+    # (3,) unit, away from gravity, as the detector used it
     up: Float32 = field(default_factory=lambda: np.array([0, 0, 1], np.float32))
     objects: list[DetectedObject] = field(default_factory=list)  # the largest first
     tracking: Tracking | None = None  # if `previous` was sent
@@ -181,7 +181,7 @@ class Scoring:
 
 
 def plain(value: Any) -> Any:
-    """The JSON form of a part of an answer that JSON does not know; its floats are float32."""
+    """The JSON form of a part of an answer that has no JSON type; its floats are float32."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     fields = vars(value)
