@@ -1,4 +1,4 @@
-"""`edgegrasp benchmark`, and `edgegrasp compare` for what it wrote."""
+"""`edgegrasp benchmark`, and `edgegrasp compare` for its results."""
 
 import json
 import sys
@@ -38,7 +38,7 @@ class BenchmarkFlags(Cluster, PlannerFlags):
     scene: str | None = None
     """packed, pile, bin, bin-full, bin-deep, table or shelf; default: the protocol's, or pile"""
     protocol: str = "edgegrasp"
-    """edgegrasp, giga, vgn, bin, table, shelf, ur5-pile, or a .toml file like them"""
+    """edgegrasp, giga, vgn, bin, table, shelf, ur5-pile, or a .toml file"""
     rounds: int | None = None
     """Rounds for each seed; default: the protocol's"""
     seed: tuple[int, ...] = ()
@@ -46,11 +46,11 @@ class BenchmarkFlags(Cluster, PlannerFlags):
     objects: Path | None = None
     """Folder of SCENE/SPLIT/*.urdf, *.obj or *.stl; default: the built-in objects"""
     split: str = "test"
-    """Objects of this folder to use: test or train"""
+    """Part of the objects to use: test or train"""
     gripper: str | None = None
     """Hand to grasp with: a gripper's name or .toml file; default: the Panda"""
     output: Path | None = None
-    """Folder for manifest, attempts, figures and report; an existing one is resumed"""
+    """Folder for manifest, attempts, figures and report; an existing benchmark is resumed"""
     report: bool = True
     """Whether to write report.html, which takes a while"""
     gate: Path | None = None
@@ -114,7 +114,7 @@ def _plan(asked: BenchmarkFlags, options: dict[str, Any]) -> tuple[BenchmarkConf
 def benchmark_arm(
     name: str, camera: CameraRules
 ) -> tuple[ArmModel, dict[str, Any] | None, dict[str, Any]]:
-    """The robot's arm, on the camera's side of a scene as if the camera were on its wrist.
+    """The robot's arm, on the camera's side of a scene, like an arm with a wrist camera.
 
     Returns:
         The arm, the fields of its hand's file (None: the Panda's), and the options of each request.
@@ -125,7 +125,7 @@ def benchmark_arm(
     from edgegrasp_robot import load_robot  # an extra
 
     robot = load_robot(name)
-    # The base stands on the table, on the camera's side; its x points to the middle of the scene.
+    # The base is on the table, on the camera's side; its x points to the middle of the scene.
     azimuth = np.deg2rad(sum(camera.azimuth_degrees) / 2)
     out = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     T_world_base = np.eye(4)
@@ -149,7 +149,7 @@ def benchmark_arm(
 def compare(
     first: Annotated[Path, Argument(help="Folder that `benchmark --output` wrote.")],
     second: Annotated[Path, Argument(help="Another, of the same scenes.")],
-    output: Annotated[Path | None, Option(help="JSON file for the figures as well.")] = None,
+    output: Annotated[Path | None, Option(help="JSON file to write: the figures.")] = None,
 ) -> None:
     """Compare two benchmarks scene by scene, with 95 % confidence intervals."""
     figures = results.compare(ResultFolder(first), ResultFolder(second))
@@ -171,7 +171,7 @@ def run_rounds(
     config: BenchmarkConfig, asked: BenchmarkFlags, options: dict[str, Any], folder: ResultFolder
 ) -> None:
     """Run the rounds that a folder lacks, with a progress bar."""
-    from edgegrasp_lab.planners import open_planner  # loads gRPC, which help does without
+    from edgegrasp_lab.planners import open_planner  # loads gRPC, which --help does not need
 
     # Fails on a wrong folder before a server is started, and prepares meshes once for all workers.
     with Console(stderr=True).status("reading objects"):

@@ -1,4 +1,4 @@
-"""`edgegrasp benchmark-real`: grasps in scenes of real cameras, judged by labels, and drawn."""
+"""`edgegrasp benchmark-real`: find grasps in scenes of real cameras, judge and draw them."""
 
 import json
 import time
@@ -27,7 +27,7 @@ from edgegrasp_sim.report import image, page, table
 
 # Options that are set by the scene or by this command.
 DECIDED = ("viewpoint", "debug", "robot", "previous")
-SHARES = ("on_object", "from_below", "through_points")  # counts, which are shares of the best
+SHARES = ("on_object", "from_below", "through_points")  # counts, reported as shares of `best`
 PIXELS = ("pixel_precision", "pixel_recall")
 OVERLAPS = ("overlap_precision", "overlap_recall", "overlap_f")
 HEADS = (  # of the two tables; P, R and F in per cent
@@ -66,7 +66,7 @@ def benchmark_real(
             start = time.perf_counter()
             _ask(client, scene, fields)
             milliseconds = 1000 * (time.perf_counter() - start)
-            # Not timed: a server takes up to twice as long to send labels.
+            # Not timed: sending labels can double a server's time.
             found, refused = _ask(client, scene, {**fields, "debug": True})
             seen, labels = found.support, np.full(len(scene.points), UNLABELLED)
             plane = None if seen is None else (np.asarray(seen.normal, np.float64), seen.offset)
@@ -118,7 +118,7 @@ def _write(
 
 def summary(done: Sequence[SceneFigures]) -> dict[str, Any]:
     """Figures over all scenes; shares are of the judged grasps, None if there are none."""
-    # For a heap that is labelled as one object, neither plane nor objects are known.
+    # If a heap is labelled as one object, its plane and objects are unknown.
     apart = [figures for figures in done if figures.plane_labelled]
 
     def share(name: str) -> float | None:
@@ -165,7 +165,7 @@ def _rows(name: str, of: Mapping[str, Any], plane: str) -> tuple[tuple[str, ...]
 
 
 def _shares(*shares: float | None) -> str:
-    """Shares as numbers of per cent."""
+    """Shares as percentages."""
     return "/".join("-" if share is None else f"{100 * share:.0f}" for share in shares)
 
 

@@ -1,4 +1,4 @@
-"""`edgegrasp benchmark-tracking`: grasps followed through a camera's images, and then executed."""
+"""`edgegrasp benchmark-tracking`: follow grasps through a camera's images, then execute them."""
 
 import itertools
 import json
@@ -27,9 +27,9 @@ RATE = 30.0  # images a second
 NOISE, MISSING = (0.0003, 0.0015), 0.005  # metres, and metres per depth squared; share of pixels
 EYE, TARGET = np.array([0.15, -0.35, 0.65]), np.array([0.15, 0.15, 0.05])  # of the camera, metres
 OBJECTS = 3  # in a simulated scene
-REPEATED = 8  # images of a still scene in which the first grasp is looked for anew
-ALIKE = 0.02, 10.0  # metres and degrees within which it is the same one
-HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # a hand of two equal fingers is the same after it
+REPEATED = 8  # images of a still scene in which the first grasp is found without tracking
+ALIKE = 0.02, 10.0  # metres and degrees; grasps that differ by less count as the same
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # a hand with two equal fingers is symmetric to it
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class Motion:
     """How objects and the camera move between the first answer and the grasp."""
 
     seconds: float = 1.0
-    speed: float = 0.0  # of the object that is grasped, level, metres a second
-    belt: bool = False  # whether the others move with it
+    speed: float = 0.0  # horizontal speed of the object to grasp, metres a second
+    belt: bool = False  # whether the other objects move with it
     shift: float = np.inf  # metres after which it stops
-    turn: float = 0.0  # degrees about the vertical when it stops
-    camera: float = 0.0  # speed at which the camera comes nearer, metres a second
+    turn: float = 0.0  # rotation about the vertical until it stops, degrees
+    camera: float = 0.0  # speed of the camera toward the objects, metres a second
 
 
 MOTIONS = {
@@ -58,18 +58,18 @@ MOTIONS = {
 class Followed:
     """How the first grasp of a scene was followed."""
 
-    # Of each answer with it: seconds at which it was there, mm and degrees that it is off.
+    # For each answer that contains it: time in seconds, errors in mm and in degrees.
     off: list[tuple[float, float, float]] = field(default_factory=list)
     latency: list[float] = field(default_factory=list)  # seconds, of all answers
-    switches: int = 0  # to another first grasp, or to none
-    first: Any = None  # grasps; None: there was none
-    last: Any = None
+    switches: int = 0  # number of changes to another first grasp, or to none
+    first: Any = None  # the first grasp; None: there was none
+    last: Any = None  # the last first grasp
     success: dict[str, bool] = field(default_factory=dict)
-    alike: float | None = None  # share of pairs of images that have the same first grasp anew
+    alike: float | None = None  # share of image pairs with the same first grasp, without tracking
 
 
 class RecordedScene:
-    """A recorded scene that stands still, in each image with new noise of a depth camera."""
+    """A recorded still scene; each image has new noise of a depth camera."""
 
     def __init__(self, scene: RealScene) -> None:
         self.points = scene.points
@@ -83,10 +83,10 @@ class RecordedScene:
         return {"cloud": noisy[seen], "viewpoint": (0.0, 0.0, 0.0)}
 
     def hold(self, T_cloud_tcp: Float64) -> None:
-        """Choose the object that moves from now on: the one nearest to a grasp; here none does."""
+        """Choose the object nearest to a grasp, which moves from now on; here no object moves."""
 
     def moved(self, seconds: float) -> Float64:
-        """(4, 4) T_now_start of that object, cloud frame."""
+        """(4, 4) T_now_start of the chosen object, cloud frame."""
         return np.eye(4)
 
 
@@ -127,7 +127,7 @@ class SimulatedScene:
         return T
 
     def execute(self, done: Followed) -> dict[str, bool]:
-        """Try the first grasp at the start; the first, and the last one, in the end."""
+        """Try the first grasp at the start, and the first and the last grasp at the end."""
         first, last, end = done.first, done.last, self.motion.seconds
         tries = {"still": (first, 0.0), "open_loop": (first, end), "followed": (last, end)}
         success: dict[str, bool] = {}
@@ -171,14 +171,14 @@ def benchmark_tracking(
 ) -> None:
     """Follow a grasp at 30 images a second, then execute it in simulation.
 
-    The scene moves on while an answer is computed, and images that arrive meanwhile are dropped.
+    The scene keeps moving while an answer is computed; images that arrive meanwhile are dropped.
     An answer takes the processor time of its computation; with --server, the time until it arrives.
     """
     names = motion or (["still"] if scenes else list(MOTIONS))
     if unknown := [name for name in names if name not in MOTIONS]:
         raise ValueError(f"--motion: got {unknown[0]!r}. Choose one of {', '.join(MOTIONS)}.")
     if scenes and set(names) != {"still"}:
-        raise ValueError("--motion: got it beside --scenes, which stand still. Leave it out.")
+        raise ValueError("--motion: got it with --scenes, which are still. Leave it out.")
     clock = time.perf_counter if asked.server else time.process_time
     done: dict[str, list[Followed]] = {}
     with open_client(asked) as client:
@@ -283,7 +283,7 @@ def simulated(objects: Path | None, motion: Motion, rounds: int) -> Iterator[Sim
 
 
 def _plot(path: Path, done: dict[str, list[Followed]]) -> None:
-    """How far the first grasp is from where it should be, over time."""
+    """Plot the distance of the first grasp from its true position over time."""
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=(7, 2.8), layout="constrained")

@@ -11,9 +11,9 @@ class Cluster(BaseModel, use_attribute_docstrings=True):
     """The flags that choose the engine, the processes and the cluster."""
 
     engine: str | None = None
-    """pybullet or mujoco; default: the protocol's, or the one that is installed"""
+    """pybullet or mujoco; default: the protocol's, or the installed engine"""
     workers: int | None = None
-    """Processes, which do not change results; default: one per core"""
+    """Number of processes, without effect on results; default: one per core"""
     ray: str | None = None
     """Address of a Ray cluster to run on; local: this machine"""
 
@@ -26,9 +26,9 @@ class PlannerFlags(Connection):
     planner: str = "server"
     """server, in-process, name of an installed planner, or module:callable"""
     server: str | None = None
-    """host:port (gRPC) or http://host:port; without it, one is started"""
+    """host:port (gRPC) or http://host:port; default: a server is started"""
     weights: tuple[Path, ...] = ()
-    """Weights besides those that ship"""
+    """Weights, in addition to the built-in weights"""
     model: str = ""
     """Weights to use: a name or a .safetensors file; empty: the default"""
     robot: str | None = None

@@ -1,4 +1,4 @@
-"""Planners for clutter removal: a detector, on a server or in this process, or any by name."""
+"""Planners for clutter removal: a detector on a server or in this process, or a named planner."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
@@ -24,7 +24,7 @@ SHIPPED = ("server", "in-process")
 class ChosenPlanner(NamedTuple):
     """A factory of planners, and its description."""
 
-    make: Callable[[], Planner]  # in the process that uses it; can be sent to another
+    make: Callable[[], Planner]  # called in the process that uses the planner; picklable
     facts: dict[str, Any]  # for the manifest
 
 
@@ -34,7 +34,7 @@ def open_planner(
 ) -> Iterator[ChosenPlanner]:
     """Find a planner for a protocol; a server started for it runs for the duration of the context.
 
-    `options` are those of each request, in place of the protocol's.
+    `options` are for each request, and override the protocol's.
 
     Raises:
         ValueError: no such planner, or no such file of weights.
@@ -44,7 +44,7 @@ def open_planner(
     if choice.planner not in SHIPPED:
         unseen = options.keys() - {"gripper", "robot", "collision"}
         if choice.model or choice.weights or choice.server or unseen:
-            given = "leave out --model, --weights, --server and options, which it would not see"
+            given = "leave out --model, --weights, --server and options, which it does not get"
             raise ValueError(f"planner is {choice.planner}; {given}")
         _loaded(choice.planner)  # fails here on a wrong name, not in every worker
         yield ChosenPlanner(partial(named_planner, choice.planner), {"name": choice.planner})
@@ -82,9 +82,9 @@ def open_planner(
 
 
 def named_planner(name: str) -> Planner:
-    """The planner of a name: `module:attribute`, or an entry point of `edgegrasp.planners`.
+    """The planner with a name: `module:attribute`, or an entry point of `edgegrasp.planners`.
 
-    A class is called without arguments to make one. ValueError: there is no such planner.
+    A class is called without arguments. Raises ValueError if there is no such planner.
     """
     found = _loaded(name)
     return cast("Planner", found() if isinstance(found, type) else found)
@@ -109,7 +109,7 @@ def _loaded(name: str) -> Any:
 
 
 class _OneThread(OwnDetector):
-    """A detector on one thread, whose sums do not depend on the number of threads."""
+    """A detector on one thread, so that results do not depend on the number of threads."""
 
     def detect(self, cloud: Any = None, **options: Any) -> Any:
         from edgegrasp_model.scene.segment import one_thread
@@ -123,7 +123,7 @@ class ClientPlanner:
 
     def __init__(
         self,
-        open_client: Callable[[], Any],  # a GraspClient or the like
+        open_client: Callable[[], Any],  # returns a GraspClient or an OwnDetector
         rules: PlanningRules,  # of the protocol
         options: Mapping[str, Any],  # of each request, besides the protocol's
         timeout: float,  # seconds
@@ -135,7 +135,7 @@ class ClientPlanner:
         """The best grasp; None if there is none.
 
         Raises:
-            GraspClientError: the server refuses the request, or is away for `timeout`.
+            GraspClientError: the server refuses the request, or is unavailable for `timeout`.
             EdgeGraspError: the detector in this process refuses it.
         """
         options = request_options(observation, seed, self.rules, self.options)
@@ -151,7 +151,7 @@ class ClientPlanner:
             raise StartCollides(str(error)) from None
         if not grasps:
             return None
-        best = grasps[0]  # for an arm, those with a motion are first
+        best = grasps[0]  # for an arm, grasps with a motion are first
         motion = best.arm.trajectory if best.arm is not None else None
         if "robot" in options and motion is None:
             return None
@@ -159,7 +159,7 @@ class ClientPlanner:
 
 
 def model_used(client: Any, name: str) -> Model:
-    """The model that a request naming `name` gets, the default if empty. GraspClientError: none."""
+    """The model with a name, the default if empty; raises GraspClientError if there is none."""
     models: list[Model] = client.models()
     for model in models:
         if model.name == name or (model.default and not name):
@@ -171,7 +171,7 @@ def model_used(client: Any, name: str) -> Model:
 def request_options(
     observation: Observation, seed: int, rules: PlanningRules, extra: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Options of a detection under a protocol; `extra` ones win.
+    """Options of a detection under a protocol; `extra` options override them.
 
     The simulator's world frame is the cloud's frame, so that T_cloud_hand is T_world_hand.
     """

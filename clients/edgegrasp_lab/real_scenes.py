@@ -23,10 +23,10 @@ from edgegrasp_model.gripper import Gripper
 BEST = 10  # grasps of each scene that are judged
 GOOD_SCORE = 0.5
 FIRST_OBJECT = 2  # lower labels: 0 anything else, 1 the support plane
-BELOW = 0.1  # sine of the angle over the level; the detector's own limit, 6 degrees
+BELOW = 0.1  # sine of the upward angle of an approach; the detector's own limit, 6 degrees
 NOISE = 0.003  # metres; 98 % of the points of a depth camera's plane lie within it at 0.6 to 0.9 m
-FOUND_F = 0.75  # F from which a labelled object is found, as in the paper of `compare_labels`
-MAX_ANGLE, MAX_OFFSET = 5.0, 0.010  # degrees, metres: of a plane that is right
+FOUND_F = 0.75  # minimum F of a found object, as in the paper of `compare_labels`
+MAX_ANGLE, MAX_OFFSET = 5.0, 0.010  # degrees, metres: maximum errors of a correct plane
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class RealScene:
     points: Float32  # (R, 3) NaN where there is no reading
     labels: Int64  # (R,) 0 anything else, 1 the support plane, 2 and up objects
     normal: Float64  # (3,) of the support plane, toward the camera; 0: it is hidden
-    offset: float  # normal . x of its points
+    offset: float  # normal . x of the plane's points x
     camera: View
     rgb: NDArray[np.uint8] | None  # (H, W, 3)
 
@@ -55,16 +55,16 @@ class RealScene:
 
 @dataclass(frozen=True)
 class Segmentation:
-    """One image against its labels. Shares are 1 if there is nothing to compare."""
+    """One image compared with its labels. Shares are 1 if there is nothing to compare."""
 
-    pixel_precision: float  # of the pixels called an object, whichever
-    pixel_recall: float  # of the pixels labelled as an object, whichever
-    overlap_precision: float  # of the pixels called an object: those on the one it is matched to
-    overlap_recall: float  # of the pixels labelled as an object: the same
+    pixel_precision: float  # share of the detected object pixels that are labelled as any object
+    pixel_recall: float  # share of the labelled object pixels that are detected as any object
+    overlap_precision: float  # share of the detected object pixels on the matched object
+    overlap_recall: float  # share of the labelled object pixels on the matched object
     overlap_f: float  # harmonic mean of the two
     found: int  # labelled objects whose own F is FOUND_F or more
     labelled: int  # objects
-    called: int  # objects in the answer
+    called: int  # number of detected objects
 
 
 def compare_labels(labels: Int64, answer: Int64) -> Segmentation:
@@ -89,9 +89,9 @@ def compare_labels(labels: Int64, answer: Int64) -> Segmentation:
 
 
 def renumbered(labels: Int64, answer: Int64) -> Int64:
-    """The answer (R,) with the numbers of the labelled objects that its own are matched to.
+    """The answer (R,) with the numbers of the matching labelled objects.
 
-    Those that are matched to none get higher numbers.
+    Objects without a match get higher numbers.
     """
     (rows, columns), called, *_ = _matched(labels, answer)
     numbers = np.concatenate([[0], labels.max(initial=0) + 1 + np.arange(len(called))])
@@ -105,10 +105,10 @@ def _matched(
 ) -> tuple[tuple[Int64, Int64], Int64, Int64, Int64, Float64]:
     """Rows and columns (M,) of the pairs that overlap, matched for the greatest sum of F.
 
-    Also the pixels of each object called (C,), of each labelled (L,) and of each pair (C, L), and
-    the F of the matches (M,).
+    Also the pixels of each detected object (C,), of each labelled object (L,) and of each pair
+    (C, L), and the F of the matches (M,).
     """
-    # Background is in both, also where an image has none.
+    # Adds background to both, in case an image has none.
     count = crosstab(np.append(answer, 0), np.append(labels, 0)).count
     called, labelled, common = count[1:].sum(axis=1), count[:, 1:].sum(axis=0), count[1:, 1:]
     f = 2 * common / np.maximum(called[:, None] + labelled, 1)
@@ -136,25 +136,25 @@ class SceneFigures:
     """Evaluation of the answer for one scene: counts over its best grasps."""
 
     grasps: int  # in the answer
-    best: int  # of those judged, BEST at most
-    on_object: int  # approach and contact point on one and the same object
-    from_below: int  # the hand comes up through the support, whose plane is labelled
-    through_points: int  # the open hand at the grasp holds measured points
+    best: int  # grasps judged, BEST at most
+    on_object: int  # approach and contact point on the same object
+    from_below: int  # the hand approaches from below the labelled support plane
+    through_points: int  # the open hand at the grasp contains measured points
     objects: int  # in the scene
     objects_with_grasp: int  # with a grasp of GOOD_SCORE or more in the answer
     plane: PlaneFigures | None  # None: none was found
-    plane_labelled: bool  # otherwise the scene is a heap: its objects are one, its plane hidden
+    plane_labelled: bool  # False: a heap labelled as one object, which hides the plane
     segmentation: Segmentation
     milliseconds: float  # from the request to the answer
     refused: str = ""  # the reason, if the request was refused
 
 
 def load_scenes(folders: Sequence[Path]) -> list[RealScene]:
-    """The scenes of folders, by name in each.
+    """The scenes of folders, sorted by name in each folder.
 
     Raises:
-        ValueError: A folder has no scene, a file is not a scene, or two have the same name; names
-            file and fix.
+        ValueError: A folder has no scene, a file is not a scene, or two have the same name; the
+            message names file and fix.
     """
     files: list[Path] = []
     for folder in folders:
@@ -169,11 +169,11 @@ def load_scenes(folders: Sequence[Path]) -> list[RealScene]:
 
 
 def load_scene(file: Path) -> RealScene:
-    """Read one scene; raises ValueError, with file, field and fix, for what is none."""
+    """Read one scene; raises ValueError, with file, field and fix, if it is not a scene."""
     try:
         with file.open("rb") as opened, np.load(opened) as archive:
             arrays = dict(archive)
-    except Exception as error:  # of another file numpy raises whatever it stumbles over
+    except Exception as error:  # for other files numpy raises many kinds of errors
         fix = "Give what numpy.savez(file, ...) writes."
         raise ValueError(f"{file.name}: {error}. {fix}") from None
     checked = _Arrays(file.name, arrays)
@@ -191,7 +191,7 @@ def load_scene(file: Path) -> RealScene:
     rgb = arrays.get("rgb")
     if rgb is not None:
         checked.get("rgb", "u", "a colour of three bytes for each pixel", points.shape)
-    if camera is None:  # it is unknown, or could not have seen them
+    if camera is None:  # unknown, or no camera could have seen the points
         seen = points[np.isfinite(points).all(axis=-1)].reshape(-1, 3)
         camera, rgb = View.of(seen, np.zeros(3), normal if normal.any() else (0, -1, 0)), None
     return RealScene(file.stem, request, points.reshape(-1, 3), labels, normal, offset, camera, rgb)
@@ -203,7 +203,7 @@ def judge(
     # Normal (3,) and offset of the support plane that was found, camera frame.
     plane: tuple[Array, float] | None,
     answer: Int64,  # (R,) number of the object that each point is on, from 1; 0: on no object
-    gripper: Gripper,  # that the grasps are for
+    gripper: Gripper,  # the gripper of the grasps
     milliseconds: float,  # from the request to the answer
     refused: str = "",  # the reason, if the request was refused
 ) -> SceneFigures:
@@ -242,10 +242,10 @@ def _meet_points(scene: RealScene, grasps: Sequence[Any], gripper: Gripper) -> B
 
 
 def _objects_held(scene: RealScene, grasps: Sequence[Any]) -> Int64:
-    """The label (E,) of the object that both points of a grasp are on; 0 where there is none."""
+    """The label (E,) of the object that both points of a grasp are on; 0 if there is none."""
     seen = np.isfinite(scene.points).all(axis=1)
     ends = [(grasp.approach_point, grasp.contact_point) for grasp in grasps]
-    # Points of a grasp are means of small voxels, so they lie near a measured point, not on it.
+    # Points of a grasp are voxel means, which are near a measured point, but not on it.
     _, row = cKDTree(scene.points[seen]).query(np.asarray(ends).reshape(-1, 2, 3))
     label = scene.labels[seen][row]  # (E, 2)
     same = (label[:, 0] == label[:, 1]) & (label[:, 0] >= FIRST_OBJECT)

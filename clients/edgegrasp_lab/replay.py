@@ -1,4 +1,4 @@
-"""`edgegrasp replay`: repeat an attempt of a benchmark, or a request recorded by a server."""
+"""`edgegrasp replay`: repeat a benchmark's attempt, or a request recorded by a server."""
 
 import json
 import sys
@@ -35,7 +35,7 @@ def attempt(
     ] = None,
     objects: Annotated[Path | None, Option(help="Object folder, if it has moved.")] = None,
     picture: Annotated[
-        Path | None, Option(help="PNG to write: the cloud seen, and the gripper.")
+        Path | None, Option(help="PNG to write: the observed cloud and the gripper.")
     ] = None,
 ) -> None:
     """Repeat one recorded attempt, in its scene and view."""
@@ -70,9 +70,9 @@ def request(
 
 
 def answer_again(file: Path, settings: Settings) -> tuple[Job, Answer, Answer]:
-    """A recorded request, the answer that is recorded, and the answer now; raises ValueError."""
+    """A recorded request, the recorded answer, and the answer now; raises ValueError."""
     job = recorded = None
-    wrong = LookupError, MemoryError, OverflowError, TypeError, ValueError  # of another file
+    wrong = LookupError, MemoryError, OverflowError, TypeError, ValueError  # for other files
     with file.open("rb") as stream, suppress(*wrong):
         job, recorded = receive(stream), receive(stream)
     outcome = isinstance(job, Job) and job.method == "RecordOutcome"  # it would be recorded twice

@@ -1,4 +1,4 @@
-"""From simulation to weights: data and training, of grasps and of scenes, and imported weights."""
+"""Commands to generate training data, to train networks of both kinds, and to import weights."""
 
 import shlex
 import sys
@@ -56,7 +56,7 @@ class TrainFlags(TrainingOptions, use_attribute_docstrings=True):
     until: int | None = None
     """Pause at this step; the same command continues"""
     teacher: Path | None = None
-    """Weights of a hand network that also teaches a network of balls"""
+    """Weights of a hand network that also teaches a ball network"""
     start_from: Path | None = None
     """Weights of the same model to start from; use a lower --learning-rate"""
     outcomes: Path | None = None
@@ -78,7 +78,7 @@ def train(
     """Train weights on labelled views.
 
     The run folder gets log.csv, the weights with the least validation loss, and a model card when
-    training is done. The same command run again continues from the last state.
+    training is done. Run the same command again to continue from the last state.
     """
     from edgegrasp_model.detector import choose_device
     from edgegrasp_training.evaluation import recalibrate
@@ -126,19 +126,19 @@ def generate_scenes(
 ) -> None:
     """Make labelled depth images of simulated scenes to train the scene network on.
 
-    Files that are there already are kept, so that the same command goes on where it stopped.
+    Existing files are kept, so that the same command continues where it stopped.
 
     Example: edgegrasp generate-scenes data/scenes --objects OBJECTS --files 110
     """
     from edgegrasp_sim.workers import run_tasks
     from edgegrasp_training.scene_images import FILE, generate
 
-    choose_engine("pybullet")  # which reads the robot arms in the background
+    choose_engine("pybullet")  # it reads the robot arms of the background
     meshes = sorted(objects.glob("*/train/*_visual.obj"))
     if not meshes:
         raise ValueError(f"objects: got {objects}. Give a folder with */train/*_visual.obj.")
     missing = [number for number in range(files) if not (output / FILE.format(number)).exists()]
-    # Each worker makes neighbours, which draw from the same objects.
+    # Each worker makes neighbouring files, which draw from the same objects.
     parts = [part.tolist() for part in np.array_split(missing, workers)]
     list(run_tasks(partial(partial, generate, output, meshes, seed), parts, workers=workers))
     print(f"{len(list(output.glob('scenes-????.npz')))} files in {output}.")
@@ -164,9 +164,9 @@ def train_scene(
 
 
 def import_checkpoint(
-    directory: Annotated[Path, Argument(help="Holds the authors' *-ckpt-N.pt files.")],
+    directory: Annotated[Path, Argument(help="Folder with the authors' *-ckpt-N.pt files.")],
     output: Annotated[
-        Path | None, Argument(help="File to write; else ARCHITECTURE.safetensors here.")
+        Path | None, Argument(help="File to write; default: ARCHITECTURE.safetensors here.")
     ] = None,
 ) -> None:
     """Convert a checkpoint in the authors' layout to one safetensors file."""

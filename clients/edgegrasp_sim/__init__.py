@@ -1,1 +1,1 @@
-"""PyBullet clutter-removal trials."""
+"""Clutter-removal trials in simulation."""

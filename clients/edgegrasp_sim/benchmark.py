@@ -19,7 +19,7 @@ from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trial import MIN_SEEN, Planner, Round, RoundDriver
 from edgegrasp_sim.workers import run_tasks
 
-# Makes the planner in the process that uses it; must be picklable if there are several.
+# Makes the planner in the process that uses it; must be picklable for several processes.
 PlannerFactory: TypeAlias = Callable[[], Planner]
 PACKAGES = ("edgegrasp", "numpy", "scipy", "pybullet", "mujoco", "torch", "open3d-cpu")
 
@@ -30,13 +30,13 @@ class BenchmarkConfig:
 
     scene: SceneKind  # kind of the scenes
     rounds: int  # how many for each seed
-    seeds: tuple[int, ...] = (0,)  # with a round's number: scene, views, noise
+    seeds: tuple[int, ...] = (0,)  # a seed and a round's number determine scene, views and noise
     protocol: Protocol = field(default_factory=lambda: load_protocol("edgegrasp"))  # the constants
     objects: Path | None = None  # `<scene>/<split>/*.urdf`; None: the built-in set
     split: str = "test"  # of that folder
-    engine: str = ""  # to simulate with; by default see `choose_engine`, with the protocol's
-    gripper: dict[str, Any] | None = None  # of a file; None: the Panda's hand
-    arm: engines.ArmModel | None = None  # what carries the hand; None: it floats
+    engine: str = ""  # to simulate with; default: `choose_engine` with the protocol's engine
+    gripper: dict[str, Any] | None = None  # fields of a gripper file; None: the Panda's hand
+    arm: engines.ArmModel | None = None  # the arm that carries the hand; None: the hand floats
 
     def __post_init__(self) -> None:
         if self.rounds < 1:
@@ -46,11 +46,11 @@ class BenchmarkConfig:
         object.__setattr__(self, "engine", engines.choose_engine(self.engine, self.protocol.engine))
 
     def object_set(self) -> ObjectSet:
-        """The objects to draw scenes from; FileNotFoundError if `objects` holds none for them."""
+        """The objects to draw scenes from; FileNotFoundError if `objects` contains none."""
         return ObjectSet.from_folder(self.objects, self.scene, self.split)
 
     def simulation(self, digest: str) -> ClutterSimulation:
-        """What its rounds run in; ValueError: its objects have another digest."""
+        """The simulation for its rounds; raises ValueError if its objects have another digest."""
         objects = self.object_set()
         objects.check_same(digest)
         return ClutterSimulation(
@@ -83,7 +83,7 @@ def run_benchmark(
 def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]:
     """All that is needed to reproduce the figures; `planner` has name, weights, digest, options."""
     drawn = config.object_set()
-    # Named where it is not the Panda's, so that earlier results can be resumed.
+    # The Panda's hand is not named, so that earlier results can be resumed.
     carried: dict[str, Any] = {} if config.gripper is None else {"gripper": config.gripper}
     if config.arm is not None:
         carried["arm"] = config.arm.joint_names
@@ -153,7 +153,7 @@ class RoundRunner:
         return RoundDriver(*where, seed=seed, index=index).run(self.planner)
 
     def close(self) -> None:
-        """Release what simulation and planner hold."""
+        """Close the simulation and the planner."""
         self.simulation.world.close()
         if close := getattr(self.planner, "close", None):
             close()

@@ -11,7 +11,7 @@ from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_sim.engine import Intrinsics
 
 CAMERA = Intrinsics()
-FARTHEST = 0.999  # of the camera's range, from which there is nothing
+FARTHEST = 0.999  # share of the camera's range; at larger depths a pixel is empty
 TableView = Literal["known", "seen", "around", "auto"]
 Float = TypeVar("Float", bound=np.floating)
 
@@ -21,12 +21,12 @@ class Observation:
     """The point cloud of one or several depth images, and other input of a planner."""
 
     cloud: Float32  # (N, 3) world frame, metres; in the order of the pixels
-    workspace: Float32  # (2, 3) corners of where grasps are looked for, unless `auto`
-    table_height: float  # metres; not to be used where `table` is `auto`
+    workspace: Float32  # (2, 3) corners of the region for grasps, unless `table` is `auto`
+    table_height: float  # metres; not to be used if `table` is `auto`
     camera_positions: Float32  # (V, 3) float32, every camera, world frame, metres
     view_ids: NDArray[np.int32]  # (N,) int32, which camera saw each point
     table: TableView = "known"  # what the cloud contains, see `PlanningRules`
-    pixels: Int64 | None = None  # (N,) row-major; None: several images, or cut off
+    pixels: Int64 | None = None  # (N,) row-major; None: several images, or a cropped cloud
 
     @property
     def image(self) -> Float32:
@@ -56,7 +56,7 @@ Sizes = Annotated[tuple[PositiveFloat, PositiveFloat], AfterValidator(_ascending
 
 @dataclass(frozen=True, slots=True)
 class ViewRange:
-    """Where a camera may stand: ranges of spherical coordinates around `target`."""
+    """Possible camera positions: ranges of spherical coordinates around `target`."""
 
     radius: Sizes  # metres
     polar_degrees: Range  # from world z
@@ -83,7 +83,7 @@ EVALUATION_VIEWS = ViewRange((0.6, 0.75), (45.0, 60.0), (0.0, 180.0), (0.15, 0.1
 def look_at(eye: Float64, target: Float64) -> Float64:
     """Pose T_world_camera (4, 4) at `eye` that looks at `target` with world z up in the image.
 
-    Camera axes: x right, y down, z along the line of sight; where that is vertical, x is world x.
+    Camera axes: x right, y down, z along the line of sight; if z is vertical, x is world x.
     """
     sight = np.asarray(target, dtype=np.float64) - eye
     right = np.cross(sight, (0.0, 0.0, 1.0))

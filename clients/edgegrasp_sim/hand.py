@@ -1,4 +1,4 @@
-"""A hand, floating or on an arm, and a grasp with it: approach, close, retreat, the outcome."""
+"""A hand, floating or on an arm, and a grasp with it: approach, closing, retreat and outcome."""
 
 from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
@@ -17,29 +17,29 @@ from edgegrasp_sim.poses import quaternion_xyzw, translation
 from edgegrasp_sim.scene import SceneObject
 
 SHAPES = Path(__file__).parent / "panda_hand.obj"
-FINGERTIP = 0.1122  # metres ahead of the panda_hand link, of the Panda
-CENTRE = 0.04  # of mass
+FINGERTIP = 0.1122  # metres along z from the Panda's panda_hand link
+CENTRE = 0.04  # metres along z to the Panda's centre of mass
 CLOSE_SECONDS = 0.5
-SETTLE_SECONDS = 0.25  # of an arm at the grasp and at the end, in which the joints arrive
+SETTLE_SECONDS = 0.25  # for an arm's joints to settle at the grasp and at the end
 
-# Far above the table and out of the cameras' sight.
+# Far above the table and out of view of the cameras.
 _PARKED = translation(0.15, 0.15, 5.0)
 
 PREGRASP_DISTANCE = 0.05  # metres back along the approach
 RETREAT_DISTANCE = 0.10  # metres
 SIDE_GRASP_ANGLE = np.pi / 3  # radians from straight down; beyond it the hand lifts straight up
-# The reference asks for 0.10 m/s in pieces of 2 mm and rounds each down to whole steps of 1/80 s.
+# The reference moves at 0.10 m/s in pieces of 2 mm and rounds each down to whole steps of 1/80 s.
 STEP_LENGTH = 0.002  # metres in each time step
 MIN_OPENING = 0.001  # metres; thinner than any object that is held
 
-# When a grasp that need not be run to its end has a clear outcome.
-STILL = 5e-5  # metres that fingers at rest still close in a time step
+# Conditions for a clear outcome, after which a grasp may be stopped.
+STILL = 5e-5  # metres per time step; fingers at rest close by less
 STILL_STEPS = 5
 EMPTY_STEPS = 2  # time steps without contact
-HELD_STEPS = 4  # time steps in which an object hangs from the fingers and moves with them
-SLIP = 2e-4  # metres that a firmly held object still moves in the hand in a time step
-LIFT_STEP = 0.005  # metres in each time step of a retreat whose outcome is clear: 0.4 m/s
-# Metres behind the fingertips at which to look for the object between the fingers, best first.
+HELD_STEPS = 4  # time steps in which an object touches only the hand and moves with it
+SLIP = 2e-4  # metres per time step; a firmly held object moves in the hand by less
+LIFT_STEP = 0.005  # metres in each time step of lifting before shaking: 0.4 m/s
+# Depths behind the fingertips, metres, to search for the object between the fingers, best first.
 _TARGET_DEPTHS = (0.007, 0.002, 0.015, 0.025)
 
 
@@ -60,26 +60,26 @@ class GraspResult:
     opening: float  # metres between the fingers at the end
     start_contact: bool  # whether the open hand overlapped something at its start pose
     held: SceneObject | None  # the object held, None if nothing is
-    target: SceneObject | None = None  # between the fingers before the hand came
+    target: SceneObject | None = None  # the object between the fingers before closing
     cause: FailureCause | None = None  # why it failed, None if it did not
     held_after_shaking: bool | None = None  # None if the hand was not shaken
-    # (T, 3) where an arm overlapped something before its pregrasp, world frame, metres.
+    # (T, 3) points at which an arm collided before its pregrasp, world frame, metres.
     touched_on_the_way: tuple[Sequence[float], ...] = ()
 
     @property
     def success(self) -> bool:
-        """Whether the hand came away holding something."""
+        """Whether the hand held an object after the retreat."""
         return self.cause is None
 
 
 def run_grasp(
     gripper: "Gripper",  # the hand to use
     T_world_hand: Float64,  # pose of the `panda_hand` link at the grasp, (4, 4)
-    objects: Mapping[int, SceneObject],  # what may be held, by the id of its body
-    obstacles: Set[int] = frozenset(),  # cutting into these bodies fails the grasp
+    objects: Mapping[int, SceneObject],  # objects that may be held, by the id of their bodies
+    obstacles: Set[int] = frozenset(),  # bodies; a collision with one fails the grasp
     *,
     to_the_end: bool,  # otherwise stop once the outcome is clear
-    shake: bool = False,  # a held object at the end; no change of `success`
+    shake: bool = False,  # shake a held object at the end; does not change `success`
 ) -> GraspResult:
     """Run a grasp from its start pose to the end of the retreat; the hand stays there."""
     gripper.start(T_world_hand)
@@ -128,22 +128,22 @@ def run_grasp(
 
 
 def retreat_pose(T_world_hand: Float64) -> Float64:
-    """Where the hand goes after closing: back along the approach, or up after a side grasp."""
+    """The hand's pose after the retreat: back along the approach, or up after a side grasp."""
     if -T_world_hand[2, 2] < np.cos(SIDE_GRASP_ANGLE):
         return translation(0.0, 0.0, RETREAT_DISTANCE) @ T_world_hand
     return T_world_hand @ translation(0.0, 0.0, -RETREAT_DISTANCE)
 
 
 class Gripper:
-    """The simulated hand, in the hand frame of its file: z out of the palm, y closes."""
+    """The simulated hand, in the hand frame of its file: z out of the palm, y the closing axis."""
 
     body: Hand
-    motion: ArmTrajectory | None = None  # of an arm, in the next grasp
-    on_the_way = False  # whether it is on an arm that has not come to its pregrasp
+    motion: ArmTrajectory | None = None  # the arm's motion for the next grasp
+    on_the_way = False  # whether the hand is on an arm that has not reached its pregrasp
 
     def __init__(self, world: World, model: HandModel, min_opening: float) -> None:
         self.world, self.model, self.min_opening = world, model, min_opening
-        self._T_hand_com = translation(*model.centre)  # the engine moves bodies by it
+        self._T_hand_com = translation(*model.centre)  # engines set poses of the centre of mass
         self.body = world.add_hand(model, _PARKED[:3, 3])
         self.park()
 
@@ -153,7 +153,7 @@ class Gripper:
         return self.body.opening <= self.min_opening
 
     def park(self) -> None:
-        """Put the open hand where it touches nothing and no camera sees it."""
+        """Move the open hand out of the scene and out of view of the cameras."""
         self.place(_PARKED)
 
     def start(self, T_world_hand: Float64) -> None:
@@ -165,12 +165,12 @@ class Gripper:
         return self.steps_to(retreat_pose(T_world_hand) if away else T_world_hand, STEP_LENGTH)
 
     def place(self, T_world_hand: Float64) -> None:
-        """Place the open hand there at once, at rest."""
+        """Set the pose of the open hand at once, at rest."""
         T_world_com = T_world_hand @ self._T_hand_com
         self.body.set_pose(T_world_com[:3, 3], quaternion_xyzw(T_world_com))
 
     def steps_to(self, T_world_hand: Float64, step_length: float) -> Iterator[None]:
-        """Drag the hand straight there, `step_length` metres a time step; yields after each."""
+        """Pull the hand straight to a pose, `step_length` metres a time step; yields after each."""
         T_world_com = T_world_hand @ self._T_hand_com
         quaternion = quaternion_xyzw(T_world_com)
         position = self.body.position
@@ -192,11 +192,11 @@ class ArmGripper(Gripper):
         self.body = self._arm = world.add_arm(arm, hand)
 
     def park(self) -> None:
-        """Put the arm to its home, the hand open."""
+        """Set the arm to its home position, with the hand open."""
         self._arm.rest()
 
     def start(self, T_world_hand: Float64) -> None:
-        """Start at home, wherever the grasp is."""
+        """Start at home, for any grasp."""
         self.park()
 
     def go(self, T_world_hand: Float64, *, away: bool) -> Iterator[None]:
@@ -220,13 +220,13 @@ class ArmGripper(Gripper):
 
 
 def seconds_of(motion: ArmTrajectory) -> float:
-    """Seconds of the motion from home to the grasp, away, and back home the same way."""
+    """Seconds of the motion from home to the grasp, away from it, and home on the same path."""
     return float(motion.times[-1] + motion.times[motion.pregrasp_row]) + CLOSE_SECONDS
 
 
 @cache
 def panda() -> HandModel:
-    """The Panda's hand, of the convex hulls of its meshes: palm at z = 0.0658, metres."""
+    """The Panda's hand, from the convex hulls of its meshes; its palm is at z = 0.0658 metres."""
     shapes = dict(parse_obj(SHAPES.read_text()))
     finger = shapes["finger"].points
     return HandModel(
@@ -242,7 +242,7 @@ def panda() -> HandModel:
 
 
 def hand_of(gripper: Mapping[str, Any]) -> HandModel:
-    """The hand of boxes that the fields of a valid gripper file describe: see docs/frames.md."""
+    """The hand of boxes described by the fields of a valid gripper file, see docs/frames.md."""
     palm, finger = (np.array(gripper[part]["boxes"], float) for part in ("hand", "finger"))
     opening, root = float(gripper["max_opening"]), float(finger[:, 0, 2].min())
     finger[..., 2] -= root
@@ -250,7 +250,7 @@ def hand_of(gripper: Mapping[str, Any]) -> HandModel:
         ((boxes.min(axis=(0, 1)) + boxes.max(axis=(0, 1))) / 2).tolist() for boxes in (palm, finger)
     )
     advance, held = None, 0.0
-    if (swing := gripper.get("swing")) is not None:  # on a circle, to a hundredth of its reach
+    if (swing := gripper.get("swing")) is not None:  # fit the circle to a hundredth of its reach
         radius, reach, half = swing["radius"], swing["reach"], np.linspace(0.0, opening / 2, 50)
         ahead = np.sqrt(radius**2 - (reach - opening / 2 + half) ** 2)
         ahead -= np.sqrt(radius**2 - reach**2)
@@ -269,13 +269,13 @@ def hand_of(gripper: Mapping[str, Any]) -> HandModel:
 
 
 def _corners(boxes: Float64) -> Parts:
-    """The eight corners (8, 3) of each of some boxes (B, 2, 3)."""
+    """The eight corners (8, 3) of each box (B, 2, 3)."""
     pick = np.indices((2, 2, 2)).reshape(3, 8).T  # lower or upper, of x, y and z
     return tuple(box[pick, np.arange(3)] for box in boxes)
 
 
 def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: bool) -> None:
-    """Close the fingers; unless `to_the_end`, only until they are shut or hold firmly."""
+    """Close the fingers; unless `to_the_end`, stop when they are shut or hold firmly."""
     opening, still_steps = gripper.body.opening, 0
     gripper.body.close_fingers()
     for _ in range(round(CLOSE_SECONDS / TIME_STEP)):
@@ -290,16 +290,16 @@ def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: 
 def _is_clear(
     gripper: Gripper, objects: Mapping[int, SceneObject], opening: float
 ) -> Iterator[bool]:
-    """After every time step of a retreat, whether it is clear what the hand will hold.
+    """Yields, after every time step of a retreat, whether the outcome is clear.
 
-    The fingers are empty then, or hold one object that rests on nothing else.
+    It is clear if the fingers are empty, or hold one object that touches nothing else.
     """
     hand, empty_steps, held_steps = gripper.body, 0, 0
     offset: Float64 | None = None
     while True:
         touched = _touched(gripper, objects)
         before, opening = opening, hand.opening
-        closing = abs(opening - before) >= STILL  # and may yet catch something
+        closing = abs(opening - before) >= STILL  # fingers that may still catch an object
         empty_steps = 0 if touched or closing else empty_steps + 1
         held = touched[0].body if len(touched) == 1 else None
         if held is None or any(contact.other_uid != hand.uid for contact in held.contacts()):
@@ -341,7 +341,7 @@ def _touched(gripper: Gripper, objects: Mapping[int, SceneObject]) -> list[Scene
 def _object_between_fingers(
     gripper: Gripper, T_world_hand: Float64, objects: Mapping[int, SceneObject]
 ) -> SceneObject | None:
-    """The object between the fingers of a hand at the grasp: the first that rays across hit."""
+    """The object between the fingers at the grasp: the first hit by rays from finger to finger."""
     half, depths = 0.5 * gripper.model.max_opening, [gripper.model.tip - d for d in _TARGET_DEPTHS]
     ends = np.array([[0.0, side * half, z, 1.0] for z in depths for side in (1, -1)])
     rays = ((each @ T_world_hand.T)[:, :3] for each in (ends, ends * (1.0, -1.0, 1.0, 1.0)))

@@ -1,4 +1,4 @@
-"""Objects to make scenes of: folders of URDF files or meshes, built-in ones, computed ones.
+"""Objects for scenes: folders of URDF files or meshes, built-in objects, computed objects.
 
 A mesh is scaled to the hand, decomposed into convex parts and cached on disk.
 """
@@ -23,18 +23,18 @@ from edgegrasp_sim.engine.urdf import convex_hull
 
 MESH_SUFFIXES = (".obj", ".stl")
 LAYOUT = 1  # of cached objects; raised whenever what is written changes
-SHORTEST_SIDE = 0.06  # metres, of the box around an object; fits between the fingers
+SHORTEST_SIDE = 0.06  # metres, of an object's bounding box; fits between the fingers
 LONGEST_SIDE = 0.15  # metres; five such objects fit into the workspace
-# How closely convex parts follow a concave surface, as a share of its size (coacd's threshold).
+# Greatest error of convex parts at a concave surface, as a share of its size (coacd's threshold).
 CONCAVITY = 0.05
-# A short search for cuts: a second or two for a closed mesh, a minute for a torn one.
+# A short search for cuts: a second or two for a closed mesh, a minute for one with holes.
 SEARCH = {"mcts_iterations": 20, "mcts_nodes": 8, "mcts_max_depth": 2, "resolution": 1000}
 Size = tuple[float, float, float]
 Mesh = tuple[Float64, Int64]  # points (P, 3), triangles (F, 3)
 
 
 class SceneKind(StrEnum):
-    """How a scene is made: upright, dropped on a heap or into a bin, on a table or a shelf."""
+    """Kind of a scene: objects upright, in a heap, in a bin, on a table or on a shelf."""
 
     PACKED = "packed"
     PILE = "pile"
@@ -46,7 +46,7 @@ class SceneKind(StrEnum):
 
     @property
     def objects(self) -> "SceneKind":
-        """The kind whose objects it uses unless it has its own."""
+        """The kind whose objects are used if a folder has none for this kind."""
         upright = self in (SceneKind.PACKED, SceneKind.TABLE, SceneKind.SHELF)
         return SceneKind.PACKED if upright else SceneKind.PILE
 
@@ -55,7 +55,7 @@ class SceneKind(StrEnum):
         raise ValueError(f"scene is {value!r}; choose one of {', '.join(cls)}")
 
 
-CLUTTER = (SceneKind.PACKED, SceneKind.PILE)  # those of the published clutter removal
+CLUTTER = (SceneKind.PACKED, SceneKind.PILE)  # kinds of the published clutter removal
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,12 +64,12 @@ class ObjectModel:
 
     name: str  # unique within its set
     urdf: Path  # its description
-    scale: float = 1.0  # factor that brings it to the size of the hand, before a scene's own scale
-    origin: "ObjectModel | None" = None  # the object that it is a stretched copy of, if it is one
+    scale: float = 1.0  # factor that fits it to the hand, before a scene's own scale
+    origin: "ObjectModel | None" = None  # the original, if it is a stretched copy
 
     @property
     def files(self) -> list[Path]:
-        """Its URDF file and the meshes that it names, sorted by name; ValueError: unusable."""
+        """Its URDF file and the meshes that it names, sorted; raises ValueError if unusable."""
         try:
             root = ElementTree.parse(self.urdf).getroot()
         except ElementTree.ParseError as error:
@@ -92,8 +92,8 @@ class ObjectModel:
 class ObjectSet:
     """Objects to draw scenes from."""
 
-    name: str  # what to call the set in a report
-    models: tuple[ObjectModel, ...]  # at least one, in an order that is the same on every machine
+    name: str  # name of the set in a report
+    models: tuple[ObjectModel, ...]  # at least one, in the same order on every machine
 
     @property
     def digest(self) -> str:
@@ -121,9 +121,9 @@ class ObjectSet:
     def from_folder(cls, root: Path | None, scene: SceneKind, split: str = "test") -> "ObjectSet":
         """The objects of a folder, sorted by name; raises as `prepare_mesh`, or FileNotFoundError.
 
-        URDF files in `<root>/<scene>/<split>` (VGN's layout), for bins, tables and shelves those of
-        piles and packed scenes where they have no such folder, or in `root` itself; else meshes
-        there, `.obj` or `.stl`. Without a `root`, those of `builtin`.
+        URDF files, else `.obj` or `.stl` meshes, in `<root>/<scene>/<split>` (VGN's layout) or in
+        `root` itself. Bins, tables and shelves without a folder of their own use that of piles or
+        packed scenes. Without a `root`, the objects of `builtin`.
         """
         if root is None:
             return cls.builtin(scene)
@@ -147,7 +147,7 @@ class ObjectSet:
 
     @classmethod
     def builtin(cls, scene: SceneKind) -> "ObjectSet":
-        """Graspable objects that need no files: boxes and cans, and for piles random shapes too."""
+        """Graspable objects that need no files: boxes, cans, and for piles also random shapes."""
         folder = _kept_in(f"builtin-{LAYOUT}", _write_builtin)
         names = [f"{family}-{k}" for family, shapes in STANDING.items() for k in range(len(shapes))]
         if scene.objects is SceneKind.PILE:
@@ -157,7 +157,7 @@ class ObjectSet:
 
 
 def blob(number: int, folder: Path, scale: float = 1.0) -> ObjectModel:
-    """Write a convex object of random shape, always the same for its number, into a folder."""
+    """Write a convex object of random shape, determined by its number, into a folder."""
     rng = np.random.default_rng(number)
     directions = rng.normal(size=(30, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -169,11 +169,11 @@ def blob(number: int, folder: Path, scale: float = 1.0) -> ObjectModel:
 
 
 def prepare_mesh(mesh: Path) -> Path:
-    """Make a simulated object of an `.obj` or `.stl` file, or look it up; returns its URDF file.
+    """Make a simulated object from an `.obj` or `.stl` file, or look it up; returns its URDF file.
 
-    The box around it gets a shortest side of `SHORTEST_SIDE`, and no side over `LONGEST_SIDE`; z
+    Its bounding box gets a shortest side of `SHORTEST_SIDE`, and no side over `LONGEST_SIDE`; z
     points up in packed scenes. The camera sees the mesh itself; contacts use its convex parts.
-    ValueError: it is no solid mesh; ModuleNotFoundError: coacd or trimesh is not installed.
+    Raises ValueError if it is not a solid mesh, ModuleNotFoundError without coacd or trimesh.
     """
     try:
         import coacd
@@ -196,7 +196,7 @@ def prepare_mesh(mesh: Path) -> Path:
         visible, hulls = ([(m.vertices, m.faces) for m in meshes] for meshes in ([surface], parts))
         write_parts("object", visible, hulls, solid.center_mass, folder)
 
-    # Everything that decides how it is prepared.
+    # All parameters that determine the prepared object.
     sizes = SHORTEST_SIDE, LONGEST_SIDE, CONCAVITY
     recipe = LAYOUT, sizes, SEARCH, version("coacd"), mesh.suffix.lower()
     digest = hashlib.sha256(repr(recipe).encode() + mesh.read_bytes()).hexdigest()
@@ -204,12 +204,12 @@ def prepare_mesh(mesh: Path) -> Path:
 
 
 def cache_folder() -> Path:
-    """Where prepared objects are kept: below `$XDG_CACHE_HOME`, else below `~/.cache`."""
+    """The folder of prepared objects, in `$XDG_CACHE_HOME`, else in `~/.cache`."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "edgegrasp" / "meshes"
 
 
 def write_object(name: str, surface: str, folder: Path) -> Path:
-    """Write an object, `surface` in OBJ and metres; the engine takes its convex hull."""
+    """Write an object from an OBJ `surface` in metres; the engine uses its convex hull."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.obj").write_text(surface)
     return _write_urdf(folder, name, name, name)
@@ -218,11 +218,11 @@ def write_object(name: str, surface: str, folder: Path) -> Path:
 def write_parts(
     name: str,  # of the object
     visible: Iterable[Mesh],  # meshes that a camera sees, metres
-    parts: Iterable[Mesh],  # convex meshes; the engine takes the hull of each
+    parts: Iterable[Mesh],  # convex meshes; the engine uses the hull of each
     centre: Float64,  # (3,) its centre of mass, metres
     folder: Path,  # gets the meshes and `<name>.urdf`; created if missing
 ) -> Path:
-    """Write an object of convex parts, so that hollow ones stay hollow; returns its URDF file."""
+    """Write an object of convex parts, which may be hollow; returns its URDF file."""
     folder.mkdir(parents=True, exist_ok=True)
     names = f"{name}_visual", f"{name}_collision"
     for mesh, surfaces in zip(names, (visible, parts), strict=True):
@@ -234,7 +234,7 @@ def write_parts(
 def as_obj(
     meshes: Iterable[Mesh],  # points (P, 3) and triangles (F, 3) of each
     *,
-    named: bool = False,  # each mesh an object, of which the engine takes the hull
+    named: bool = False,  # whether each mesh is a named object, of which the engine uses the hull
 ) -> str:
     """Meshes as one OBJ file."""
     lines, before, decimals = [], 1, 7 if named else 6
@@ -248,9 +248,9 @@ def as_obj(
 
 
 def _prism(sides: int, size: Size) -> str:
-    """An upright prism as an OBJ file: its base is regular, and unlike a cylinder it does not roll.
+    """An upright prism with a regular base as an OBJ file; unlike a cylinder it does not roll.
 
-    `sides` are those of the base, 4 or more; `size` is the full extents along x, y and z, metres.
+    `sides` is the number of sides of the base, 4 or more; `size` are the full extents, metres.
     """
     angles = np.pi / sides * (2 * np.arange(sides) + 1)
     base = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -263,8 +263,8 @@ def _prism(sides: int, size: Size) -> str:
     return as_obj([(corners, np.array(faces))])
 
 
-# The built-in objects that stand upright, by family: sides of the base and full extents of boxes
-# and cans, metres, as they come into a scene. Large: 60 to 70 mm in a hand that opens 80 mm.
+# The built-in upright objects, by family: sides of the base and full extents of boxes and cans,
+# metres, before a scene's own scale. Large: 60 to 70 mm for a hand that opens 80 mm.
 STANDING: dict[str, tuple[tuple[int, Size], ...]] = {
     "regular": (
         *((4, (0.03, 0.03, 0.08)), (4, (0.04, 0.04, 0.04)), (4, (0.03, 0.05, 0.07))),
@@ -275,7 +275,7 @@ STANDING: dict[str, tuple[tuple[int, Size], ...]] = {
         *((10, (0.06, 0.06, 0.12)), (10, (0.065, 0.065, 0.10)), (10, (0.07, 0.07, 0.08))),
     ),
 }
-_BLOBS = 12  # random shapes that the sets of piles hold besides
+_BLOBS = 12  # random shapes in the built-in set for piles
 
 
 def _write_builtin(folder: Path) -> None:
@@ -304,12 +304,12 @@ def _read(mesh: Path) -> Any:
 
     try:
         surface: Any = trimesh.load(mesh, force="mesh", process=True, skip_materials=True)
-    except Exception as error:  # readers of meshes raise whatever they stumble over
+    except Exception as error:  # readers of meshes raise many kinds of errors
         raise ValueError(f"{mesh} cannot be read as a mesh: {error}") from error
     if len(surface.faces) == 0 or surface.extents is None:
         raise ValueError(f"{mesh} contains no triangles; export the object as a triangle mesh")
     flat = not np.isfinite(surface.vertices).all() or min(surface.extents) <= 1e-9
-    if not flat:  # along the axes; it may still be a tilted sheet
+    if not flat:  # not flat along an axis, but it may be a tilted sheet
         sides = surface.bounding_box_oriented.primitive.extents
         flat = min(sides) <= 1e-6 * max(sides)
     if flat:

@@ -18,7 +18,7 @@ def about_z(angle: float) -> tuple[float, float, float, float]:
 
 
 def translation(x: float, y: float, z: float) -> Float64:
-    """A 4 x 4 transform that moves by (x, y, z) metres and does not turn."""
+    """A 4 x 4 transform that moves by (x, y, z) metres without rotation."""
     T = np.eye(4)
     T[:3, 3] = (x, y, z)
     return T

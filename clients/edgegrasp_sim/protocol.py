@@ -1,4 +1,4 @@
-"""Protocols: the constants of a benchmark besides planner and objects.
+"""Protocols: the constants of a benchmark, other than planner and objects.
 
 A protocol is a named and versioned file in `protocols/`; its constants go into every result.
 """
@@ -27,23 +27,23 @@ class SceneRules:
 
     # How many objects to try to place, in turn from round to round.
     num_objects: Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
-    packed_scale: Sizes  # range of the factor on the objects' size in packed scenes and on tables
-    pile_scale: Sizes  # range of that factor in piles and bins
+    packed_scale: Sizes  # range of the scale of objects in packed scenes, on tables and shelves
+    pile_scale: Sizes  # range of the scale of objects in piles and bins
     table_thickness: NonNegativeFloat = OPEN_THICKNESS  # of packed and pile scenes, metres
 
 
 @dataclass(frozen=True, config=STRICT)
 class RoundRules:
-    """What counts as held, and conditions that end a round."""
+    """The criterion for a held object, and conditions that end a round."""
 
-    min_opening: NonNegativeFloat  # metres between fingers; open by less, a hand holds nothing
+    min_opening: NonNegativeFloat  # metres between the fingers; below this a hand holds nothing
     max_consecutive_failures: PositiveInt  # failed grasps in a row that end a round
     max_no_grasp: PositiveInt  # views without any grasp that end a round
 
 
 @dataclass(frozen=True, config=STRICT)
 class CameraRules(ViewRange):
-    """Where the camera stands; ranges are drawn from uniformly before every grasp."""
+    """The camera's position, drawn uniformly from these ranges before every grasp."""
 
     views: PositiveInt  # images before every grasp, spread evenly over a full turn from the first
 
@@ -54,11 +54,11 @@ class NoiseRules(DepthNoise):
 
     # Standard deviation of each coordinate of each point, metres.
     point_std: NonNegativeFloat = 0.0
-    # Kind of camera whose faults the images have besides; `random`: another before every grasp.
+    # Kind of camera whose faults the images also have; `random`: a new camera before every grasp.
     sensor: Literal["", "random", "structured-light", "stereo", "time-of-flight"] = ""
 
     def faults(self, rng: np.random.Generator) -> list[DepthNoise | DepthSensor]:
-        """This noise, and the camera of the next view if it is one with faults."""
+        """This noise, and the faults of the next view's camera, if any."""
         sensor = random_sensor(rng) if self.sensor == "random" else SENSORS.get(self.sensor)
         return [self] if sensor is None else [self, sensor]
 
@@ -67,14 +67,14 @@ class NoiseRules(DepthNoise):
 class PlanningRules:
     """The input of a planner, and its number of candidates."""
 
-    # `known`: the cloud is cut off above the table, and its plane is given; `seen`: the cloud
+    # `known`: the cloud is cropped above the table, and its plane is given; `seen`: the cloud
     # includes the table, and its plane is given, so that the depth scale can be corrected;
-    # `around`: the cloud holds everything that the camera sees, and plane and workspace are given;
-    # `auto`: the same, and only the camera's position is given.
+    # `around`: the cloud contains all that the camera sees, and plane and workspace are given;
+    # `auto`: the same cloud, and only the camera's position is given.
     table: TableView
     num_approach_points: PositiveInt  # approach points sampled
     num_candidates: PositiveInt  # candidates scored at most
-    min_score: Share  # no grasp is made that scores less
+    min_score: Share  # grasps with a lower score are not executed
     # Greatest relative error of depths, which a planner corrects by the known table.
     max_depth_error: Share = 0.0
 
@@ -86,18 +86,18 @@ class Protocol:
     name: str  # of the protocol
     version: PositiveInt  # raised whenever a constant changes
     source: str  # where its constants come from
-    rounds: PositiveInt  # how many rounds for each seed make a full run
+    rounds: PositiveInt  # number of rounds for each seed of a full run
     seeds: tuple[int, ...]  # of a full run
-    scene: SceneRules  # what stands on the table
-    round: RoundRules  # what ends a round
-    camera: CameraRules  # where the camera stands
-    noise: NoiseRules  # of what it sees
-    planning: PlanningRules  # what a planner is given
-    engine: str = ""  # the physics engine that its figures are of; empty: any
-    kind: SceneKind | None = None  # of scenes that it is meant for; None: packed ones and piles
+    scene: SceneRules  # the objects
+    round: RoundRules  # held objects and the end of a round
+    camera: CameraRules  # the camera's position
+    noise: NoiseRules  # of the camera
+    planning: PlanningRules  # the input of a planner
+    engine: str = ""  # the physics engine for its figures; empty: any
+    kind: SceneKind | None = None  # kind of its scenes; None: packed and pile
 
     def to_json(self) -> dict[str, Any]:
-        """All constants but engine and kind, which a result names by itself; ready for JSON."""
+        """All constants except engine and kind, which a result names separately; for JSON."""
         table = asdict(self)
         del table["engine"], table["kind"]
         for section, name in (("noise", "sensor"), ("planning", "max_depth_error")):
@@ -107,7 +107,7 @@ class Protocol:
 
 
 def load_protocol(name: str) -> Protocol:
-    """A shipped protocol by name, or a `.toml` file; raises FileNotFoundError or ValueError."""
+    """A built-in protocol by name, or a `.toml` file; raises FileNotFoundError or ValueError."""
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if not path.is_file():
         known = ", ".join(protocol_names())
@@ -122,7 +122,7 @@ def load_protocol(name: str) -> Protocol:
 
 
 def _constants(path: Path) -> dict[str, Any]:
-    """The tables of a file, and those constants of its `base`, which ships, that it leaves out."""
+    """The tables of a file, completed with constants of its `base`, a built-in protocol."""
     table = tomllib.loads(path.read_text("utf-8"))
     if "base" not in table:
         return table
@@ -137,7 +137,7 @@ def _constants(path: Path) -> dict[str, Any]:
 
 
 def protocol_names() -> list[str]:
-    """The protocols that ship, sorted."""
+    """The names of the built-in protocols, sorted."""
     return sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 

@@ -1,4 +1,4 @@
-"""The report of a benchmark, one HTML file with tables and pictures; attempts made again for it."""
+"""The report of a benchmark, an HTML file with tables and pictures, and repeated attempts."""
 
 import base64
 import json
@@ -36,7 +36,7 @@ def repeat(
 ) -> tuple[Round, Attempt, Observation]:
     """Repeat a round up to an attempt; raises FileNotFoundError or ValueError.
 
-    Returns the recorded round, the attempt now, and the image before it.
+    Returns the recorded round, the repeated attempt, and the observation before it.
     """
     facts = folder.manifest()
     run, known = facts["run"], facts["objects_folder"]
@@ -138,7 +138,7 @@ def draw_attempt(path: Path, done: Round, number: int, seen: Observation) -> Non
 
 
 def page(title: str, parts: Iterable[str]) -> str:
-    """A page: an escaped title above parts that are HTML."""
+    """An HTML page: a title, which is escaped, and parts in HTML."""
     title = escape(title)
     head = "<!doctype html><html lang=en><head><meta charset=utf-8>"
     head += "<meta name=viewport content='width=device-width, initial-scale=1'>"

@@ -19,9 +19,9 @@ from edgegrasp_camera.arrays import Int64
 from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.trial import Attempt, Round
 
-PAIRED = ("scene", "engine", "protocol", "objects", "constants")  # equal in paired runs
+PAIRED = ("scene", "engine", "protocol", "objects", "constants")  # must be equal in paired runs
 COUNTS = ("successes", "attempts", "objects")
-# Fields of an attempt that its digest leaves out: times, and what only arms have.
+# Fields of an attempt that its digest leaves out: times, and fields of arms.
 UNDIGESTED = ("planning_seconds", "motion_seconds", "touched_on_the_way", "touched_seen")
 RATE_LABELS = {"grasp_success_rate": "GSR", "declutter_rate": "DR"}
 GATED = ("scene", "engine", "protocol", "protocol_version")
@@ -36,7 +36,7 @@ class ResultFolder:
     path: Path
 
     def open(self, manifest: dict[str, Any]) -> None:
-        """Start a benchmark in this folder, or resume its own. ValueError: it holds another one."""
+        """Start or resume a benchmark in this folder; raises ValueError if it contains another."""
         known = self.path / "manifest.json"
         manifest = json.loads(json.dumps(manifest))  # tuples become lists, as in the file
         if known.is_file():
@@ -94,7 +94,7 @@ class ResultFolder:
 
 
 def summary_of(run: dict[str, Any], rounds: Sequence[Round]) -> dict[str, Any]:
-    """What was run, as the manifest has it, and its figures."""
+    """The scene, engine and protocol of a manifest's run, and the figures of its rounds."""
     protocol = run["protocol"]
     named = {"protocol": protocol["name"], "protocol_version": protocol["version"]}
     return {"scene": run["scene"], "engine": run["engine"], **named, **summarise(rounds)}
@@ -139,7 +139,7 @@ def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
 
 
 def _arm_figures(rounds: Sequence[Round]) -> dict[str, Any] | None:
-    """Figures of an arm, None for a floating hand; times are simulated and the planner's."""
+    """Figures of an arm, None for a floating hand; times are simulated motion and planning."""
     attempts = [attempt for item in rounds for attempt in item.attempts]
     if not any(attempt.motion_seconds for attempt in attempts):
         return None
@@ -154,7 +154,7 @@ def _arm_figures(rounds: Sequence[Round]) -> dict[str, Any] | None:
 
 
 def count(rounds: Iterable[Round]) -> Int64:
-    """Successes, attempts and objects of each round, as `COUNTS`: (3, R)."""
+    """Successes, attempts and objects of each round, in the order of `COUNTS`: (3, R)."""
     rows = [(item.successes, len(item.attempts), len(item.objects)) for item in rounds]
     return np.array(rows, np.int64).reshape(-1, len(COUNTS)).T
 
@@ -180,7 +180,7 @@ def by_object(rounds: Sequence[Round]) -> dict[str, dict[str, int]]:
 
 
 def attempts_digest(rounds: Sequence[Round]) -> str:
-    """SHA-256 of all but wall-clock times and the objects' widths; equal for equal attempts."""
+    """SHA-256 of rounds without times, `too_wide` and fields of arms; equal for equal attempts."""
     tables = [asdict(item) for item in sorted(rounds, key=lambda r: (r.seed, r.index))]
     for table in tables:
         del table["too_wide"], table["start_collisions"]
@@ -226,7 +226,7 @@ def compare(first: ResultFolder, second: ResultFolder) -> dict[str, Any]:
 
 
 def below_gate(summary: dict[str, Any], gate: Path) -> list[str]:
-    """The rates of a result that fall below the interval of a committed one, in words."""
+    """Sentences about rates that fall below the interval of a committed result."""
     try:
         committed = json.loads(gate.read_text())
         limits = {name: committed[name]["wilson_95"] for name in RATE_LABELS}
@@ -254,7 +254,7 @@ def wilson(successes: int, trials: int) -> tuple[float, float] | None:
 def paired_difference(above: Int64, below: Int64) -> dict[str, Any]:
     """Second ratio of sums minus the first, and its 95 % interval; None if a run has no counts.
 
-    Scenes are resampled, so that differences between them cancel out. Counts (2, S): of run and
+    Scenes are resampled, so that differences between them cancel out. Counts are (2, S), by run and
     scene.
     """
     if (below.sum(axis=1) == 0).any():
@@ -276,7 +276,7 @@ def percent(rate: dict[str, Any]) -> str:
 
 
 def over_seeds(rate: dict[str, Any]) -> str:
-    """Mean of the seeds' rates, and standard deviation where there are several, in per cent."""
+    """Mean of the seeds' rates, and the standard deviation of several seeds, in per cent."""
     numbers = (rate["mean_over_seeds"], rate["std_over_seeds"])
     return " ± ".join(f"{100 * number:.1f}" for number in numbers if number is not None) or "none"
 

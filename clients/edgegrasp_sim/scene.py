@@ -1,4 +1,4 @@
-"""Making packed and pile scenes, bins, crowded tables and shelves, and bringing them to rest."""
+"""Make packed and pile scenes, bins, crowded tables and shelves, and let them come to rest."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,41 +16,41 @@ from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import about_z
 from edgegrasp_sim.surroundings import MIDDLE, SIZE, TABLE_HEIGHT, Box, Surroundings
 
-# The usual range of the factor on the objects' sizes, by the kind whose objects they are.
+# The default range of the objects' scale, by the kind that the objects belong to.
 SCALES = {SceneKind.PACKED: (0.7, 0.8), SceneKind.PILE: (0.8, 1.0)}
 
-PACKED_ATTEMPTS = 12  # objects drawn to be stood upright on a table
+PACKED_ATTEMPTS = 12  # maximum number of objects drawn to stand upright on a table
 PACKED_RANGE = (0.08, 0.22)  # metres, of x and y
 CLEARANCE = 0.002  # metres above the table at which objects are put down
 
-# The open box that a pile is dropped into, which is taken away afterwards.
+# The open box that a pile is dropped into, which is removed afterwards.
 PILE_DROP_HEIGHT = 0.2  # metres above the table
 PILE_CORNER = 0.02  # metres, x and y
 PILE_SIDE, PILE_HEIGHT = 0.26, 0.13  # metres
 PILE_WALL = 0.0039  # metres
-PILE_SECONDS = 1.0  # given to each object to come to rest
+PILE_SECONDS = 1.0  # for each object to come to rest
 
 # How objects are poured into a bin.
 POUR_HEIGHT = 0.08  # metres above the walls
-POUR_MARGIN = 0.25  # of its length and width, along each side, where nothing is dropped
-FULL_MARGIN = 0.12  # that of a bin that gets full
-POUR_SECONDS = 0.5  # given to each object to come to rest
-AT_ONCE = 4  # objects poured into a bin that gets full before it is looked at
-COVERED = 0.85  # share of its floor that objects hide from above when it is full
-RAYS = 24  # along each side of the floor, which measure that
+POUR_MARGIN = 0.25  # share of its length and width, on each side, where nothing is dropped
+FULL_MARGIN = 0.12  # the same for a bin to be filled
+POUR_SECONDS = 0.5  # for each object to come to rest
+AT_ONCE = 4  # objects poured between two checks whether a bin is full
+COVERED = 0.85  # share of the floor of a full bin that objects hide from above
+RAYS = 24  # rays along each side of the floor, to measure this share
 
 # How objects are put on a table or a shelf.
 CROWD_ATTEMPTS = 4  # for each object
-LYING_SHARE = 0.4  # of the objects, which are dropped in any pose
+LYING_SHARE = 0.4  # share of the objects that are dropped in any pose
 
-REST_SPEED = 0.01  # m/s and rad/s together, at which objects are at rest
-REST_STEPS = 60  # time steps between two looks
-REST_SECONDS = 2.0  # waited at most
+REST_SPEED = 0.01  # m/s and rad/s together; slower objects are at rest
+REST_STEPS = 60  # time steps between two checks for rest
+REST_SECONDS = 2.0  # maximum time to wait for rest
 
 
 @dataclass(frozen=True, slots=True)
 class SceneObject:
-    """An object that stands in a scene."""
+    """An object in a scene."""
 
     model: ObjectModel
     scale: float  # factor on the size in the model's file
@@ -60,7 +60,7 @@ class SceneObject:
 def load_object(
     world: World, model: ObjectModel, position: Vector, quaternion_xyzw: Vector, scale: float
 ) -> SceneObject:
-    """Load an object with its link frame there; `scale` comes on top of the model's own."""
+    """Load an object with its link frame at a pose; `scale` multiplies the model's own scale."""
     if not model.urdf.is_file():
         raise FileNotFoundError(f"no object file at {model.urdf}; check the object folder")
     whole = scale * model.scale
@@ -70,12 +70,12 @@ def load_object(
 class Layout(NamedTuple):
     """The parts of a scene."""
 
-    world: World  # gets the objects; the surroundings are there already
-    surroundings: Surroundings  # what stays as it is
+    world: World  # gets the objects; contains the surroundings already
+    surroundings: Surroundings  # the fixed parts
     objects: ObjectSet  # to draw from
     rng: np.random.Generator  # source of the draws
     num_objects: int  # how many to try to place
-    scales: tuple[float, float]  # range of the factor on their size
+    scales: tuple[float, float]  # range of their scale
 
 
 MakeSurroundings: TypeAlias = Callable[[np.random.Generator], Surroundings]
@@ -83,12 +83,12 @@ MakeObjects: TypeAlias = Callable[[Layout], list[SceneObject]]
 
 
 def make_packed(layout: Layout) -> list[SceneObject]:
-    """Stand `PACKED_ATTEMPTS` objects or fewer upright, each where it touches no other."""
+    """Stand at most `PACKED_ATTEMPTS` objects upright, each where it touches no other."""
     return _put_down(layout, PACKED_ATTEMPTS, lambda: layout.rng.uniform(*PACKED_RANGE, size=2))
 
 
 def make_table(layout: Layout) -> list[SceneObject]:
-    """Put objects on a table or a shelf beside its fixed parts: most upright, some dropped."""
+    """Put objects on a table or a shelf, next to its fixed parts: most upright, some dropped."""
     rng, reach = layout.rng, np.array(layout.surroundings.reach)
     attempts = CROWD_ATTEMPTS * layout.num_objects
     return _put_down(
@@ -97,7 +97,7 @@ def make_table(layout: Layout) -> list[SceneObject]:
 
 
 def make_bin(layout: Layout) -> list[SceneObject]:
-    """Drop objects into a bin one by one; those that do not fit are removed."""
+    """Drop objects into a bin one by one; objects that do not fit are removed."""
     return settle(layout.world, _pour(layout, layout.num_objects, POUR_MARGIN), layout.surroundings)
 
 
@@ -169,7 +169,7 @@ def _covered(layout: Layout, placed: Sequence[SceneObject]) -> float:
 def _drop(
     layout: Layout, number: int, where: tuple[Float64, Float64], height: float, seconds: float
 ) -> list[SceneObject]:
-    """Drop objects one by one, turned any way, between the corners `where`, (2,) each, metres."""
+    """Drop objects one by one, in any orientation, between two corners `where`, (2,), metres."""
     rng = layout.rng
     dropped: list[SceneObject] = []
     for _ in range(number):
@@ -186,7 +186,7 @@ def _put_down(
     layout: Layout,
     attempts: int,  # objects drawn at most
     draw_place: Callable[[], Float64],  # gives x and y, metres
-    lying_share: float = 0.0,  # of the objects, which are turned any way
+    lying_share: float = 0.0,  # share of the objects in any orientation
 ) -> list[SceneObject]:
     """Put objects down one by one, each where it touches nothing."""
     world, rng = layout.world, layout.rng
@@ -213,7 +213,7 @@ def _put_down(
     return placed
 
 
-# What objects stand in (None: an open table), and how they are placed.
+# The surroundings of the objects (None: an open table), and how objects are placed.
 STANDING_IN: dict[SceneKind, tuple[MakeSurroundings | None, MakeObjects]] = {
     SceneKind.PACKED: (None, make_packed),
     SceneKind.PILE: (None, make_pile),

@@ -1,10 +1,10 @@
 """Faults of depth cameras: structured light, stereo, time of flight, and plain noise.
 
-A rendered depth image goes in, one as such a camera would give it comes out, NaN where it has no
-reading. The models follow measurements of such cameras: noise that grows with the square of the
-depth (Khoshelham and Elberink 2012; Nguyen, Izadi and Lovell 2012), quantised disparities and the
-shadow of the projector (Handa et al. 2014), windows that smooth over small steps, and the pixels
-of a time-of-flight camera that fly between an edge and what is behind it (Sarbolandi et al. 2015).
+Turns a rendered depth image into an image of such a camera, NaN where there is no reading. The
+models follow measurements of such cameras: noise that grows with the square of the depth
+(Khoshelham and Elberink 2012; Nguyen, Izadi and Lovell 2012), quantised disparities and the shadow
+of the projector (Handa et al. 2014), windows that smooth over small steps, and flying pixels of
+time-of-flight cameras between an edge and the surface behind it (Sarbolandi et al. 2015).
 """
 
 from dataclasses import dataclass, replace
@@ -17,10 +17,10 @@ from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter, zoom
 from edgegrasp_camera.arrays import Bools, Float32, Float64
 from edgegrasp_sim.engine import Intrinsics
 
-EDGE = 0.015  # metres between neighbouring pixels from which on they show different surfaces
-SAME_SURFACE = 0.004  # metres by which a pixel may lie behind what hides it
-WARP_PIXELS = 96  # between the independent values of the warp
-PATCH_PIXELS = 12  # between those of what is missing
+EDGE = 0.015  # metres; a larger depth step between neighbouring pixels is an edge
+SAME_SURFACE = 0.004  # metres; a pixel this little behind another is not hidden by it
+WARP_PIXELS = 96  # pixels between the independent values of the warp
+PATCH_PIXELS = 12  # pixels between the independent values of missing patches
 Share = Annotated[float, Field(ge=0.0, le=1.0)]  # checked in a protocol's file
 
 
@@ -28,7 +28,7 @@ Share = Annotated[float, Field(ge=0.0, le=1.0)]  # checked in a protocol's file
 class DepthNoise:
     """Noise of depth images: a random factor on each, and smooth Gaussian noise on some."""
 
-    gamma_shape: NonNegativeFloat = 0.0  # of the gamma distribution of the factor; 0: no factor
+    gamma_shape: NonNegativeFloat = 0.0  # shape of the factor's gamma distribution; 0: no factor
     gamma_scale: NonNegativeFloat = 0.0  # its scale
     correlated_std: NonNegativeFloat = 0.0  # standard deviation of the smooth noise, metres
     correlated_pixels: PositiveInt = 4  # pixels between its independent values, interpolated
@@ -44,24 +44,24 @@ class DepthNoise:
             coarse = rng.normal(0.0, self.correlated_std, cells)
             factors = np.divide(depth.shape, coarse.shape)
             noisy = noisy + zoom(coarse, factors, order=1, mode="nearest", grid_mode=True)
-        return np.where(depth < 0.999 * camera.far, noisy, depth)  # nothing stays nothing
+        return np.where(depth < 0.999 * camera.far, noisy, depth)  # empty pixels stay empty
 
 
 @dataclass(frozen=True, slots=True)
 class DepthSensor:
-    """A depth camera: what `apply` does to an image, in this order."""
+    """A depth camera: the faults that `apply` adds to an image."""
 
     name: str  # of its kind
     baseline: float  # metres along x to the projector or second camera; 0: nothing is hidden
-    window: int  # pixels of the window that smooths steps smaller than `EDGE`; 1: not smoothed
+    window: int  # side in pixels of the window that smooths steps below `EDGE`; 1: not smoothed
     fattening: float  # share of the pixels behind an edge that get the depth of its front
     flying: float  # share of the pixels at an edge that lie between its front and its back
     noise_floor: float  # standard deviation of the noise at depth 0, metres
-    noise_growth: float  # what is added to that for each square metre of depth, 1 / metre
+    noise_growth: float  # added to it per square metre of squared depth, 1 / metre
     noise_pixels: int  # pixels between independent values of the noise
     warp: float  # standard deviation of a smooth error over the whole image, metres
     disparity_step: float  # pixels to which disparities are rounded; 0: not rounded
-    grazing: float  # degrees off the surface's normal at which half of the readings are missing
+    grazing: float  # degrees from the surface normal at which half of the readings are missing
     missing: float  # share of the image that is missing in patches
 
     def apply(self, depth: Float64, camera: Intrinsics, rng: np.random.Generator) -> Float64:
@@ -84,7 +84,7 @@ class DepthSensor:
         return seen.astype(np.float64)
 
     def _at_edges(self, depth: Float32, rng: np.random.Generator) -> Float32:
-        """Depths smoothed over small steps, fattened or flying at large ones."""
+        """Depths smoothed over small steps, fattened or flying at edges."""
         across = max(self.window, 3)
         front = minimum_filter(depth, across, mode="nearest")
         back = maximum_filter(depth, across, mode="nearest")
@@ -104,7 +104,7 @@ class DepthSensor:
         return seen
 
     def _grazing(self, depth: Float32, camera: Intrinsics, rng: np.random.Generator) -> Bools:
-        """Pixels that show a surface at too small an angle."""
+        """Pixels that see a surface at a grazing angle."""
         slope = np.zeros_like(depth)
         for axis in (0, 1):
             step = np.abs(np.diff(depth, axis=axis))
@@ -117,7 +117,7 @@ class DepthSensor:
         return np.asarray(angle > limit)
 
 
-# A first-generation Kinect, an active stereo camera, a time-of-flight camera; at arm's length.
+# A first-generation Kinect, an active stereo camera, a time-of-flight camera, at arm's length.
 STRUCTURED_LIGHT = DepthSensor(
     name="structured-light", baseline=0.075, window=5, fattening=0.15, flying=0.0,
     noise_floor=0.0002, noise_growth=0.0014, noise_pixels=2, warp=0.001, disparity_step=0.125,
@@ -161,14 +161,14 @@ def random_sensor(rng: np.random.Generator) -> DepthSensor:
 def _shadow(depth: Float32, disparity_scale: float) -> Bools:
     """Pixels of a depth image (H, W), metres, hidden from a viewpoint beside the camera.
 
-    `disparity_scale` is its distance along the image's x times the focal length, metres times
-    pixels.
+    `disparity_scale` is the viewpoint's distance along the image's x times the focal length, metres
+    times pixels.
     """
     height, width = depth.shape
     if disparity_scale == 0:
         return np.zeros(depth.shape, dtype=bool)
     place = np.arange(width, dtype=np.float32) - np.float32(disparity_scale) / depth
-    # Two columns on either side of the image take what the second viewpoint sees beyond it.
+    # Two columns on either side of the image are for points that the second viewpoint sees outside.
     column = np.clip(np.floor(place).astype(np.int32), -2, width) + 2
     cells = column + (width + 4) * np.arange(height, dtype=np.int32)[:, None]
     nearest = np.full(height * (width + 4), np.inf, dtype=np.float32)

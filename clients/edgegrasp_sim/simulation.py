@@ -1,4 +1,4 @@
-"""Clutter removal in simulation: make a scene, look at it, grasp in it."""
+"""Clutter removal in simulation: make a scene, observe it, grasp in it."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -24,18 +24,18 @@ from edgegrasp_sim.sensor import DepthNoise, DepthSensor
 from edgegrasp_sim.surroundings import OPEN_TABLE, TABLE_HEIGHT, Surroundings
 
 NOISE_STD = 0.001  # metres
-WOOD = np.array([168.0, 140.0, 110.0])  # colour of what never moves
-# Of objects, RGB; none is yellow, as good grasps are.
+WOOD = np.array([168.0, 140.0, 110.0])  # colour of the fixed parts
+# Colours of objects, RGB; none is yellow, the colour of good grasps.
 PAINTS = np.reshape([*bytes.fromhex("E6483C 3484D2 EE8032 3EB074 F5F0E2 9660B4 344256")], (-1, 3))
-_ALOFT = np.array([[0.0, 0.0, 0.015], [0.0, 0.0, 0.0]])  # metres the table is below the workspace
-_AROUND = np.array([[-0.06], [0.06]])  # metres; wrong depths move points that far out
+_ALOFT = np.array([[0.0, 0.0, 0.015], [0.0, 0.0, 0.0]])  # metres; extends the box below the table
+_AROUND = np.array([[-0.06], [0.06]])  # metres; wrong depths move points this far out
 _EVERYWHERE = np.array([[-np.inf], [np.inf]])
-_CROP_MARGIN = 0.01  # metres; points further out cannot come back in by noise
+_CROP_MARGIN = 0.01  # metres; noise cannot move points farther out back in
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectPlacement:
-    """Where an object is."""
+    """The pose of an object."""
 
     urdf: Path  # its description
     scale: float  # factor on the description's size
@@ -48,7 +48,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
 
     def __init__(
         self,
-        objects: ObjectSet | None = None,  # to make scenes of; None: each kind's built-in ones
+        objects: ObjectSet | None = None,  # for scenes; None: each kind's built-in objects
         *,
         engine: str | None = None,
         gripper: Mapping[str, Any] | None = None,
@@ -69,7 +69,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
 
     @property
     def num_objects(self) -> int:
-        """How many objects are left."""
+        """Number of objects left."""
         return len(self._objects)
 
     @property
@@ -79,18 +79,18 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
 
     @property
     def too_wide(self) -> list[ObjectModel]:
-        """Models of the objects that are wider at their narrowest than the hand opens."""
+        """Models of the objects whose least width exceeds the hand's opening."""
         opening, there = self.hand.max_opening, self._objects
         return [one.model for one in there if least_width(one.model.urdf) * one.scale > opening]
 
     @property
     def object_bounds(self) -> Float64:
-        """The box around each object that is left: (K, 2, 3) metres, world frame."""
+        """The bounding box of each object that is left: (K, 2, 3) metres, world frame."""
         return np.array([item.body.bounds for item in self._objects]).reshape(-1, 2, 3)
 
     @property
     def placements(self) -> list[ObjectPlacement]:
-        """Where the objects are; `reset_from_poses` takes them back."""
+        """The poses of the objects, for `reset_from_poses`."""
         return [
             ObjectPlacement(item.model.urdf, item.scale, (x, y, z), turn)
             for item in self._objects
@@ -102,10 +102,10 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         scene: SceneKind | str,  # a kind or its name
         rng: np.random.Generator,  # the scene's own stream
         num_objects: int = 5,  # how many to try to place
-        scales: tuple[float, float] | None = None,  # of the factor on sizes; None: usual
+        scales: tuple[float, float] | None = None,  # range of the objects' scale; None: default
         table: Surroundings = OPEN_TABLE,  # of packed and pile scenes
     ) -> int:
-        """Make a new scene at rest; returns how many objects are there."""
+        """Make a new scene at rest; returns its number of objects."""
         kind = SceneKind(scene)
         objects = self.object_set or ObjectSet.builtin(kind)
         surround, make = STANDING_IN[kind]
@@ -118,7 +118,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
     def reset_from_poses(
         self, placements: Sequence[ObjectPlacement], surroundings: Surroundings = OPEN_TABLE
     ) -> None:
-        """Put objects exactly at the given poses, at rest, without simulating."""
+        """Place objects exactly at the given poses, at rest, without simulating."""
         self._clear(surroundings)
         for placement in placements:
             model = ObjectModel(placement.urdf.stem, placement.urdf)
@@ -140,10 +140,10 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         rng_noise: np.random.Generator,  # stream of the noise
         *,
         noise_std: float = NOISE_STD,  # of each coordinate of each point, metres
-        faults: Sequence[DepthNoise | DepthSensor] = (),  # of the images, one after the other
-        table: TableView = "known",  # what the cloud holds of the table, see `Observation`
+        faults: Sequence[DepthNoise | DepthSensor] = (),  # applied to each image in this order
+        table: TableView = "known",  # how the cloud contains the table, see `PlanningRules`
     ) -> Observation:
-        """Look at the scene from each of the given poses, (4, 4) each."""
+        """Observe the scene from each of the given poses, (4, 4) each."""
         workspace = np.asarray(self.surroundings.workspace)
         boxes = {"known": workspace, "seen": workspace - _ALOFT + _AROUND}
         box = boxes.get(table, _EVERYWHERE)
@@ -176,7 +176,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         row = np.flatnonzero(np.any(inside, axis=0))
         painted = np.full((len(points), 3), WOOD)
         for part in np.array_split(row, len(row) // 10_000 + 1):
-            starts = np.tile(eye, (len(part), 1))  # rays end a little behind what is seen
+            starts = np.tile(eye, (len(part), 1))  # rays end a little behind the visible points
             hits = self.world.first_hits(starts, starts + 1.01 * (points[part] - eye))
             for number, item in enumerate(self._objects):
                 painted[part[np.equal(hits, item.body.uid)]] = PAINTS[number % len(PAINTS)]
@@ -188,10 +188,10 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
     def try_grasp(
         self, T_world_hand: ArrayLike, *, shake: bool = False, to_the_end: bool = False
     ) -> GraspResult:
-        """Simulate a grasp, (4, 4) of the `panda_hand` link, and return to the scene as it was.
+        """Simulate a grasp, (4, 4) of the `panda_hand` link, and restore the scene.
 
-        Unless `to_the_end`, it ends once its outcome is clear: twice as fast, another one for 1 in
-        100.
+        Unless `to_the_end`, it ends once its outcome is clear, which is twice as fast and changes
+        the outcome of 1 in 100 grasps.
         """
         result = self._run(T_world_hand, to_the_end=to_the_end, shake=shake)
         self._restore_rest()
@@ -200,7 +200,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
     def execute_grasp(
         self, T_world_hand: ArrayLike, motion: ArmTrajectory | None = None
     ) -> GraspResult:
-        """Grasp until a held object has left the scene and others rest; ValueError: not rigid."""
+        """Grasp, remove a held object, let others rest; ValueError unless the pose is rigid."""
         self._hand.motion = motion
         result = self._run(T_world_hand, to_the_end=True, shake=False)
         self._rest_state = None
@@ -231,10 +231,10 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         )
 
     def _restore_rest(self) -> None:
-        # Every grasp starts from one saved state, so that earlier tries leave no trace.
+        # Every grasp starts from the same saved state, so that earlier grasps have no effect.
         if self._rest_state is None:
             self._rest_state = self.world.save_state()
-        # The engine keeps contact caches over a restore; moving all bodies apart empties them.
+        # The engine keeps contact caches when it restores; moving all bodies apart empties them.
         for index, item in enumerate(self._objects):
             item.body.set_pose((5.0 + 5.0 * index, 0.0, 9.0), (0.0, 0.0, 0.0, 1.0))
         self._hand.park()

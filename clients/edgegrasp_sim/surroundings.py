@@ -1,6 +1,6 @@
 """The surroundings of a scene's objects: a table, an open bin, a crowded table, or a shelf.
 
-Nothing of it ever moves. The plane that the objects rest on lies at `TABLE_HEIGHT` in every scene.
+The surroundings never move. The plane that the objects rest on is at `TABLE_HEIGHT` in every scene.
 """
 
 from dataclasses import dataclass
@@ -13,44 +13,44 @@ from edgegrasp_sim.engine import Body, Vector, World
 SIZE = 0.30  # metres, edge of the workspace cube
 TABLE_HEIGHT = 0.05  # metres
 OPEN_EXTENT = 1.2  # metres along both sides of an open table
-OPEN_THICKNESS = 0.2  # metres; objects sink into a thin table, as into the reference's of 12 mm
-TABLE_FRICTION = 0.5  # and of walls
-BOTTOM = TABLE_HEIGHT + 0.005  # metres, z at which the workspace begins
-# Lowest and highest corner of where grasps are looked for on an open table.
+OPEN_THICKNESS = 0.2  # metres; objects sink into a thin table like the reference's, 12 mm
+TABLE_FRICTION = 0.5  # of tables and walls
+BOTTOM = TABLE_HEIGHT + 0.005  # metres, lowest z of the workspace
+# Lowest and highest corner of the region for grasps on an open table.
 WORKSPACE = ((0.02, 0.02, BOTTOM), (SIZE - 0.02, SIZE - 0.02, SIZE))
 MIDDLE = SIZE / 2  # metres, x and y of the middle of every scene
 
-Span = tuple[float, float]  # least and greatest, metres
+Span = tuple[float, float]  # minimum and maximum, metres
 Spans = tuple[Span, Span, Span]  # of length, width and height
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]  # lowest, highest; metres
 
-# Random bins. Length, width and height inside: the palm of the Panda's hand is 20 cm wide and 5 cm
-# above its fingertips, so that along a higher wall it holds little.
+# Random bins. Inner length, width and height: the palm of the Panda's hand is 20 cm wide and 5 cm
+# above its fingertips, so that it can grasp little along a higher wall.
 BIN_INSIDE: Spans = ((0.40, 0.60), (0.30, 0.42), (0.03, 0.08))
 SMALL_BIN_INSIDE: Spans = ((0.30, 0.40), (0.24, 0.30), (0.03, 0.08))
 DEEP_BIN_INSIDE: Spans = ((0.36, 0.60), (0.26, 0.42), (0.08, 0.22))
-BIN_WALL: Span = (0.008, 0.015)  # its floor is as thick; objects are pressed through thinner ones
+BIN_WALL: Span = (0.008, 0.015)  # also the floor's; objects are pressed through thinner walls
 GROUND = 0.2  # metres, thickness of a floor, for the same reason
-STAND_SHARE = 0.3  # of the bins, which stand off the table: on a stand, a conveyor
+STAND_SHARE = 0.3  # share of the bins that are above the table: on a stand, a conveyor
 STAND: Span = (0.1, 0.4)
-HEAP = 0.10  # metres that a heap may rise over the walls
+HEAP = 0.10  # metres that a heap may rise above the walls
 FLOOR = (6.0, 6.0, 0.2)  # metres, size of the floor below tables and shelves
 
 # Random crowded tables.
-REACH = 0.16  # metres from the middle, along x and y, where objects are put
+REACH = 0.16  # greatest distance of objects from the middle, along x and y, metres
 TABLE_LENGTH: Span = (0.5, 1.2)
 TABLE_OVER_FLOOR: Span = (0.4, 0.8)
-LARGE_OBJECTS = (1, 3)  # least and most objects too large to grasp
+LARGE_OBJECTS = (1, 3)  # minimum and maximum number of objects too large to grasp
 LARGE_DISTANCE: Span = (0.05, 0.30)  # from the middle to the nearest side of a large object
-# Length, width and height of large objects. No hand would grasp a longer object.
+# Length, width and height of large objects, which are too long for any grasp.
 CARTON: Spans = ((0.42, 0.60), (0.10, 0.35), (0.05, 0.40))
 PANEL: Spans = ((0.42, 0.60), (0.02, 0.05), (0.42, 0.55))  # monitors, walls
 KERB: Spans = ((0.42, 0.60), (0.04, 0.12), (0.02, 0.06))  # books, keyboards
 
-# Random shelves. Width, depth and height inside a compartment, in which a hand has room.
+# Random shelves. Width, depth and height inside a compartment, with room for a hand.
 SHELF_INSIDE: Spans = ((0.45, 0.90), (0.26, 0.40), (0.34, 0.48))
 SHELF_BOARD: Span = (0.015, 0.030)
-SHELF_MARGIN = 0.06  # metres from its sides and edges where no object is put
+SHELF_MARGIN = 0.06  # metres from its sides and edges without objects
 SHELF_OVER_FLOOR: Span = (0.4, 1.2)
 
 
@@ -61,7 +61,7 @@ class Box:
     size: tuple[float, float, float]  # full extent along its own axes
     centre: tuple[float, float, float]  # of the box
     yaw: float = 0.0  # radians about world z
-    obstacle: bool = True  # a hand that hits it has failed; the table is none
+    obstacle: bool = True  # whether a collision with it fails the grasp; not with the table
 
     def add_to(self, world: World) -> Body:
         """Add it to a world."""
@@ -72,10 +72,10 @@ class Box:
 class Surroundings:
     """The fixed parts of a scene, and the region of its objects."""
 
-    boxes: tuple[Box, ...]  # all that never moves
-    workspace: Corners  # of where grasps are looked for
-    bounds: Corners  # of where an object's centre may be; one that leaves it is taken away
-    # Metres from the middle, along x and y, where objects are put down.
+    boxes: tuple[Box, ...]  # all fixed parts
+    workspace: Corners  # of the region for grasps
+    bounds: Corners  # of the region for objects' centres; objects that leave it are removed
+    # Greatest distance of placed objects from the middle, along x and y, metres.
     reach: tuple[float, float] = (REACH, REACH)
 
     def add_to(self, world: World) -> frozenset[int]:
@@ -95,7 +95,7 @@ def _slab(size: Vector, top: float, x: float = MIDDLE, y: float = MIDDLE) -> Box
 
 
 def open_table(thickness: float = OPEN_THICKNESS) -> Surroundings:
-    """A table alone, of a thickness in metres."""
+    """A table without other parts, of a thickness in metres."""
     table = _slab((OPEN_EXTENT, OPEN_EXTENT, thickness), TABLE_HEIGHT)
     return Surroundings((table,), WORKSPACE, ((0.0, 0.0, 0.0), (SIZE, SIZE, np.inf)))
 
@@ -104,7 +104,7 @@ OPEN_TABLE = open_table()
 
 
 def random_bin(rng: np.random.Generator, extents: Spans = BIN_INSIDE) -> Surroundings:
-    """An open box of inner `extents` on a table or over it, its floor at `TABLE_HEIGHT`."""
+    """An open box of inner `extents` on or above a table, with its floor at `TABLE_HEIGHT`."""
     length, width, height = (rng.uniform(*extent) for extent in extents)
     wall = rng.uniform(*BIN_WALL)
     stand = rng.uniform(*STAND) if rng.random() < STAND_SHARE else 0.0
@@ -125,7 +125,7 @@ def random_table(rng: np.random.Generator) -> Surroundings:
     """A table with an edge near the objects, a floor below, and one to three large objects."""
     over = float(rng.uniform(*TABLE_OVER_FLOOR))
     size = rng.uniform(*TABLE_LENGTH, size=2)
-    # All the objects' places are on it; an edge may be close to them.
+    # All objects are placed on it; an edge may be close to them.
     aside = rng.uniform(-1.0, 1.0, size=2) * (size / 2 - REACH - 0.02)
     table = _slab((*size, over), TABLE_HEIGHT, *(MIDDLE + aside))
     boxes = [_slab(FLOOR, TABLE_HEIGHT - over), table]
@@ -137,7 +137,7 @@ def random_table(rng: np.random.Generator) -> Surroundings:
 
 
 def random_shelf(rng: np.random.Generator) -> Surroundings:
-    """A compartment of a shelf, open toward -y, its floor at `TABLE_HEIGHT`, another one above."""
+    """A shelf's compartment, open toward -y, with its floor at `TABLE_HEIGHT`; another is above."""
     width, depth, height = (float(rng.uniform(*extent)) for extent in SHELF_INSIDE)
     board, over = float(rng.uniform(*SHELF_BOARD)), float(rng.uniform(*SHELF_OVER_FLOOR))
     tall = GROUND + 2 * height
@@ -158,7 +158,7 @@ def random_shelf(rng: np.random.Generator) -> Surroundings:
 
 
 def _large_object(rng: np.random.Generator) -> Box:
-    """An object too large to grasp that stands beside the others, turned any way."""
+    """An object too large to grasp, next to the others, with any yaw."""
     kind = (CARTON, CARTON, PANEL, KERB)[int(rng.integers(4))]
     length, width, height = (float(rng.uniform(*extent)) for extent in kind)
     yaw, around = rng.uniform(0.0, 2 * np.pi), rng.uniform(0.0, np.pi)
@@ -172,6 +172,6 @@ def _large_object(rng: np.random.Generator) -> Box:
 
 
 def _corners(half: Float64, bottom: float, top: float) -> Corners:
-    """Of what extends `half` (2,) from the middle, along x and y."""
+    """Corners of a box that extends `half` (2,) from the middle, along x and y."""
     (left, front), (right, back) = (MIDDLE - half).tolist(), (MIDDLE + half).tolist()
     return (left, front, bottom), (right, back, top)

@@ -1,6 +1,6 @@
-"""One round of clutter removal: look, plan, grasp, until the table is empty or planning fails.
+"""One round of clutter removal: observe, plan, grasp, until the table is empty or planning fails.
 
-A planner is any callable; what runs behind it is up to the caller.
+A planner is any callable, which the caller provides.
 """
 
 import time
@@ -20,8 +20,8 @@ from edgegrasp_sim.protocol import Protocol
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.surroundings import open_table
 
-MIN_SEEN = 100  # points above the table; with fewer the planner is not asked
-SEEN_DISTANCE = 0.01  # metres from a seen point, within which a touched surface was seen too
+MIN_SEEN = 100  # points above the table; with fewer the planner is not called
+SEEN_DISTANCE = 0.01  # metres; a touched surface this near to a seen point counts as seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,16 +31,16 @@ class PlannedGrasp:
     T_world_hand: ArrayLike  # (4, 4) pose of the `panda_hand` link in the world, metres
     score: float  # how good the planner believes the grasp is; higher is better
     width: float  # opening that the grasp needs, metres
-    motion: ArmTrajectory | None = None  # of the arm that carries the hand, if one does
+    motion: ArmTrajectory | None = None  # of the arm that carries the hand, if any
 
 
-# From an observation, and a seed for randomness in planning, to the grasp to execute; None if
-# there is none. A planner may have a method `close`, called after the last round.
+# Maps an observation, and a seed for randomness in planning, to the grasp to execute, or None. A
+# planner may have a method `close`, which is called after the last round.
 Planner: TypeAlias = Callable[[Observation, int], PlannedGrasp | None]
 
 
 class StartCollides(Exception):  # noqa: N818
-    """Raised by a planner: in this view the arm is in collision before it moves."""
+    """Raised by a planner: according to this view the arm collides before it moves."""
 
 
 class RoundEnd(StrEnum):
@@ -57,17 +57,17 @@ class Attempt:
 
     cause: FailureCause | None  # why it failed, None if it did not
     object: str | None  # name of the object removed, None after a failure
-    target: str | None  # name of the object that was between the fingers, None if there was none
-    wrong_object: bool  # whether what was removed was not the target
+    target: str | None  # name of the object between the fingers before closing, None without one
+    wrong_object: bool  # whether the removed object was not the target
     score: float  # the planner's score
-    width: float  # the opening the planner asked for, metres
+    width: float  # the opening that the planner requested, metres
     opening: float  # metres between the fingers at the end
     start_contact: bool  # whether the open hand overlapped something at its start pose
     view: int  # number of the view in its round that the grasp was planned in
-    points: int  # size of the cloud that was seen
+    points: int  # number of points in the observed cloud
     planning_seconds: float  # wall-clock time of the planner
     T_world_hand: list[list[float]]  # (4, 4) row-major pose of the hand
-    motion_seconds: float = 0.0  # that an arm took from home to the grasp, away and home again
+    motion_seconds: float = 0.0  # of an arm from home to the grasp, away and home again
     touched_on_the_way: bool = False  # whether an arm overlapped anything before its pregrasp
     touched_seen: bool = False  # whether the camera had seen the surface that was touched
 
@@ -78,22 +78,22 @@ class Attempt:
 
     @property
     def T_cloud_hand(self) -> NDArray[np.float32]:  # noqa: N802
-        """The pose (4, 4) as `Picture.grasps` takes it: clouds are in the world's frame."""
+        """The pose (4, 4) for `Picture.grasps`; the cloud frame is the world frame."""
         return np.asarray(self.T_world_hand, np.float32)
 
 
 @dataclass(slots=True)
 class Round:
-    """One round of clutter removal, as it goes on."""
+    """One round of clutter removal, updated while it runs."""
 
-    seed: int  # with `index` it gives the scene, the views and the noise
+    seed: int  # determines, with `index`, the scene, the views and the noise
     index: int  # number of the round
-    objects: tuple[str, ...]  # names of the objects that were there after the reset
+    objects: tuple[str, ...]  # names of the objects after the reset
     attempts: tuple[Attempt, ...]  # the grasps executed, in order
-    no_grasp: int  # how often the planner found none; not counted as attempts
+    no_grasp: int  # how often the planner found no grasp; not counted as attempts
     end: RoundEnd  # why the round ended
     too_wide: tuple[str, ...] = ()  # names of objects wider than the hand opens
-    start_collisions: int = 0  # in how many of those the arm touched something where it started
+    start_collisions: int = 0  # number of views without a grasp because the arm collided at start
 
     @property
     def successes(self) -> int:
@@ -114,7 +114,7 @@ class RoundDriver:
         index: int,
     ) -> None:
         self.simulation, self.protocol = simulation, protocol
-        # None depends on what another was used for.
+        # Independent streams: the draws from one do not affect the others.
         streams = (np.random.default_rng([seed, index, stream]) for stream in range(4))
         layout, self._camera, self._noise, self._policy = streams
         rules, upright = protocol.scene, scene.objects is SceneKind.PACKED
@@ -145,7 +145,7 @@ class RoundDriver:
         """Run the round to its end."""
         while (end := self.end) is None:
             seen, seed = self.look(), int(self._policy.integers(2**31))
-            # Something in front may hide all of the objects.
+            # An obstacle in front may hide all of the objects.
             height = crop(seen.cloud, seen.workspace)[:, 2] - seen.table_height
             shown = np.count_nonzero(height > 0.005) >= MIN_SEEN
             grasp, started = None, time.perf_counter()

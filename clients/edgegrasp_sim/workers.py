@@ -1,4 +1,4 @@
-"""Tasks that do not depend on each other: in this process, in several, or on a Ray cluster."""
+"""Run independent tasks in this process, in several processes, or on a Ray cluster."""
 
 import atexit
 import ctypes
@@ -20,14 +20,14 @@ Result = TypeVar("Result")
 # Makes the callable that does a task, in the process that uses it; picklable for other processes.
 MakeRunner: TypeAlias = Callable[[], Callable[[Task], Result]]
 
-MAX_CRASHES = 3  # of processes in a row without a result between them; of one task on a cluster
+MAX_CRASHES = 3  # of processes in a row, without a result in between; of one task on a cluster
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 PR_SET_PDEATHSIG = 1  # of Linux's prctl
 LOCAL_RAY = "local"  # address of a cluster that is started on this machine for the run
 
 
 class WorkerError(RuntimeError):
-    """Processes or a cluster that cannot run tasks."""
+    """Worker processes or a cluster cannot run the tasks."""
 
 
 def run_tasks(
@@ -35,7 +35,7 @@ def run_tasks(
     tasks: Sequence[Task],
     *,
     workers: int | None = None,  # at a time; 1: in this process; None: all cores
-    ray: str | None = None,  # address of a cluster as of `ray.init`; `local` starts one
+    ray: str | None = None,  # address of a cluster, as in `ray.init`; `local` starts one
 ) -> Iterator[tuple[Task, Result]]:
     """Run independent tasks, again if a worker dies; yields each task with its result."""
     if workers is not None and workers < 1:
@@ -76,7 +76,7 @@ def _in_processes(
                 crashes = 0
                 missing.remove(task)
                 yield task, result
-        except (KeyboardInterrupt, GeneratorExit):  # their results would be lost anyway
+        except (KeyboardInterrupt, GeneratorExit):  # results would be lost anyway
             for process in list(pool._processes.values()):
                 process.terminate()
             raise
@@ -95,7 +95,7 @@ def _start_process() -> None:
     for name in THREADS:  # all cores are busy anyway
         os.environ.setdefault(name, "1")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)  # however the parent ends
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)  # end with the parent in any case
 
 
 def _run(made: bytes, task: Any) -> Any:
@@ -113,7 +113,7 @@ def _runner(made: bytes) -> Callable[[Any], Any]:
 def _on_ray(
     address: str, make_runner: MakeRunner[Task, Result], tasks: Sequence[Task], workers: int | None
 ) -> Iterator[tuple[Task, Result]]:
-    """Run on Ray as tasks, not actors: those of a lost machine are run again elsewhere."""
+    """Run on Ray as tasks, not actors: Ray runs the tasks of a lost machine again elsewhere."""
     try:
         ray: Any = importlib.import_module("ray")
     except ModuleNotFoundError:

@@ -1,7 +1,7 @@
-"""The choice of a physics engine, and what both take and return.
+"""The choice of a physics engine, and the types that both engines take and return.
 
-Each is a file, with classes of the same methods: a world, its bodies, a hand. `with_mujoco` has
-their docstrings. Nothing else knows which one runs.
+Each engine is a module whose classes have the same methods: a world, its bodies, a hand.
+`with_mujoco` has their docstrings. Other code does not depend on the engine.
 """
 
 import importlib.util
@@ -24,7 +24,7 @@ TIME_STEP = 1.0 / 80.0  # seconds
 GRAVITY = 9.81  # m/s²
 OBJECT_MASS = 0.5  # kg
 OBJECT_FRICTION = 1.0
-SLIDE_MASS = 0.05  # kg, of what carries fingers that swing
+SLIDE_MASS = 0.05  # kg, of the carriage of swinging fingers
 ENGINES = ("pybullet", "mujoco")  # the first that is installed is the default
 
 
@@ -57,7 +57,7 @@ def make_world(engine: str | None = None) -> World:
 
 
 def world_type(engine: str) -> type[World]:
-    """The worlds of an engine."""
+    """The class of an engine's worlds."""
     module = importlib.import_module(f"edgegrasp_sim.engine.with_{engine}")
     found: type[World] = getattr(module, f"{engine.capitalize()}World")
     return found
@@ -79,12 +79,12 @@ class Intrinsics:
 class Contact(NamedTuple):
     """One contact point of a body."""
 
-    other_uid: int  # the body that is touched
-    distance: float  # metres; negative where the two overlap
-    position: Sequence[float]  # (3,) where, world frame, metres
+    other_uid: int  # the other body
+    distance: float  # metres; negative if the bodies overlap
+    position: Sequence[float]  # (3,) world frame, metres
 
 
-Parts: TypeAlias = tuple[Float64, ...]  # convex ones, each by its points, (P, 3) metres
+Parts: TypeAlias = tuple[Float64, ...]  # the points of each convex part, (P, 3) metres
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,20 +92,20 @@ class HandModel:
     """A floating hand with two coupled fingers that slide apart along y."""
 
     palm: Parts  # in the hand's frame
-    fingers: tuple[Parts, Parts]  # that at y > 0 and the other, shut, each in its own frame
+    fingers: tuple[Parts, Parts]  # at y > 0 and at y < 0, in the shut hand, each in its own frame
     finger_base: float  # metres along the hand's z to the fingers' frames
     finger_centre: tuple[float, float, float]  # of mass of the finger at y > 0, metres
-    tip: float  # fingertips as they hold something, metres along z
+    tip: float  # position of the fingertips along z when holding an object, metres
     centre: tuple[float, float, float]  # the palm's centre of mass, hand frame, metres
     max_opening: float  # metres between the fingers
     mass: float = 0.5  # of the palm, kg
     friction: float = 1.0  # of the palm
     finger_mass: float = 0.1  # kg
     finger_friction: float = 0.75  # lateral
-    finger_force: float = 20.0  # with which each finger closes and opens, N
-    tool_force: float = 300.0  # with which the hand is moved at most, N
-    # How far the fingers are ahead of where they are in the open hand, metres: the coefficients of
-    # 1, q, ..., q^4, where q is half the opening; None: they never are.
+    finger_force: float = 20.0  # of each finger when it closes or opens, N
+    tool_force: float = 300.0  # maximum force that moves the hand, N
+    # How far the fingers advance along z compared with the open hand, metres: the coefficients of
+    # 1, q, ..., q^4, where q is half the opening; None: they do not advance.
     advance: tuple[float, ...] | None = None
     meshes: tuple[str, str] | None = None  # PyBullet's palm and finger; None: boxes
 
@@ -114,9 +114,9 @@ class HandModel:
 class ArmModel:
     """An arm that carries a hand; J joints."""
 
-    urdf: str  # XML with absolute paths of meshes, without what is beyond the flange
-    T_world_root: Float64  # where its first link stands, (4, 4)
-    flange: str  # link that the hand is on
-    T_flange_hand: Float64  # where the hand's frame is in the flange's, (4, 4)
+    urdf: str  # XML with absolute paths of meshes, without the links beyond the flange
+    T_world_root: Float64  # pose of its first link, (4, 4)
+    flange: str  # link that carries the hand
+    T_flange_hand: Float64  # pose of the hand's frame in the flange's frame, (4, 4)
     joint_names: Sequence[str]  # of the moving joints, J
-    home: Float64  # where they rest, (J,) radians or metres
+    home: Float64  # their positions at rest, (J,) radians or metres

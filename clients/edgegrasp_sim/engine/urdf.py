@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float64, Int64
 
-SIDES = 32  # of the prism that stands for a cylinder
-BALL = 300  # points of the hull that stands for a sphere
+SIDES = 32  # sides of the prism that approximates a cylinder
+BALL = 300  # points of the hull that approximates a sphere
 
 
 class Surface(NamedTuple):
@@ -28,14 +28,14 @@ class Shape(NamedTuple):
     """An object, in the frame of its centre of mass, with the axes of its link."""
 
     centre: Float64  # the centre of mass in the link's frame, (3,) metres
-    visible: list[Surface]  # what a camera sees
+    visible: list[Surface]  # the surfaces that a camera sees
     hulls: list[Surface]  # the convex parts that contacts use
 
 
 def read_urdf(path: Path, scale: float) -> Shape:
     """The shape of the first link of a URDF file, `scale` times as large.
 
-    ValueError: it cannot be read, or has no solid collision shape.
+    Raises ValueError if it cannot be read or has no solid collision shape.
     """
     centre, *surfaces = _read_urdf(path, path.stat().st_mtime_ns)
     visible, hulls = (
@@ -69,12 +69,12 @@ def parse_obj(text: str) -> list[tuple[str, Surface]]:
     """The named objects of an OBJ file's text, with the points that their faces use."""
     points: list[list[float]] = []
     parts: list[tuple[str, list[list[int]]]] = [("", [])]  # names and triangles
-    # Only points count, not the normals and texture places behind their slashes.
+    # Only points matter, not the normals and texture coordinates after the slashes.
     for line in re.sub(r"/\S*", "", text).splitlines():
         match line.split():
             case ["v", *numbers]:
                 points.append([float(number) for number in numbers[:3]])
-            case ["f", *corners]:  # count points from 1, or back from the last
+            case ["f", *corners]:  # numbers count from 1, or negative from the last point
                 row = [k - 1 if k > 0 else len(points) + k for k in map(int, corners)]
                 parts[-1][1].extend([row[0], *two] for two in pairwise(row[1:]))
             case ["o" | "g", *words]:
@@ -89,7 +89,7 @@ def parse_obj(text: str) -> list[tuple[str, Surface]]:
 
 @cache
 def least_width(path: Path) -> float:
-    """The least distance between parallel planes around an object, one along a face; metres."""
+    """An object's least width: between parallel planes, one of them along a face; metres."""
     hull = ConvexHull(np.concatenate([part.points for part in read_urdf(path, 1.0).hulls]))
     heights = hull.points[hull.vertices] @ hull.equations[:, :3].T
     return float(np.ptp(heights, axis=0).min())

@@ -1,4 +1,4 @@
-"""MuJoCo: wheels for every current Python, and an image in milliseconds."""
+"""MuJoCo, which has wheels for every current Python and renders an image in milliseconds."""
 
 import itertools
 import os
@@ -21,29 +21,29 @@ from edgegrasp_sim.engine.urdf import read_urdf
 from edgegrasp_sim.poses import about_z, quaternion_xyzw, translation
 
 SUBSTEPS = 4  # of 3.125 ms in each time step
-ARM_SUBSTEPS = 13  # with an arm, for joints that hardly give: more than 1 kHz
+ARM_SUBSTEPS = 13  # with an arm, whose stiff joints need more than 1 kHz
 JOINT_INERTIA = 0.5  # kg m² or kg, of a joint's drive
 JOINT_STIFFNESS = 20000.0  # N m/rad or N/m, of its controller
 JOINT_DAMPING = 400.0  # N m s/rad, about critical
-CONTACT_SECONDS = 0.00625  # in which a contact pushes bodies apart; no less than two substeps
+CONTACT_SECONDS = 0.00625  # time constant of contacts; at least two substeps
 IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)  # of contacts, see MuJoCo's `solimp`
-COLLISION_DEPTH = 0.0002  # metres, which the hand overlaps something hard by at about 100 N
-FRICTION_IMPEDANCE = 10.0  # that of friction over that of normal forces, lest held objects creep
+COLLISION_DEPTH = 0.0002  # metres; overlap of the hand with a hard body at about 100 N
+FRICTION_IMPEDANCE = 10.0  # ratio of friction to normal impedance; keeps held objects from creeping
 ARM_INERTIA = 1.0  # kg and kg m², of the arm behind the hand
 ARM_STIFFNESS = 30000.0  # N/m and N m/rad
-# Metres: the torque about a contact's normal, by its force. A pad of 1 cm's radius turns against
-# two thirds of that times its friction.
+# Metres: the ratio of the torque about a contact's normal to its force. For a pad of 1 cm radius it
+# is two thirds of the radius times the friction.
 FINGER_SPINNING_FRICTION = 0.005
-FINGER_SPEED = 0.2  # m/s, at which a finger moves where nothing stops it
+FINGER_SPEED = 0.2  # m/s, of a finger that nothing stops
 FINGER_INERTIA = 0.3  # kg, of a finger's drive
 FINGER_DAMPING = 400.0  # N s/m, with which the drive keeps to its speed
 _SHARES = np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS
-_HAND = 2  # bit of a hand's shapes, which meet those of bit 1, MuJoCo's default, and no others
-# What MuJoCo would do to a URDF besides: join links that no joint moves, look for meshes nearby.
+_HAND = 2  # bit of a hand's shapes, which collide only with shapes of bit 1, MuJoCo's default
+# Without this, MuJoCo would merge links that no joint moves, and strip the paths of meshes.
 _URDF_AS_IT_IS = (
     '<mujoco><compiler fusestatic="false" strippath="false" discardvisual="true"/></mujoco></robot>'
 )
-_VISIBLE, _SOLID = 0, 3  # groups of shapes: seen by the camera, and met by rays
+_VISIBLE, _SOLID = 0, 3  # groups of shapes: visible to the camera, and hit by rays
 
 
 class MujocoWorld(AbstractContextManager["MujocoWorld"]):
@@ -53,7 +53,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
     """
 
     name = "mujoco"
-    constants: ClassVar = {  # its own, for the record of a result
+    constants: ClassVar = {  # of this engine, recorded in results
         "substeps": SUBSTEPS,
         "contact_seconds": CONTACT_SECONDS,
         "friction_impedance": FRICTION_IMPEDANCE,
@@ -64,12 +64,12 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         "finger_inertia": FINGER_INERTIA,
     }
     collision_depth = COLLISION_DEPTH  # metres; a finger sliding along an object overlaps by less
-    # How a hand that holds an object is shaken, along x and y: metres to either side, and in each
-    # time step. At 0.4 m/s the hand follows, and turns sharply.
+    # How a holding hand is shaken along x and y: metres to either side, and metres in each time
+    # step. At 0.4 m/s the hand can follow, and reverses sharply.
     shake_distance, shake_step = 0.01, 0.005
 
     def __init__(self) -> None:
-        self._drawn: Any = None  # the model that scene and context, made for its first image, show
+        self._drawn: Any = None  # the model that scene and context were made for
         self._scene: Any = None
         self._context: Any = None
         self.reset()
@@ -78,7 +78,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         self.close()
 
     def close(self) -> None:
-        """Release what it holds. Safe to call twice."""
+        """Release the rendering context. Safe to call twice."""
         if self._context is not None:
             self._context.free()
         self._drawn = self._scene = self._context = None
@@ -90,7 +90,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         spec.option.timestep = engine.TIME_STEP / SUBSTEPS
         spec.option.gravity = (0.0, 0.0, -engine.GRAVITY)
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP  # what rests costs nothing
+        spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP  # resting bodies cost nothing
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         spec.option.impratio = FRICTION_IMPEDANCE
         spec.default.geom.solref = (CONTACT_SECONDS, 1.0)
@@ -109,7 +109,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
 
     @property
     def data(self) -> Any:
-        """The state, of a model that has all bodies."""
+        """The state, after recompiling the model if bodies have changed."""
         if self.changed:
             self.changed = False
             self._model, self._data = self.spec.recompile(self._model, self._data)
@@ -127,7 +127,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
             first, last = model.tree_dofadr[tree], model.tree_dofadr[tree] + model.tree_dofnum[tree]
             start = model.jnt_qposadr[model.dof_jntid[first]]
             floats = model.jnt_type[model.dof_jntid[first]] == mujoco.mjtJoint.mjJNT_FREE
-            # Of a body that floats, place and quaternion wxyz; behind it its links' joints.
+            # A floating body has position and quaternion wxyz, followed by its links' joints.
             end = start + last - first + int(floats)
             self._places[uid] = (data.qpos[start:end], data.qvel[first:last])
         return self._places[uid]
@@ -146,7 +146,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
             hand.way = None
 
     def first_hits(self, starts: Float64, ends: Float64) -> list[int]:
-        """The body that each ray meets first, -1 for none; (R, 3) metres each, world frame."""
+        """The body that each ray hits first, -1 for none; (R, 3) metres each, world frame."""
         model, data = self.data.model, self.data
         solid = np.arange(6) == _SOLID
         hits, geom = [], np.empty(1, np.int32)
@@ -160,7 +160,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         mujoco.mj_forward(self.data.model, self.data)
 
     def save_state(self) -> Any:
-        """Keep the present state until `reset`; valid for the bodies that are there now."""
+        """Keep the present state until `reset`; valid for the present bodies only."""
         kept = mujoco.MjData(self.data.model)
         mujoco.mj_copyData(kept, self.data.model, self.data)
         return kept
@@ -174,7 +174,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
     def load_urdf(
         self, path: Path, position: Vector, quaternion_xyzw: Vector, scale: float
     ) -> "MujocoBody":
-        """Load an object with its link frame there; its inertia is that of its collision shape."""
+        """Load an object with its link frame at a pose; inertia comes from its collision shape."""
         shape = read_urdf(path, scale)
         body = self._add(np.asarray(position), quaternion_xyzw)
         body.add_freejoint()
@@ -182,7 +182,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         _weigh(body, engine.OBJECT_MASS, corners)
         kind, shell = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
         for number, surface in enumerate(shape.visible):
-            name = f"{body.name} visible {number}"  # which the camera sees, and nothing touches
+            name = f"{body.name} visible {number}"  # visible to the camera, without collisions
             points, faces = surface.points.ravel(), surface.faces.ravel().astype(np.int32)
             self.spec.add_mesh(name=name, uservert=points, userface=faces, inertia=shell)
             body.add_geom(type=kind, meshname=name, contype=0, conaffinity=0, group=_VISIBLE)
@@ -197,7 +197,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
     def add_box(
         self, size: Vector, centre: Vector, *, friction: float, yaw: float = 0.0
     ) -> "MujocoBody":
-        """Add a box that never moves, turned about z; `size` is its full extent in metres."""
+        """Add a box that never moves, rotated about z; `size` is its full extent in metres."""
         kind, half = mujoco.mjtGeom.mjGEOM_BOX, 0.5 * np.asarray(size)
         body = self._add(np.asarray(centre), about_z(yaw))
         # Its friction counts, not the object's.
@@ -207,11 +207,11 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         return MujocoBody(self, body, signs * half)
 
     def add_hand(self, model: HandModel, position: Float64) -> "MujocoHand":
-        """Add an open hand with its centre of mass there; a world may have one."""
+        """Add an open hand with its centre of mass at a position; a world may have one."""
         body = self._add(np.asarray(position), (0.0, 0.0, 0.0, 1.0))
         body.add_freejoint().armature = ARM_INERTIA
         palm = self._build_hand(body, model)
-        # Springs of limited force along all six axes pull it to the pose of a target.
+        # Springs of limited force along all six axes pull the hand to the pose of a target.
         self.spec.worldbody.add_body(name="-1 target", mocap=True).add_site(name="target")
         body.add_site(name="hand")
         damping = 2.0 * (ARM_STIFFNESS * (ARM_INERTIA + body.mass)) ** 0.5
@@ -224,7 +224,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         return self._hand
 
     def add_arm(self, arm: engine.ArmModel, model: HandModel) -> "MujocoArm":
-        """Add an arm at its home with an open hand."""
+        """Add an arm in its home position with an open hand."""
         self.substeps = ARM_SUBSTEPS
         self.spec.option.timestep = engine.TIME_STEP / ARM_SUBSTEPS
         added = mujoco.MjSpec.from_string(arm.urdf.replace("</robot>", _URDF_AS_IT_IS))
@@ -252,7 +252,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         return added_arm
 
     def _build_hand(self, body: Any, model: HandModel) -> Float64:
-        """Give a body palm and fingers; returns the palm's corners (P, 3)."""
+        """Add palm and fingers to a body; returns the palm's corners (P, 3)."""
         body.gravcomp = 1.0
         palm = [part - model.centre for part in model.palm]
         _weigh(body, model.mass, np.concatenate(palm))
@@ -325,7 +325,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         frame = mujoco.MjrRect(0, 0, camera.width, camera.height)
         mujoco.mjr_render(frame, scene, self._context)
         mujoco.mjr_readPixels(None, image, frame, self._context)
-        # Rows go up; depths from 1, near, to 0, far or nothing.
+        # Rows go up; depths go from 1 (near) to 0 (far or empty).
         return near * far / (near + (far - near) * image[::-1].astype(np.float64))
 
     def _add(self, position: Float64, quaternion_xyzw: Vector) -> Any:
@@ -339,7 +339,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, group=_SOLID, **contact)
 
     def _drive(self, name: str, force: float | None = None, **moved: Any) -> Any:
-        """Add a drive that exerts at most a force, by default of the joint with its name."""
+        """Add a drive of limited force, by default for the joint of the same name."""
         joint = {"trntype": mujoco.mjtTrn.mjTRN_JOINT, "target": name}
         drive = self.spec.add_actuator(name=name, **moved or joint)
         if force is not None:
@@ -381,13 +381,13 @@ class MujocoBody:
 
     @property
     def quaternion_xyzw(self) -> tuple[float, float, float, float]:
-        """Orientation in the world."""
+        """Orientation in the world frame."""
         w, x, y, z = self.world.places(self.uid)[0][3:7].tolist()
         return x, y, z, w
 
     @property
     def rotation(self) -> Float64:
-        """Its axes in the world, (3, 3)."""
+        """Its rotation matrix in the world frame, (3, 3)."""
         matrix = np.empty(9)
         mujoco.mju_quat2Mat(matrix, self.world.places(self.uid)[0][3:7])
         return matrix.reshape(3, 3)
@@ -401,12 +401,12 @@ class MujocoBody:
 
     @property
     def speed(self) -> float:
-        """Length of linear (m/s) and angular (rad/s) velocity taken together."""
+        """Norm of the linear (m/s) and angular (rad/s) velocities together."""
         return float(np.linalg.norm(self.world.places(self.uid)[1]))
 
     @property
     def bounds(self) -> Float64:
-        """Lowest and highest corner of the axis-aligned box around it: (2, 3) metres."""
+        """Lowest and highest corner of its axis-aligned bounding box: (2, 3) metres."""
         corners = self.points @ self.rotation.T + self.position
         return np.stack((corners.min(axis=0), corners.max(axis=0)))
 
@@ -422,13 +422,13 @@ class MujocoBody:
 
 
 class MujocoHand(MujocoBody):
-    """A body, the palm, that springs of limited force pull to a target; motors at two fingers."""
+    """The palm, which springs of limited force pull to a target, with two motorised fingers."""
 
     def __init__(self, world: MujocoWorld, body: Any, points: Float64, model: HandModel) -> None:
         super().__init__(world, body, points)
         self.hand = model
-        self.way: Float64 | None = None  # (substeps, D) in the next time step, of
-        self.goal: Float64 = np.empty(0)  # (D,) part of the state: its target's place
+        self.way: Float64 | None = None  # (substeps, D) values of `goal` in the next time step
+        self.goal: Float64 = np.empty(0)  # (D,) view of the state: the position of the target
 
     @property
     def opening(self) -> float:
@@ -448,7 +448,7 @@ class MujocoHand(MujocoBody):
         self.way = None
 
     def move(self, position: Vector, quaternion_xyzw: Vector) -> None:
-        """Pull the centre of mass there in the next step."""
+        """Pull the centre of mass to a pose in the next step."""
         x, y, z, w = quaternion_xyzw
         data = self.world.data
         self.goal = data.mocap_pos[0]
@@ -460,11 +460,11 @@ class MujocoHand(MujocoBody):
         self.world.data.ctrl[:2] = -FINGER_SPEED
 
     def watch(self) -> None:
-        """Record what happened in the last substep."""
+        """Called after each substep; a floating hand records nothing."""
 
 
 class MujocoArm(MujocoHand):
-    """A hand on an arm: its joints move it, not its pose.
+    """A hand on an arm, which is moved by its joints and not by setting its pose.
 
     Its contacts are those of all links in all substeps of the last time step.
     """
@@ -475,11 +475,11 @@ class MujocoArm(MujocoHand):
 
     @property
     def position(self) -> Float64:
-        """As of other bodies; an arm's joints come first in its places."""
+        """The same as for other bodies; `places` of an arm begins with its joints."""
         return np.array(self.world.data.body(str(self.uid)).xpos)
 
     def rest(self) -> None:
-        """Move the arm to its home at once, at rest, with an open hand."""
+        """Set the arm to its home position at once, at rest, with an open hand."""
         joints, velocities = self.world.places(self.uid)
         data, count = self.world.data, len(self.home)
         joints[:count], joints[count:-2], joints[-2:] = self.home, 0.0, self.hand.max_opening / 2
@@ -488,7 +488,7 @@ class MujocoArm(MujocoHand):
         self.way, self._found = None, ()
 
     def drive(self, positions: Float64, velocities: Float64) -> None:
-        """Have the joints' controllers follow (substeps, J) in the next time step."""
+        """Let the joints' controllers follow (substeps, J) in the next time step."""
         self.goal = self.world.data.ctrl[2 : 2 + len(self.home)]
         self.way = positions + JOINT_DAMPING / JOINT_STIFFNESS * velocities
         self._found = ()
@@ -498,11 +498,11 @@ class MujocoArm(MujocoHand):
         self._found += tuple(super().contacts())
 
     def contacts(self) -> list[Contact]:
-        """Those of the last time step; at its home, those found by collision detection."""
+        """The contacts of the last time step; at home, those found by collision detection."""
         return list(self._found) or super().contacts()
 
     def close_fingers(self) -> None:
-        """Drive the fingers together, and forget the contacts before."""
+        """Drive the fingers together, and forget earlier contacts."""
         super().close_fingers()
         self._found = ()
 
@@ -511,11 +511,11 @@ class MujocoArm(MujocoHand):
 def _gl_context(width: int, height: int) -> Any:
     """The OpenGL context of this process, created once."""
     try:
-        # MuJoCo chooses on import, which may have been before MUJOCO_GL was set.
+        # MuJoCo chooses when it is imported, perhaps before MUJOCO_GL was set.
         drawing = import_module(f"mujoco.{os.environ['MUJOCO_GL'].lower()}")
         context = drawing.GLContext(width, height)
         context.make_current()
-    except Exception as error:  # ctypes, OpenGL and EGL raise whatever they stumble over
+    except Exception as error:  # ctypes, OpenGL and EGL raise many kinds of errors
         raise OSError(
             f"MuJoCo cannot draw images with MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; on "
             "Debian and Ubuntu: apt-get install libegl1 libgl1"
@@ -524,7 +524,7 @@ def _gl_context(width: int, height: int) -> Any:
 
 
 def _weigh(body: Any, mass: float, corners: Float64) -> None:
-    """Give a body the inertia of the box around its points (P, 3), as PyBullet does."""
+    """Give a body the inertia of the bounding box of its points (P, 3), as PyBullet does."""
     x, y, z = np.square(np.ptp(corners, axis=0))
     body.explicitinertial = True
     body.mass, body.ipos = mass, np.zeros(3)

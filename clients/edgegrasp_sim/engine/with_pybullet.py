@@ -1,4 +1,4 @@
-"""PyBullet, which the published figures were measured in."""
+"""PyBullet, the engine of the published figures."""
 
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -17,12 +17,12 @@ from edgegrasp_sim.poses import about_z
 
 SOLVER_ITERATIONS = 100
 COLLISION_DEPTH = 0.001  # metres
-FINGER_SPINNING_FRICTION = 0.05  # metres: torque about a contact's normal, by its force
+FINGER_SPINNING_FRICTION = 0.05  # metres: ratio of torque about a contact's normal to its force
 FINGER_STIFFNESS = 30000.0  # N/m at a contact
 FINGER_DAMPING = 1000.0  # N s/m at a contact
-GEAR_FORCE = 30.0  # N, which keeps the fingers at one opening
+GEAR_FORCE = 30.0  # N, of the gear that keeps both fingers at the same distance
 GEAR_ERP = 0.1
-# The Panda's collision meshes, which the published figures were measured with.
+# The Panda's collision meshes, with which the published figures were measured.
 _MESHES = Path(pybullet_data.getDataPath()) / "franka_panda" / "meshes" / "collision"
 _STRAIGHT, _HALF_TURN = [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]  # xyzw
 
@@ -37,7 +37,7 @@ class PybulletWorld(AbstractContextManager["PybulletWorld"]):
         "gear_force": GEAR_FORCE,
     }
     collision_depth = COLLISION_DEPTH
-    shake_distance, shake_step = 0.05, 0.0125  # at 1 m/s: the hand lags and comes half as far
+    shake_distance, shake_step = 0.05, 0.0125  # at 1 m/s the hand lags and moves half as far
 
     def __init__(self) -> None:
         self.client = BulletClient(pybullet.DIRECT)
@@ -84,7 +84,7 @@ class PybulletWorld(AbstractContextManager["PybulletWorld"]):
     def load_urdf(
         self, path: Path, position: Vector, quaternion_xyzw: Vector, scale: float
     ) -> "PybulletBody":
-        read_urdf(path, scale)  # PyBullet itself takes damaged files without a word
+        read_urdf(path, scale)  # raises for damaged files, which PyBullet accepts silently
         try:
             uid = self.client.loadURDF(str(path), position, quaternion_xyzw, globalScaling=scale)
         except pybullet.error as error:
@@ -177,7 +177,7 @@ class PybulletBody:
 
 
 class PybulletHand(PybulletBody):
-    """A hand that a fixed constraint drags; the last two links are its fingers."""
+    """A hand that a fixed constraint pulls; the last two links are its fingers."""
 
     def __init__(self, client: BulletClient, model: HandModel, position: Float64) -> None:
         self.client, self.model = client, model
@@ -258,7 +258,7 @@ class PybulletHand(PybulletBody):
             self._drive(finger, 0.0, self.model.finger_force)
 
     def swing(self) -> None:
-        """Move the fingers forward in the next step by as much as their closing requires."""
+        """Move swinging fingers along z in the next step, as their opening requires."""
         if self.model.advance is None:
             return
         finger = self.client.getJointState(self.uid, self._fingers[0])
