@@ -1,8 +1,8 @@
 """The logic of the node, without ROS: messages to a request, grasps to the fields of messages.
 
-Messages that come in are any objects with the attributes of theirs; those that go out are
-dictionaries of fields, for `rosidl_runtime_py.set_message_fields`. Poses are those of the hand's
-frame, except for `moveit_msgs/Grasp`, which has the end effector's parent link.
+Incoming messages are any objects with the same attributes; outgoing messages are dictionaries of
+fields, for `rosidl_runtime_py.set_message_fields`. Poses are poses of the hand's frame, except for
+`moveit_msgs/Grasp`, which has the end effector's parent link.
 """
 
 from collections import deque
@@ -24,7 +24,7 @@ from edgegrasp_client.requests import object_in_scene, on_mask, option_of_text
 from edgegrasp_results import Detection
 
 Lookup = Callable[[str, str, Any], Float64]
-"""lookup(target, source, stamp): T_target_source (4, 4), as tf2 has it; stamp None: the latest."""
+"""lookup(target, source, stamp): T_target_source (4, 4), from tf2; stamp None: the latest."""
 
 OPTION_PREFIX = "options."  # prefix of the parameters that are options of a detection
 DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")  # encodings of depths: millimetres, or metres
@@ -38,29 +38,29 @@ ENCODINGS = {  # of sensor_msgs/Image: type of a value, channels
 }
 DELETE_ALL, LINE_LIST = 3, 5  # of visualization_msgs/Marker
 LINE_WIDTH = 0.003  # metres
-KEPT_MESSAGES = 30  # images or clouds that a mask may still be of
-MAX_BEHIND = 5.0  # seconds that a camera's image may be older than another camera's beside it
+KEPT_MESSAGES = 30  # latest images or clouds, for which a mask may still arrive
+MAX_BEHIND = 5.0  # seconds; older images of another camera are not used together with an image
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The node's parameters beside the options; every field is one, of this name and default."""
+    """The node's parameters, without the options; each field is a parameter with its default."""
 
     server: str = "127.0.0.1:50051"  # host:port (gRPC) or http://host:port
     timeout: float = 30.0  # seconds for a request
-    on_message: bool = True  # detect at every cloud, image or mask, not only for an action
-    follow: bool = False  # the same grasp from message to message, of a camera that stands still
-    mask_age: float = 1.0  # seconds a mask may be behind the newest image; 0: no mask is used
-    target_frame: str = ""  # what answers are in; empty: the frame of the cloud or image
-    camera_frame: str = ""  # where the camera of a cloud stands; empty: the cloud's own origin
-    gravity_frame: str = ""  # whose z is up; empty: target_frame; "none": found from the support
-    hand_frame: str = ""  # the gripper's hand frame, such as panda_hand; beside parent_link
+    on_message: bool = True  # detect for every cloud, image or mask, not only for an action
+    follow: bool = False  # follow a grasp from message to message; the camera must not move
+    mask_age: float = 1.0  # seconds a mask may be behind the newest image; 0: masks are not used
+    target_frame: str = ""  # frame of the answers; empty: the frame of the cloud or image
+    camera_frame: str = ""  # frame of a cloud's camera; empty: the camera is at the cloud's origin
+    gravity_frame: str = ""  # its z is up; empty: target_frame; "none": found from the support
+    hand_frame: str = ""  # the gripper's hand frame, such as panda_hand; used with parent_link
     parent_link: str = ""  # of the end effector, such as panda_link8; empty: the hand frame
     joint_names: tuple[str, ...] = conversions.PANDA_JOINTS.names
     joint_closed: float = 0.0  # position of each joint in the closed hand
-    joint_per_metre: float = 0.5  # what each joint moves for a metre of opening
-    approach_distance: float = 0.05  # metres of straight way in, from the pregrasp pose
-    retreat_distance: float = 0.1  # metres of straight way out, back along the approach
+    joint_per_metre: float = 0.5  # motion of each joint per metre of opening
+    approach_distance: float = 0.05  # metres of straight approach from the pregrasp pose
+    retreat_distance: float = 0.1  # metres of straight retreat, back along the approach
 
     @property
     def joints(self) -> conversions.FingerJoints:
@@ -72,19 +72,19 @@ class Settings:
 
 
 def parameters() -> dict[str, Any]:
-    """Names and defaults of the node's parameters; of an option: empty text, the server's."""
+    """Names and defaults of the node's parameters; empty text for an option: server's default."""
     own = {each.name: each.default for each in fields(Settings)}
     own["joint_names"] = list(Settings.joint_names)
     return own | {f"{OPTION_PREFIX}{name}": "" for name in DetectOptions.__annotations__}
 
 
 def read_parameters(given: Mapping[str, Any]) -> tuple[Settings, dict[str, Any]]:
-    """Settings, and options of a detection; text of an option that is JSON stands for its value."""
+    """Settings, and options of a detection; an option's text is parsed if it is valid JSON."""
     options = {}
     for name, value in given.items():
         if name.startswith(OPTION_PREFIX) and not (isinstance(value, str) and value == ""):
             options[name.removeprefix(OPTION_PREFIX)] = option_of_text(value)
-    if options.get("objects") is False:  # as YAML reads off
+    if options.get("objects") is False:  # YAML reads `off` as False
         options["objects"] = "off"
     return Settings(**{each.name: given[each.name] for each in fields(Settings)}), options
 
@@ -95,8 +95,8 @@ class Scene(NamedTuple):
     cloud: Any = None  # sensor_msgs/PointCloud2
     depth: Any = None  # sensor_msgs/Image, rectified
     camera: Any = None  # sensor_msgs/CameraInfo of `depth`
-    mask: Any = None  # sensor_msgs/Image: not 0 on what is to be grasped
-    others: tuple[tuple[Any, Any], ...] = ()  # images and their cameras, beside `depth`
+    mask: Any = None  # sensor_msgs/Image: not 0 on the object to grasp
+    others: tuple[tuple[Any, Any], ...] = ()  # further depth images and their cameras
     joints: Mapping[str, float] = {}  # the latest position of each joint, by its name
 
     @property
@@ -106,7 +106,7 @@ class Scene(NamedTuple):
 
 
 class Inbox:
-    """The messages that came last, and which of them belong together."""
+    """Keeps the latest messages, and matches those that belong together."""
 
     def __init__(self) -> None:
         self._sources = {field: deque[Any](maxlen=KEPT_MESSAGES) for field in ("cloud", "depth")}
@@ -116,14 +116,14 @@ class Inbox:
         self._joints: dict[str, float] = {}
 
     def take(self, field: str, message: Any, mask_age: float) -> bool:
-        """Keep a message of a field of Scene; whether there is something new to detect in."""
+        """Keep a message of a field of Scene; returns whether there is new input to detect in."""
         new = field in self._sources
-        if field == "camera":  # that of the first image may come after it
+        if field == "camera":  # the first CameraInfo may arrive after its image
             new = message.header.frame_id not in self._cameras and len(self._newest) > 0
             self._cameras[message.header.frame_id] = message
         elif field == "mask":
             self._mask = message
-        elif field == "joints":  # an arm's and a gripper's may come apart
+        elif field == "joints":  # an arm and a gripper may publish separately
             self._joints |= zip(message.name, map(float, message.position), strict=False)
         else:
             self._sources[field].append(message)
@@ -133,24 +133,24 @@ class Inbox:
         return self._mask_is_due(field, message, mask_age) if masked else new
 
     def _mask_is_due(self, field: str, message: Any, mask_age: float) -> bool:
-        """Whether a message completes a mask and its image, or shows that they do not match."""
+        """Whether a message completes a mask and its image, or shows that none will match."""
         sources = next(filter(None, map(list, self._sources.values())), [])
         if field not in ("mask", *self._sources) or not sources:
             return field == "mask"
         its = self._mask.header.stamp
         age = _seconds(sources[-1].header.stamp, its)
-        if age < 0 or field == "mask":  # younger than the newest image: its own is still to come
+        if age < 0 or field == "mask":  # a mask newer than the newest image waits for its image
             return age >= 0
         known = any(each.header.stamp == its for each in sources)
         return message.header.stamp == its or not known or age > mask_age
 
     def scene(self, mask_age: float) -> Scene:
-        """The newest cloud or depth image of each camera; with a mask, the image it was made of.
+        """The newest cloud or depth image of each camera; with a mask, the image of the mask.
 
         Raises:
-            ValueError: The mask is too old, or the image that it was made of has not come.
+            ValueError: The mask is too old, or its image has not arrived.
         """
-        clouds, depths = map(list, self._sources.values())  # others may come meanwhile
+        clouds, depths = map(list, self._sources.values())  # copies: messages may arrive meanwhile
         sources = clouds or depths
         if not sources:
             return Scene(joints=self._joints)
@@ -168,7 +168,7 @@ class Inbox:
             return Scene(cloud=source, mask=mask, joints=self._joints)
         latest = [source]
         if mask is None:
-            # The first one's frame is the answer's, which must not change from image to image.
+            # The first image's frame is the frame of the answer, which must not change.
             now, newest = source.header.stamp, sorted(self._newest.copy().items())
             latest = [each for _, each in newest if _seconds(now, each.header.stamp) <= MAX_BEHIND]
         source, *more = latest
@@ -176,7 +176,7 @@ class Inbox:
         return Scene(None, source, self._camera_of(source), mask, others, self._joints)
 
     def _camera_of(self, depth: Any) -> Any:
-        """The CameraInfo of an image: that of its frame, or the only one of the only camera."""
+        """The CameraInfo with an image's frame, or the only one if there is only one camera."""
         frames = {each.header.frame_id for each in list(self._sources["depth"])}
         alone = len(self._cameras) == len(frames) == 1
         only = next(iter(self._cameras.values())) if alone else None
@@ -207,17 +207,17 @@ def detect(
     """Grasps of a scene, or of one object in it.
 
     Args:
-        client: Of the server.
+        client: A client of the server.
         scene: The latest messages.
         settings: The node's parameters.
-        options: Of the detection; they come before what frames say.
+        options: Options of the detection; they override options derived from frames.
         lookup: Transforms between frames.
-        object_cloud: sensor_msgs/PointCloud2 of the object that grasps are for.
-        tracker: Made with `options`: what it remembers is followed.
+        object_cloud: sensor_msgs/PointCloud2 of the object to grasp.
+        tracker: A tracker made with `options`, which follows its grasp.
 
     Raises:
         GraspClientError: The server is unavailable or refuses the request.
-        ValueError: There is no message to detect in, or one that cannot be read.
+        ValueError: No cloud or image has arrived, or a message cannot be read.
         InvalidRequest: A cloud or an image does not match its fields.
     """
     if scene.header is None and object_cloud is not None:
@@ -240,7 +240,7 @@ def detect(
         asked["depth_images"] = _depth_images(scene, settings, lookup)
     try:
         found = client.detect(cloud, **asked)
-    except GraspClientError:  # perhaps its robots are others now
+    except GraspClientError:  # the server's robots may have changed
         _robots.cache_clear()
         raise
     if tracker is not None:
@@ -281,7 +281,7 @@ def marker_array(found: Found) -> Message:
 
 
 def trajectories(found: Found) -> list[Message]:
-    """The motion to the best pick and on, as trajectory_msgs/JointTrajectory; empty without one."""
+    """The motions of the best pick, as trajectory_msgs/JointTrajectory; empty without a motion."""
     pick = found.best_pick
     motion = pick and pick.arm and pick.arm.trajectory
     return conversions.joint_trajectories(motion) if motion else []
@@ -308,9 +308,9 @@ def moveit_grasps(found: Found, settings: Settings, lookup: Lookup) -> Message:
 
 
 def object_results(found: Found, settings: Settings, object_id: str = "", most: int = 0) -> Message:
-    """Result of GenerateGrasps: `most` grasps of each object, or of the one asked for; 0: all.
+    """Result of GenerateGrasps: at most `most` grasps of each object; 0: all.
 
-    `object_id` names the object whose cloud was sent; empty: all, by their numbers.
+    `object_id` names the object whose cloud was sent; empty: all objects, named by their numbers.
     """
     groups = {
         str(thing.number): [each for each in found.grasps if each.object == thing.number]
@@ -338,7 +338,7 @@ def object_results(found: Found, settings: Settings, object_id: str = "", most: 
 
 
 def failed_result(object_id: str, why: Exception) -> Message:
-    """Result of GenerateGrasps whose goal is aborted."""
+    """Result of GenerateGrasps for an aborted goal."""
     message = f"{type(why).__name__}: {why}"
     return {"results": [{"object_id": object_id, "success": False, "message": message}]}
 
@@ -357,9 +357,9 @@ def image_array(image: Any, known: Collection[str] = ENCODINGS) -> Array:
 
 
 def camera_matrix(camera: Any) -> Float64:
-    """The (3, 3) matrix of a rectified image, cut out and binned, by `p`, or `k` if `p` is 0.
+    """The (3, 3) matrix of a rectified image, cropped and binned, from `p`, or `k` if `p` is 0.
 
-    ValueError: no CameraInfo has come, or one of a camera that is not calibrated.
+    Raises ValueError if no CameraInfo has arrived, or its camera is not calibrated.
     """
     if camera is None:
         raise ValueError("The depth image has no CameraInfo yet.")
@@ -372,7 +372,7 @@ def camera_matrix(camera: Any) -> Float64:
 
 
 def matrix_of(transform: Any) -> Float64:
-    """(4, 4) of a geometry_msgs/Transform."""
+    """The (4, 4) matrix of a geometry_msgs/Transform."""
     turn, shift = transform.rotation, transform.translation
     T = np.eye(4)
     T[:3, :3] = conversions.matrix_from_quaternion([turn.x, turn.y, turn.z, turn.w])
@@ -380,7 +380,7 @@ def matrix_of(transform: Any) -> Float64:
     return T
 
 
-@lru_cache(1)  # a camera's images are many
+@lru_cache(1)  # not asked again for every image
 def _robots(client: GraspClient) -> dict[str, Robot]:
     return {robot.name: robot for robot in client.robots()}
 
@@ -388,7 +388,7 @@ def _robots(client: GraspClient) -> dict[str, Robot]:
 def _robot(
     client: GraspClient, asked: str | Mapping[str, Any], scene: Scene, lookup: Lookup
 ) -> dict[str, Any]:
-    """The option `robot`, of which a name is enough, with the arm's joints and pose."""
+    """The option `robot`, given as a name or a mapping, with the arm's joints and pose."""
     given = {"name": asked} if isinstance(asked, str) else asked
     name, listed = given.get("name"), _robots(client)
     if (robot := listed.get(str(name))) is None:
@@ -406,7 +406,7 @@ def _robot(
 
 
 def _pose_at(header: Any, scene: Scene, settings: Settings, lookup: Lookup) -> Float64:
-    """T_scene_frame (4, 4) of a header's frame, each where it was when its message was made."""
+    """T_scene_frame (4, 4) of a header's frame, each frame at the time of its message."""
     level = "" if settings.gravity_frame == "none" else settings.gravity_frame
     still = settings.target_frame or level or scene.header.frame_id
     T_still_scene = lookup(still, scene.header.frame_id, scene.header.stamp)
@@ -414,7 +414,7 @@ def _pose_at(header: Any, scene: Scene, settings: Settings, lookup: Lookup) -> F
 
 
 def _depth_images(scene: Scene, settings: Settings, lookup: Lookup) -> list[dict[str, Any]]:
-    """The images of a scene with their cameras, whose poses are in the frame of its header."""
+    """The images of a scene with their cameras; poses are in the frame of the scene's header."""
     images: list[dict[str, Any]] = []
     for depth, camera in ((scene.depth, scene.camera), *scene.others):
         image = {"depth": image_array(depth, DEPTH_ENCODINGS), "intrinsics": camera_matrix(camera)}
@@ -423,7 +423,7 @@ def _depth_images(scene: Scene, settings: Settings, lookup: Lookup) -> list[dict
 
 
 def _from_frames(scene: Scene, settings: Settings, lookup: Lookup) -> dict[str, Any]:
-    """Options that follow from frames: where the camera stands, and which way is up."""
+    """Options derived from frames: the camera's position, and the up direction."""
     frame_id, stamp = scene.header.frame_id, scene.header.stamp
     asked: dict[str, Any] = {}
     if scene.cloud is not None:
@@ -436,7 +436,7 @@ def _from_frames(scene: Scene, settings: Settings, lookup: Lookup) -> dict[str, 
 
 
 def _points(scene: Scene, settings: Settings, lookup: Lookup) -> Any:
-    """Points (N, 3) or (H, W, 3) of the scene's cloud, or of its depth images; own frame."""
+    """Points (N, 3) or (H, W, 3) of the scene's cloud or depth images, in the header's frame."""
     if scene.cloud is not None:
         return read_point_cloud2(scene.cloud).points
     images = _depth_images(scene, settings, lookup)

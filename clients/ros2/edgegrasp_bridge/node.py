@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The node: rclpy around `bridge`, and nothing that could be tested without it."""
+"""The node: only the parts that need rclpy; `bridge` has all other logic."""
 
 import importlib
 from contextlib import closing, suppress
@@ -37,7 +37,7 @@ MOTIONS = ("trajectory_to_grasp", "trajectory_with_object", "trajectory_after_pl
 
 
 class EdgeGraspNode(Node):
-    """Subscribes to clouds or depth images; answers two actions; publishes what was found."""
+    """Subscribes to clouds or depth images, answers two actions, and publishes grasps."""
 
     def __init__(self) -> None:
         super().__init__("edgegrasp")
@@ -46,7 +46,7 @@ class EdgeGraspNode(Node):
         settings, _ = self._read()
         self.client = GraspClient(settings.server, timeout=settings.timeout)
         self._inbox = bridge.Inbox()
-        self._followed: Any = None  # the options and the frame that the tracker is for
+        self._followed: Any = None  # the tracker's options and frame
         self._tracker = GraspTracker()
         self._buffer = Buffer()
         self._listener = TransformListener(self._buffer, self)
@@ -54,7 +54,7 @@ class EdgeGraspNode(Node):
         self._before = self.create_publisher(PoseArray, "pregrasps", 1)
         self._markers = self.create_publisher(MarkerArray, "grasp_markers", 1)
         inputs, actions = MutuallyExclusiveCallbackGroup(), ReentrantCallbackGroup()
-        # Apart from the inputs, so that they do not queue up while a detection runs.
+        # In its own callback group, so that inputs do not queue up while a detection runs.
         self._news = self.create_guard_condition(
             self._detect_newest, MutuallyExclusiveCallbackGroup()
         )
@@ -90,7 +90,7 @@ class EdgeGraspNode(Node):
     def _detect_newest(self) -> None:
         try:
             self._detect(follow=self.get_parameter("follow").value)
-        except Exception as error:  # tf2's too: the node goes on with the next message
+        except Exception as error:  # including tf2's: the node continues with the next message
             self.get_logger().warning(f"{type(error).__name__}: {error}")
 
     def _detect(self, object_cloud: Any = None, follow: bool = False) -> Any:
@@ -106,7 +106,7 @@ class EdgeGraspNode(Node):
         )
         for warning in found.warnings:
             self.get_logger().warning(warning)
-        if settings.follow and not follow:  # an action's answer is not the followed grasp
+        if settings.follow and not follow:  # an action's answer does not replace the followed grasp
             return found, settings
         motions = zip(self._motions, bridge.trajectories(found), strict=False)
         for publisher, message, fields in (
@@ -124,7 +124,7 @@ class EdgeGraspNode(Node):
         try:
             set_message_fields(result, answer(goal.request))
             goal.succeed()
-        except Exception as error:  # tf2's too: a goal that fails is reported, the node goes on
+        except Exception as error:  # including tf2's: report the failed goal, and continue
             self.get_logger().error(f"{type(error).__name__}: {error}")
             if failed is not None:
                 set_message_fields(result, failed(goal.request.object_id, error))

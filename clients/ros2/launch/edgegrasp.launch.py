@@ -15,7 +15,7 @@ TOPICS = ("points", "depth", "camera_info", "mask", "joint_states")
 def generate_launch_description() -> LaunchDescription:
     """Arguments: the topics, a file with the node's parameters, and the server's address.
 
-    An address that is given comes before that of the file.
+    A given address overrides the address in the file.
     """
     defaults = {name: name for name in TOPICS} | {"server": "", "parameters": str(PARAMETERS)}
     arguments = [DeclareLaunchArgument(name, default_value=one) for name, one in defaults.items()]
