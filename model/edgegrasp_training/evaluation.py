@@ -1,7 +1,7 @@
-"""Scores against outcomes: their evaluation, the model card, and recalibration on a robot's.
+"""Scores against outcomes: evaluation, the model card, and recalibration on a robot's outcomes.
 
 `python -m edgegrasp_training.evaluation data/held-out --weights A.safetensors B.safetensors`
-compares weights of hand networks on labelled views that none of them has learned from: by kind of
+compares weights of hand networks on labelled views that none of them was trained on: by kind of
 scene, depth camera and object, and by whether the camera saw the far side.
 """
 
@@ -32,8 +32,8 @@ from edgegrasp_training.views import find_views, load_view, scene_of, table
 
 TENTHS = tuple(round(0.1 * number, 1) for number in range(11))
 EDGES = (0.0, 0.1, 0.3, 0.5, 0.8, 0.9, 0.95, 1.0)  # edges of the score ranges in a comparison
-SCORES = (1e-4, 1.0 - 1e-4)  # scores are taken to lie between
-# Spread of log(scale) and of shift before there is any outcome: few outcomes change little.
+SCORES = (1e-4, 1.0 - 1e-4)  # scores are clipped to this range
+# Standard deviations of the prior of log(scale) and of shift: few outcomes change little.
 PRIOR_SCALE, PRIOR_SHIFT = 0.5, 1.5
 FEW = 25
 
@@ -45,7 +45,7 @@ class Evaluation:
     loss: float  # cross entropy, nats
     accuracy: float
     auroc: float
-    temperature: float  # that calibrates the logits
+    temperature: float  # calibrates the logits
     logit: Float32  # (E,)
     label: Float32  # (E,)
 
@@ -63,7 +63,7 @@ def cross_entropy(logit: Floats, label: Floats) -> float:
 
 
 def auroc(logit: Floats, label: Floats) -> float:
-    """Chance that a success outscores a failure, ties counting half; nan with one class."""
+    """Probability that a success outscores a failure, ties counting half; nan for one class."""
     held = label > 0.5
     if held.all() or not held.any():
         return float("nan")
@@ -72,7 +72,7 @@ def auroc(logit: Floats, label: Floats) -> float:
 
 
 def fit_temperature(logit: Floats, label: Floats) -> float:
-    """The t for which sigmoid(logit / t) has the least cross entropy; near 1 for few labels."""
+    """The t that minimises the cross entropy of sigmoid(logit / t); near 1 for few labels."""
     logit, label = logit.astype(np.float64), label.astype(np.float64)
 
     def cost(log_t: float) -> float:
@@ -86,7 +86,7 @@ class Range(NamedTuple):
     """Grasps whose scores lie between two edges."""
 
     score: float  # mean
-    held: float  # share of them
+    held: float  # share that held
     number: int
 
 
@@ -133,17 +133,17 @@ def write_model_card(
     path.write_text("\n".join(lines) + "\n")
 
 
-# Learning from the robot. Two numbers are fitted, p = sigmoid(scale * logit + shift) (Platt
-# scaling), which is as much as some hundred outcomes can determine. The order of grasps stays.
+# Learning from the robot: fit p = sigmoid(scale * logit + shift) (Platt scaling). A hundred or so
+# outcomes determine no more than these two numbers. The order of grasps does not change.
 
 
 def read_outcomes(path: Path, digest: str) -> tuple[Float64, Float64]:
-    """Logits (N,) of executed grasps, and 1 or 0 (N,) whether they held, in a file of JSON lines.
+    """Logits (N,) of executed grasps, and 1 or 0 (N,) whether they held, from a JSON lines file.
 
-    Of the weights with this digest.
+    Only outcomes of the weights with this digest are read.
 
     Raises:
-        ValueError: The file has none, or a line that is no outcome.
+        ValueError: The file has no such outcome, or a line that is not an outcome.
     """
     scores, held = [], []
     for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
@@ -164,7 +164,7 @@ def read_outcomes(path: Path, digest: str) -> tuple[Float64, Float64]:
 
 
 def fit(logit: Float64, held: Float64) -> tuple[float, float]:
-    """Scale and shift of the logits that are most probable after the outcomes."""
+    """The most probable scale and shift of the logits, given the outcomes."""
 
     def cost(parameters: Float64) -> float:
         log_scale, shift = parameters
@@ -177,7 +177,7 @@ def fit(logit: Float64, held: Float64) -> tuple[float, float]:
 
 
 def recalibrate(weights: Path, outcomes_file: Path, folder: Path) -> str:
-    """Write NAME-robot.safetensors, calibrated on outcomes; returns what was done."""
+    """Write NAME-robot.safetensors, calibrated on outcomes; returns a sentence about the result."""
     network, metadata = load_checkpoint(weights)
     logit, held = read_outcomes(outcomes_file, metadata.digest)
     scale, shift = fit(logit, held)
@@ -194,7 +194,7 @@ def recalibrate(weights: Path, outcomes_file: Path, folder: Path) -> str:
     path = folder / f"{name}.safetensors"
     save_checkpoint(path, network, replace(metadata, name=name, training=training))
     before, after = cross_entropy(logit, held), cross_entropy(scale * logit + shift, held)
-    few = f" Warning: fewer than {FEW} outcomes say little." if len(held) < FEW else ""
+    few = f" Warning: fewer than {FEW} outcomes are not reliable." if len(held) < FEW else ""
     return (
         f"{len(held)} outcomes, {share:.2f} held: scores' cross entropy {before:.3f} -> "
         f"{after:.3f} (scale {scale:.2f}, shift {shift:+.2f}): {path}.{few}"
@@ -214,10 +214,10 @@ class Scored(NamedTuple):
 
 
 def score_views(paths: list[Path], weights: list[Path]) -> Scored:
-    """Score the labelled grasps of views; ValueError: there are none, or other networks."""
+    """Score the labelled grasps of views; ValueError without grasps or for other networks."""
     networks = [load_checkpoint(path) for path in weights]
     if any(metadata.network.architecture != "hand" for _, metadata in networks):
-        raise ValueError("weights: hand networks are compared, such as edgegrasp-plus. Name those.")
+        raise ValueError("weights: got another network. Name hand networks, e.g. edgegrasp-plus.")
     parts = []
     for path in paths:
         view, logits = load_view(path), []
@@ -245,14 +245,14 @@ def score_views(paths: list[Path], weights: list[Path]) -> Scored:
 
 
 def family_of(name: str) -> str:
-    """Kind of the object with this name, "": nothing was between the fingers."""
+    """Kind of the object with this name; "" means that no object was between the fingers."""
     household = re.fullmatch(r"([a-z]+)-\d+", name)
     kind = "computed" if name.startswith(("made-", "blob_")) else "scanned"
     return household[1] if household else f"{kind} object" if name else "no object"
 
 
 def reliability_tables(scored: Scored, names: list[str]) -> str:
-    """Markdown: figures for each group of grasps, and the share that held by score."""
+    """Markdown tables: figures for each group of grasps, and the share that held, by score."""
     groups = {"all": np.ones(len(scored.held), dtype=bool)}
     groups |= {name: row == name for row in scored.groups for name in np.unique(row)}
     groups |= {"far side hidden": scored.far_side_hidden, "far side seen": ~scored.far_side_hidden}

@@ -1,6 +1,6 @@
-"""Training examples: the balls or hands of a view, with labels, packed as networks take them.
+"""Training examples: the balls or hands of a view, with labels, packed as input of networks.
 
-Labels are the outcomes of grasps that were tried, and the scores of a teacher.
+Labels are the outcomes of tried grasps, and the scores of a teacher.
 """
 
 import zlib
@@ -33,12 +33,12 @@ from edgegrasp_model.scene.scene import Surroundings
 from edgegrasp_training.recipes import LENGTH_UNIT
 from edgegrasp_training.views import UNTRIED, UP, LabelledView, load_view
 
-SPARE_POINTS = 2  # factor of points kept per hand, from which each step picks
+SPARE_POINTS = 2  # factor of points kept per hand, from which each step draws
 TRIED_WEIGHT = 4.0  # weight of a simulated label in the loss; a teacher's score has weight 1
 SHAKEN_SHARE = 0.2  # part of a successful grasp's label that depends on surviving shaking
 FIRM_SHARE = 0.78  # share of successful grasps that survive shaking; used if shaking was not tried
 TAUGHT_BALLS = 24  # balls of a view in which a teacher scores candidates
-OWN_BALLS = 16  # most of these balls that are around approach points of tried grasps
+OWN_BALLS = 16  # maximum number of these balls around approach points of tried grasps
 GRASPS_PER_BALL = 64  # scored at most; about a third of a ball's candidates
 
 
@@ -48,7 +48,7 @@ class TriedGrasps:
 
     cloud: Cloud
     candidates: Candidates  # E of them
-    # Of the hand network; float16, to keep many views in memory. None for networks of balls.
+    # Input of a hand network, float16 to keep many views in memory; None for ball networks.
     seen: HandBatch | None
     label: Float32  # (E,) 0: not held; 1: held, less if it did not survive shaking
     turn: Float32  # (3, 3) rotation of the cloud's axes to the detector's frame
@@ -67,7 +67,7 @@ class TriedGrasps:
 
 
 class SoftLabels(NamedTuple):
-    """Candidates of a view with a teacher's scores; 16 bits each, to keep many views in memory."""
+    """Candidates of a view with a teacher's scores, in 16 bits, to keep many views in memory."""
 
     candidates: Candidates  # E of them
     chance: NDArray[np.float16]  # (E,) probability that it holds, by the teacher
@@ -77,7 +77,7 @@ class Packed(NamedTuple):
     """One step's input of a network, and its targets."""
 
     batch: BallBatch | HandBatch
-    label: Tensor  # (E,) float32 target: above 1/2 where it held, or a teacher believes so
+    label: Tensor  # (E,) float32 target: above 1/2 if it held, or if the teacher's score is
     weight: Tensor  # (E,) float32, in the loss
 
 
@@ -88,7 +88,7 @@ def tried_grasps(
     rows = view.tried()
     cloud = Cloud(view.points, view.normals)
     candidates = _candidates(view, cloud, rows)
-    # A grasp that holds counts a little more where it survives shaking.
+    # The label of a successful grasp is a little higher if it survived shaking.
     shaken = UNTRIED if view.firm is None else view.firm
     firm = np.where(shaken == UNTRIED, FIRM_SHARE, shaken == 1)
     labels = np.asarray((view.success == 1) * (1.0 - SHAKEN_SHARE * (1.0 - firm)), np.float32)
@@ -103,10 +103,10 @@ def tried_grasps(
 
 
 def hand_batch(
-    view: LabelledView,  # what is seen of the scene
+    view: LabelledView,  # the observed scene
     candidates: Candidates,  # E hands to try
     viewpoints: Float32,  # (W, 3) camera positions, metres; none if they are unknown
-    max_points: int,  # points of each hand at most
+    max_points: int,  # maximum number of points of each hand
 ) -> HandBatch:
     """The hand network's inputs for candidates in a simulated scene."""
     known = view.support_plane, viewpoints, view.cut_off(), view.numbered_objects()
@@ -125,7 +125,7 @@ class Teacher:
         self.crop_radius = crop_radius
 
     def soft_labels(self, path: Path) -> SoftLabels:
-        """Score candidates around some of a view's points, the same for the same file."""
+        """Score candidates around some of a view's points, chosen by the file's contents."""
         view, rng = load_view(path), np.random.default_rng(zlib.crc32(path.read_bytes()))
         own = np.unique(view.approach_index[view.tried()])
         others = np.setdiff1d(np.flatnonzero(view.numbered_objects() >= 0), own)
@@ -145,7 +145,7 @@ class Teacher:
         return SoftLabels(Candidates(*short), chance.astype(np.float16))
 
     def _candidates(self, view: LabelledView, balls: Int64, rng: np.random.Generator) -> Candidates:
-        """At most GRASPS_PER_BALL candidates in each ball (A,), made as the detector makes them."""
+        """At most GRASPS_PER_BALL candidates in each ball (A,), made like the detector's."""
         cloud, support = Cloud(view.points, view.normals), view.support_plane
         crop = crop_balls(cloud.points, balls, self.crop_radius)
         pairs = balls[crop.ball_of_point], crop.ball_rows
@@ -167,7 +167,7 @@ class Teacher:
 def pack_balls(
     grasps: TriedGrasps, balls: Int64, config: NetworkConfig, soft_labels: SoftLabels | None = None
 ) -> Packed:
-    """Pack candidates in balls, rows (A,) of a view; detector's axes, multiples of LENGTH_UNIT."""
+    """Pack candidates in balls, rows (A,) of a view, in the detector's axes and LENGTH_UNITs."""
     candidates, label = grasps.candidates, grasps.label
     weight = np.ones(len(label), dtype=np.float32)
     if soft_labels is not None:
@@ -186,7 +186,7 @@ def pack_balls(
 
 
 def joined(batches: Sequence[BallBatch | HandBatch]) -> BallBatch | HandBatch:
-    """Batches of one kind as one; scores come out in the same order."""
+    """Batches of one kind as one batch; scores keep the order."""
     columns = {name: [vars(batch)[name] for batch in batches] for name in vars(batches[0])}
     if balls := [batch for batch in batches if isinstance(batch, BallBatch)]:
         points = np.cumsum([0, *(len(batch.points) for batch in balls)]).tolist()
@@ -236,7 +236,7 @@ def random_turn(rng: np.random.Generator, *, upright: bool) -> Float32:
 
 
 def _candidates(view: LabelledView, cloud: Cloud, rows: Int64) -> Candidates:
-    """The tried candidates; `pair` counts in `rows`."""
+    """The tried candidates; `pair` is an index into `rows`."""
     approach_index, contact_index = view.approach_index[rows], view.contact_index[rows]
     if view.T_world_hand is None:
         return edge_grasps(cloud, approach_index, contact_index, view.hand)[0]

@@ -35,14 +35,14 @@ from edgegrasp_training.views import TABLE as TABLE_PLANE
 from edgegrasp_training.views import LabelledView, load_view
 
 APPROACH_POINTS = 12  # few balls with many labels each are the cheapest to train on
-BIN_APPROACH_POINTS = 24  # walls block most hands there
+BIN_APPROACH_POINTS = 24  # walls block most hands in bins
 PACKED, PILE, BIN, TABLE, FULL_BIN, DEEP_BIN, SHELF = SceneKind
-BINS = BIN, DEEP_BIN, FULL_BIN  # seen from above only
-# Four in ten scenes are those of the benchmark of the paper.
+BINS = BIN, DEEP_BIN, FULL_BIN  # observed only from above
+# Four in ten scenes are of the kinds of the paper's benchmark.
 MIXTURE = (PACKED, PILE, BIN, TABLE, BIN, PACKED, TABLE, PILE, BIN, TABLE)
-# A scene holds one object and Poisson(this) more.
+# A scene has one object and Poisson(this) more.
 FURTHER_OBJECTS = {PACKED: 4, PILE: 4, BIN: 7, DEEP_BIN: 9, FULL_BIN: 24, TABLE: 5, SHELF: 3}
-_ANY_SIDE = (0.0, 360.0)  # degrees, as the other angles
+_ANY_SIDE = (0.0, 360.0)  # degrees, like the other angles
 _HIGH, _LOW = (MIDDLE, MIDDLE, 0.25), (MIDDLE, MIDDLE, 0.1)  # metres, looked at
 VIEWS = {
     **dict.fromkeys((PACKED, PILE), ViewRange((0.45, 0.75), (0.0, 75.0), _ANY_SIDE, _HIGH)),
@@ -50,52 +50,52 @@ VIEWS = {
     TABLE: ViewRange((0.5, 1.2), (20.0, 75.0), _ANY_SIDE, _LOW),
     SHELF: ViewRange((0.45, 1.0), (45.0, 90.0), (230.0, 310.0), _LOW),
 }
-# Household objects are seen more from the side, where a tall or wide one hides its back.
+# Household objects are observed more from the side, where a tall or wide object hides its back.
 SIDE_VIEWS = ViewRange((0.5, 1.2), (40.0, 80.0), _ANY_SIDE, _LOW)
-# Metres from the nearest hand that was tried: from where the frame of a Panda's hand would be.
+# Metres from the nearest tried hand: from a Panda's hand frame with the same fingertips.
 KEPT_DISTANCE = 0.18
-AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
-# Of the views that are not cut off, where support and workspace are given; else none.
+AROUND_SHARE = 0.3  # share of the views of packed scenes and piles that are not cropped
+# Share of the views without cropping for which support and workspace are given; else neither.
 GIVEN_SHARE = {BIN: 0.7, DEEP_BIN: 0.5, FULL_BIN: 0.5, TABLE: 0.3, SHELF: 0.3}
-AIMED_SHARE = 0.85  # of the views of bins and tables with grasps of the objects alone
+AIMED_SHARE = 0.85  # share of the views of bins, tables and shelves with grasps only on objects
 AIM_MARGIN = np.array([[-0.005], [0.005]])  # metres around an object
 AROUND_MARGIN = 0.006  # metres around an obstacle
 PLANE_TILT, PLANE_ERROR = 0.006, 0.001  # radians, metres; standard deviations
-OTHER_OBJECTS = 0.3  # share of the scenes made of the other kind's objects
-VARIED_SHARE = 0.85  # of the scenes of an object folder, made of stretched and computed objects
+OTHER_OBJECTS = 0.3  # share of the scenes with objects of the other kind
+VARIED_SHARE = 0.85  # share of an object folder's scenes with stretched and computed objects
 NUM_HOUSEHOLD = 12  # household objects that a scene is drawn from,
 HOUSEHOLD_SCALE = 0.9, 1.1  # and the range of their scales
 WIDER_SCALES = 0.85, 1.15  # factors on the ends of a scene's range of scales
-CLEARED_SHARE = 0.75  # of the scenes, which the network clears as a robot would
-FAILURES = 2  # in a row, after which it gets another scene
-SENSOR_SHARE = 0.4  # of the views, with the faults of a depth camera
-OTHER_NOISE = 0.3  # of the views, with another noise than the benchmark's
+CLEARED_SHARE = 0.75  # share of the scenes that the network clears like a robot
+FAILURES = 2  # consecutive failures after which it gets another scene
+SENSOR_SHARE = 0.4  # share of the views with the faults of a depth camera
+OTHER_NOISE = 0.3  # share of the views with noise that differs from the benchmark's
 MAX_NOISE = 0.004  # metres
 
-FREE_SHARE = 0.75  # of the grasps chosen at random, those that are collision-free
-LIKELY, LIKELY_SHARE = 1 / 3, 0.7  # best part of an object's grasps, most of which are tried there
+FREE_SHARE = 0.75  # collision-free share of the grasps chosen at random
+LIKELY, LIKELY_SHARE = 1 / 3, 0.7  # best part of an object's grasps, and its share of the tries
 
 Query = tuple[Observation, DetectOptions]  # a view of a scene, and a request for grasps in it
 detector = lru_cache(maxsize=2)(GraspDetector.load)  # loads weights once in a process
-USUAL = WEIGHTS_FOLDER / "edgegrasp-plus.safetensors"  # prepares views without a guide
+USUAL = WEIGHTS_FOLDER / "edgegrasp-plus.safetensors"  # weights that prepare views without a guide
 
 
 def generate(
-    folder: Path,  # where the views go, one file each
-    objects: Path | None,  # `packed/train`, `pile/train`; None: built-in ones
+    folder: Path,  # for the views, one file each
+    objects: Path | None,  # folder with `packed/train`, `pile/train`; None: built-in objects
     options: GenerationOptions,  # what to generate
     workers: int | None = 1,  # how many scenes at a time, and
     ray: str | None = None,  # address of a Ray cluster, see `run_tasks`; views come back
 ) -> Iterator[tuple[int, int, int]]:
     """Generate the missing scenes; yields each one's index, grasps tried, and grasps that held."""
     folder.mkdir(parents=True, exist_ok=True)
-    # Other machines find files at whole paths too.
+    # Other machines need absolute paths.
     weights, objects = (path and path.resolve() for path in (options.weights, objects))
     if weights is not None:
-        detector(weights)  # refuses wrong ones now, not only once a scene is cleared by them
+        detector(weights)  # refuses wrong weights now, not when the first scene is cleared
     changes = {"engine": choose_engine(options.engine), "weights": weights}
     options = options.model_copy(update=changes)
-    # One view of each kind and seed: the other scenes of a seed are made by the same engine.
+    # One view of each kind and seed: all scenes of a seed are made by the same engine.
     some = {path.name.rsplit("-", 1)[0]: path for path in folder.glob("*.npz")}
     if other := {load_view(path).engine for path in some.values()} - {options.engine}:
         raise ValueError(
@@ -137,7 +137,7 @@ def missing_scenes(folder: Path, options: GenerationOptions) -> list[int]:
 
 
 def kind_of(options: GenerationOptions, index: int) -> SceneKind:
-    """How a scene is made."""
+    """The kind of a scene."""
     return SceneKind(options.scene) if options.scene else MIXTURE[index % len(MIXTURE)]
 
 
@@ -158,11 +158,11 @@ def _scene_maker(
 def generate_scene(
     sets: dict[SceneKind, ObjectSet], options: GenerationOptions, index: int
 ) -> list[LabelledView]:
-    """Generate all views of one scene, of the built-in objects where there are no sets."""
+    """Generate all views of one scene; without sets, the scene has built-in objects."""
     streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(7)]
     scene, *of_views, shape, hand, household = streams
     kind = kind_of(options, index)
-    # Some scenes are made of the other kind's objects, where there are any.
+    # Some scenes have objects of the other kind, if there are any.
     source = kind.objects
     if scene.random() < OTHER_OBJECTS:
         other = PILE if source is PACKED else PACKED
@@ -193,9 +193,9 @@ def _views(
     seen_from: ViewRange,
     options: GenerationOptions,
     rng: np.random.Generator,  # of the objects
-    of_views: Sequence[np.random.Generator],  # of cameras, noise, and requests and grasps
+    of_views: Sequence[np.random.Generator],  # of cameras, of noise, of requests and grasps
 ) -> Iterator[LabelledView]:
-    """The views of one scene, which a network clears meanwhile, if one is given and drawn to."""
+    """The views of one scene; in some scenes, the given network clears it between the views."""
     (camera, noise, choice), hand = of_views, simulation.gripper
     guide, failures = None, FAILURES
     if options.weights is not None and rng.random() < CLEARED_SHARE:
@@ -225,15 +225,15 @@ def ask(
     simulation: ClutterSimulation,
     kind: SceneKind,
     cameras: Sequence[Float64],  # (4, 4) T_world_camera of each
-    noise: np.random.Generator,  # of the observation and what it is said to show
+    noise: np.random.Generator,  # of the observation and of the given support
     choice: np.random.Generator,  # of the rest of the request
     *,
-    guided: bool,  # whether a network clears the scene, and has to be asked as a robot asks it
+    guided: bool,  # whether a network clears the scene and needs a robot's full request
 ) -> tuple[Query, str]:
-    """Observe the scene and make a request like a benchmark's, unless guided for a few balls only.
+    """Observe the scene and make a request like a benchmark's; unless guided, for a few balls.
 
-    In bins, on tables and in some other views the cloud holds all that the camera sees, and the
-    support is given, not quite where it is, or has to be found.
+    In bins, on tables and shelves and in some other views, the cloud contains all that the camera
+    sees, and the support is given with an error, or has to be found.
     """
     open_table = kind in (PACKED, PILE)
     around = not open_table or noise.random() < AROUND_SHARE
@@ -263,7 +263,7 @@ def ask(
 
 
 def _plane(rng: np.random.Generator) -> SupportPlane:
-    """The table's plane with the error of a measurement."""
+    """The table's plane with a measurement error."""
     tilted = np.array([*rng.normal(0.0, PLANE_TILT, size=2), 1.0])
     x, y, z = (tilted / np.linalg.norm(tilted)).tolist()
     height = TABLE_HEIGHT + rng.normal(0.0, PLANE_ERROR)
@@ -288,13 +288,13 @@ def _objects_of(simulation: ClutterSimulation) -> dict[str, Any]:
 
 
 def label(
-    simulation: ClutterSimulation,  # holds the scene
-    query: Query,  # A view of it and the request
+    simulation: ClutterSimulation,  # contains the scene
+    query: Query,  # a view of it and the request
     options: GenerationOptions,  # how many to try
     rng: np.random.Generator,  # chooses among the candidates
     guide: GraspDetector | None,  # guides the choice
 ) -> tuple[LabelledView, Float32 | None]:
-    """Sample candidates as the detector does and try some; also the guide's best hand (4, 4)."""
+    """Sample candidates like the detector and try some; also returns the guide's best (4, 4)."""
     observation, _ = query
     found = choose_grasps(query, options, rng, guide)
     if found is None:
@@ -333,9 +333,9 @@ def label(
 def choose_grasps(
     query: Query, options: GenerationOptions, rng: np.random.Generator, guide: GraspDetector | None
 ) -> tuple[Prepared, Scene, Candidates, int | None] | None:
-    """Sample candidates of a view as the detector does and choose some; None without any.
+    """Sample candidates of a view like the detector and choose some; None if there are none.
 
-    The last is the row of the guide's best among them.
+    The last value is the row of the guide's best among them.
     """
     observation, request = query
     if len(observation.cloud) < (request.num_approach_points or 1):
@@ -359,7 +359,7 @@ def choose_grasps(
 
 
 def _any(sample: Sample, total: int, rng: np.random.Generator) -> Int64:
-    """Ascending rows of candidates to try, `total` at most, most of them collision-free."""
+    """Ascending rows of at most `total` candidates to try, most of them collision-free."""
     free = rng.permutation(np.flatnonzero(sample.collision_free))
     hit = rng.permutation(np.flatnonzero(~sample.collision_free))
     free = free[: max(round(FREE_SHARE * total), total - len(hit))]
@@ -368,14 +368,14 @@ def _any(sample: Sample, total: int, rng: np.random.Generator) -> Int64:
 
 def _likely(
     number: Int64,  # (E,) the candidates' objects
-    logit: Float32,  # (E,) the network's
-    rating: Float32,  # (E,) that a robot would go by
+    logit: Float32,  # (E,) the network's output
+    rating: Float32,  # (E,) the rating by which a robot would choose
     total: int,
     rng: np.random.Generator,
 ) -> Int64:
-    """Ascending rows of candidates to try, some `total`: the best of each object, others like it.
+    """Ascending rows of about `total` candidates: the best of each object, then mostly likely ones.
 
-    Scores trained on randomly drawn grasps are too high for the best grasps.
+    A network trained on randomly drawn grasps overestimates the best grasps.
     """
     chosen, likely = np.zeros((2, len(number)), dtype=bool)
     for each in np.unique(number):
@@ -391,23 +391,23 @@ def _likely(
 
 
 def random_gripper(rng: np.random.Generator) -> dict[str, Any]:
-    """The fields of a gripper whose opening, and fingers' length, width and thickness are drawn.
+    """The fields of a gripper with random opening and random finger length, width and thickness.
 
-    A finger is a pad, and behind it a root that is no thinner. Metres.
+    A finger is a pad, and behind it a root that is at least as thick. Metres.
     """
 
     def draw(least: float, most: float) -> float:
         return round(rng.uniform(least, most), 4)
 
     opening, length = draw(0.04, 0.14), draw(0.035, 0.12)  # of a finger, from the palm to its tip
-    half_width, thick = draw(0.005, 0.015), draw(0.006, 0.022)  # of a finger, thick at its tip
-    # The palm's z, half the hand's depth, and what a finger's root has outward beside the pad.
+    half_width, thick = draw(0.005, 0.015), draw(0.006, 0.022)  # of a finger, thickness at its tip
+    # The palm's z, half the hand's depth, and the extra thickness of a finger's root.
     palm, body, root = draw(0.06, 0.09), draw(0.02, 0.035), draw(0.0, 0.016)
     tip, pad = palm + length, palm + length * rng.uniform(0.2, 0.6)
     side = max(opening / 2 + thick + rng.uniform(-0.03, 0.02), 0.03)
-    contact = tip - 0.007  # as far from the tips as in every gripper file
+    contact = tip - 0.007  # the same distance from the tips as in all gripper files
     swing: dict[str, float] | None = None
-    if rng.random() < 0.4:  # fingers swing on links, here their length and outward part
+    if rng.random() < 0.4:  # fingers swing on links of this length and outward reach
         radius = rng.uniform(0.05, 0.11)
         swing = {"radius": radius, "reach": min(rng.uniform(0.3, 0.5) * opening, 0.75 * radius)}
     pad_box = [[-half_width, 0.0, pad], [half_width, thick, tip]]

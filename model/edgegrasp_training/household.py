@@ -13,18 +13,18 @@ from edgegrasp_model.scene.cloud import unit
 from edgegrasp_sim.engine.urdf import Surface, convex_hull
 
 Numbers = Float64 | list[float]
-Part = Float64  # (..., 3) metres: points whose convex hull it is
+Part = Float64  # (..., 3) metres: points; the part is their convex hull
 Random = np.random.Generator
 
-FINE, COARSE = 28, 16  # corners of a circle: of a solid part, and of a wall of as many parts
+FINE, COARSE = 28, 16  # corners of a circle: for a solid part, for a wall with a part per side
 LIE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # turns z to x
 RAISE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # turns y to z
 
 
 def household_mesh(rng: Random) -> tuple[str, list[Surface]]:
-    """Draw an object of any family: its name, and closed convex parts that may overlap.
+    """Draw an object of any family: its family's name, and closed convex parts that may overlap.
 
-    They stand on z = 0 about the z axis.
+    The object stands on z = 0, centred on the z axis.
     """
     make = FAMILIES[int(rng.integers(len(FAMILIES)))]
     parts = [part.reshape(-1, 3) for part in make(rng)]
@@ -136,7 +136,7 @@ def _book(rng: Random) -> list[Part]:
 
 
 def _torch(rng: Random) -> list[Part]:
-    """Lying, or standing on its head."""
+    """A torch that lies, or stands on its head."""
     grip, length = rng.uniform(0.009, 0.018), rng.uniform(0.08, 0.22)
     head, neck = grip * rng.uniform(1.1, 2.0), length * rng.uniform(0.15, 0.35)
     parts = [_solid([head, head, grip], [0.0, 0.5 * neck, neck])]
@@ -279,7 +279,7 @@ FAMILIES = (
 
 
 def oval(sharp: float = 1.0, corners: int = FINE) -> Float64:
-    """A circle of radius one (corners, 2); a `sharp` below one makes it squarer."""
+    """A circle of radius one (corners, 2); `sharp` below one makes it squarer."""
     angle = 2 * np.pi * (np.arange(corners) + 0.5) / corners
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return np.asarray(np.sign(ring) * np.abs(ring) ** sharp)
@@ -290,7 +290,7 @@ def _rectangle(x: float, y: float) -> Float64:
 
 
 def lofted(outline: Float64, widths: Numbers, heights: Numbers) -> Float64:
-    """An outline (S, 2) scaled by a width, or two (R, 2), at each height: (R, S, 3)."""
+    """An outline (S, 2) scaled by one width (R,) or two widths (R, 2) at each height: (R, S, 3)."""
     rings = np.empty((len(widths), len(outline), 3))
     rings[..., :2] = outline * np.reshape(widths, (len(widths), 1, -1))
     rings[..., 2] = np.asarray(heights)[:, None]
@@ -298,7 +298,7 @@ def lofted(outline: Float64, widths: Numbers, heights: Numbers) -> Float64:
 
 
 def swept(section: Float64, angles: Float64) -> Float64:
-    """Radii and heights (S, 2), or (R, S, 2) one for each angle, turned about z: (R, S, 3)."""
+    """Radii and heights (S, 2), or (R, S, 2) for each angle, rotated about z: (R, S, 3)."""
     rings = np.empty((len(angles), section.shape[-2], 3))
     rings[..., 0] = np.cos(angles)[:, None] * section[..., 0]
     rings[..., 1] = np.sin(angles)[:, None] * section[..., 0]
@@ -307,12 +307,12 @@ def swept(section: Float64, angles: Float64) -> Float64:
 
 
 def _solid(radii: Numbers, heights: Numbers) -> Part:
-    """A solid of revolution about z; its profile is convex."""
+    """A solid of revolution about z with a convex profile."""
     return lofted(oval(), radii, heights)
 
 
 def _box(size: ArrayLike, centre: ArrayLike, cut: float = 0.0) -> Part:
-    """A box; `cut` of its size is taken off its upright edges."""
+    """A box with bevelled upright edges; `cut` is the bevel as a share of its smaller side."""
     x, y, z = np.asarray(size) / 2
     cut = cut * 2 * min(x, y)
     outline = np.concatenate([_rectangle(2 * (x - cut), 2 * y), _rectangle(2 * x, 2 * (y - cut))])
@@ -320,14 +320,14 @@ def _box(size: ArrayLike, centre: ArrayLike, cut: float = 0.0) -> Part:
 
 
 def _walls(x: float, y: float, z: float, thick: float) -> list[Part]:
-    """Four bars around an opening, x by y outside and z high."""
+    """Four bars around an opening; outer size x by y, height z."""
     sides = -1.0, 1.0
     parts = [_box((x, thick, z), (0.0, side * (y - thick) / 2, z / 2)) for side in sides]
     return parts + [_box((thick, y, z), (side * (x - thick) / 2, 0.0, z / 2)) for side in sides]
 
 
 def _rod(start: Float64, end: Float64, first: float, last: float = 0.0) -> Part:
-    """A round rod from one point to another, with the radius at each; without a last the same."""
+    """A round rod from one point to another, with the radius at each end; default: equal radii."""
     z = unit(end - start)
     x = unit(np.cross(z, (0.0, 0.0, 1.0) if abs(z[2]) < 0.9 else (1.0, 0.0, 0.0)))
     frame = np.stack([x, np.cross(z, x), z], axis=1)
@@ -343,7 +343,7 @@ def _wedges(section: Float64, angles: Float64) -> list[Part]:
 
 
 def _shell(radii: Numbers, heights: Numbers, wall: float, floor: float) -> list[Part]:
-    """A vessel: its outer profile from the foot up, the thickness of its wall and its floor."""
+    """A vessel from its outer profile, from the foot up, and the thickness of wall and floor."""
     outside = np.stack([radii, heights], axis=1)
     way = unit(np.diff(outside, axis=0))
     way = unit(np.concatenate([way[:1], way[1:] + way[:-1], way[-1:]]))

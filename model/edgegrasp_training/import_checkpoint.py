@@ -1,4 +1,4 @@
-"""Conversion of the authors' checkpoints, which store each part of a network in its own file.
+"""Convert the authors' checkpoints, which store each part of a network in its own file.
 
 Their layout (github.com/HaojHuang/Edge-Grasp-Network): `local_emd_model-ckpt-N.pt`,
 `global_emd_model-ckpt-N.pt`, `classifier_model-ckpt-N.pt` and, for the VN network, `std-ckpt-N.pt`.
@@ -17,11 +17,11 @@ from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.edgegrasp import GRASP_WIDTH
 from edgegrasp_training.recipes import RECIPES, build_network
 
-# Of the authors' evaluation, metres.
+# The authors' evaluation: metres, metres, hand.
 VOXEL_SIZE, CROP_RADIUS, GRIPPER = 0.0045, 0.05, "panda"
 # The first word of a file's name is the prefix of its parts below.
 _FILES = "local_emd_model", "global_emd_model", "classifier_model", "std"
-# Their parts by our names.
+# Patterns of their names, and our names.
 _EDGEGRASP_PARTS = {
     r"local\.(conv\d)\.local_nn\.0": r"\1.hidden",
     r"local\.(conv\d)\.local_nn\.2": r"\1.output",
@@ -58,7 +58,7 @@ _VN_PARTS = {
 def import_checkpoint(directory: Path) -> tuple[nn.Module, CheckpointMetadata]:
     """Read a checkpoint in the authors' layout; with a `std` file it is a VN network.
 
-    Returns what `save_checkpoint` takes; InvalidCheckpoint: a file is missing, or does not fit.
+    Returns arguments of `save_checkpoint`. Raises InvalidCheckpoint if a file is missing or wrong.
     """
     found = sorted(directory.glob("local_emd_model-ckpt-*.pt"))
     if len(found) != 1:
@@ -79,7 +79,7 @@ def import_checkpoint(directory: Path) -> tuple[nn.Module, CheckpointMetadata]:
     try:
         ours = _renamed(theirs, _VN_PARTS if is_vn else _EDGEGRASP_PARTS)
         if "join.weight" in ours:
-            # Theirs reads point, normal, f3, ball, depth, approach; ours f3 and ball at the end.
+            # Their order is point, normal, f3, ball, depth, approach; ours has f3 and ball last.
             sizes = [6, config.conv_widths[-1] + config.global_widths_2[-1], GRASP_WIDTH - 6]
             first, features, last = torch.split(ours["join.weight"], sizes, dim=1)
             ours["join.weight"] = torch.cat((first, last, features), dim=1)
@@ -98,17 +98,17 @@ def _load_weights(path: Path) -> dict[str, Tensor]:
     try:
         weights = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(weights, dict):
-            raise TypeError(f"it holds a {type(weights).__name__}")
+            raise TypeError(f"it contains a {type(weights).__name__}")
     except (OSError, RuntimeError, EOFError, UnpicklingError, TypeError) as error:
         raise InvalidCheckpoint(
             f"directory: got {path}, which cannot be read as a state dict ({error}). "
-            "Give complete files that hold tensors alone."
+            "Give complete files that contain only tensors."
         ) from error
     return weights
 
 
 def _renamed(theirs: dict[str, Tensor], parts: dict[str, str]) -> dict[str, Tensor]:
-    """Weights under our names; unknown ones keep theirs, so that load_state_dict names them."""
+    """Weights under our names; unknown names stay, so that load_state_dict reports them."""
     ours = {}
     for name, weight in theirs.items():
         for pattern, replacement in parts.items():

@@ -26,13 +26,13 @@ class GenerationOptions(BaseModel, extra="forbid"):
     )
     gripper: str = Field(
         "panda",
-        description="Hand to try grasps with: a gripper's name or .toml file; random: one a scene",
+        description="Hand that tries grasps: a gripper's name or .toml file; random: one per scene",
     )
     household: float = Field(
-        0.0, ge=0.0, le=1.0, description="Share of the scenes made of random household objects"
+        0.0, ge=0.0, le=1.0, description="Share of the scenes with random household objects"
     )
     engine: str | None = Field(
-        None, description="pybullet or mujoco; default: the first one that is installed"
+        None, description="pybullet or mujoco; default: the first installed one"
     )
 
 
@@ -42,7 +42,7 @@ class TrainingOptions(BaseModel, extra="forbid"):
     steps: int = Field(20_000, ge=1, description="Number of training steps")
     views_per_step: int = Field(4, ge=1, description="Views in a step")
     balls_per_view: int = Field(8, ge=1, description="Balls of each view in a step")
-    learning_rate: float = Field(1e-3, gt=0, description="At the start; falls to 0 in the end")
+    learning_rate: float = Field(1e-3, gt=0, description="Initial learning rate; falls to 0")
     rotations: Literal["any", "none"] = Field(
         "any", description="Random rotations of training balls, for edgegrasp networks"
     )

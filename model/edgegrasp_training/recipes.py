@@ -1,4 +1,4 @@
-"""The networks that can be trained: their sizes, first weights, and the unit they train in."""
+"""The networks that can be trained: their sizes, initial weights, and unit of length."""
 
 from copy import deepcopy
 from functools import partial
@@ -13,22 +13,22 @@ from edgegrasp_model.networks.hand import HandNet
 from edgegrasp_model.networks.vn_edgegrasp import VNEdgeGraspNet
 
 CROP_RADIUS = 0.04  # metres; half the gripper's opening, as in the paper
-VOXEL_SIZE = 0.0045  # metres; that of the training views
-# Metres. In metres the positions in a ball are far smaller than its normals, and learned late. A
-# power of two, so that converting weights back to metres is exact.
+VOXEL_SIZE = 0.0045  # metres; the same as in the training views
+# Metres. In metres, positions in a ball are far smaller than normals, and are learned late. A power
+# of two makes converting weights back to metres exact.
 LENGTH_UNIT = 1 / 64
 CONSTANT = 1e-6  # standard deviation below which a number of the description counts as constant
 # With PyTorch's initial weights the dozen layers of a ball network would shrink signals to nothing.
 GAIN = 3**0.5
 LOCAL = (32, 64, 128)  # widths of the layers that see a point and its neighbours
 _sized = partial(NetworkConfig, crop_radius=CROP_RADIUS)
-# Of the networks of balls: widths of those, before each maximum over the ball, of the classifier.
+# Widths of ball networks: local layers, layers before each maximum over the ball, classifier.
 RECIPES = {
     # The paper's network (section IV-B and the authors' release): 3.05 M parameters.
     "edgegrasp": _sized("edgegrasp", LOCAL, (256, 512, 512), (1024, 1024), (512, 256, 128)),
     # An eighth of the paper's network (0.39 M parameters), for machines without a GPU.
     "edgegrasp-small": _sized("edgegrasp", LOCAL, (128, 128, 128), (256, 256), (256, 128)),
-    # Scores each edge grasp in the frame of its own hand; 0.13 M parameters.
+    # Scores each edge grasp in its hand frame; 0.13 M parameters.
     "edgegrasp-plus": _sized(
         architecture="hand",
         hand_widths=LOCAL,
@@ -41,7 +41,7 @@ RECIPES = {
 
 
 def recipe(name: str) -> CheckpointMetadata:
-    """The metadata of a new network of that name; raises ValueError for an unknown one."""
+    """The metadata of a new network with this name; raises ValueError for an unknown name."""
     if name not in RECIPES:
         raise ValueError(f"model: got {name!r}. Use one of: {', '.join(RECIPES)}.")
     return CheckpointMetadata(name, RECIPES[name], VOXEL_SIZE, gripper="panda")
@@ -74,13 +74,13 @@ def start_from(network: nn.Module, start: nn.Module) -> None:
     """Copy the weights of a network that takes lengths in metres; ValueError: another model."""
     try:
         network.load_state_dict(rescaled(start, LENGTH_UNIT).state_dict())
-    except RuntimeError:  # which lists dozens of layers
+    except RuntimeError:  # its message lists dozens of layers
         found = f"{type(start).__name__} to train {type(network).__name__}"
         raise ValueError(f"start_from: got {found}. Give weights of the same model.") from None
 
 
 def rescaled(network: nn.Module, factor: float) -> nn.Module:
-    """A copy with the weights of lengths scaled: by LENGTH_UNIT, it takes multiples of that."""
+    """A copy with scaled weights of lengths; with LENGTH_UNIT, its input is in that unit."""
     copy = deepcopy(network)
     with torch.no_grad():
         for weight in _length_weights(copy):

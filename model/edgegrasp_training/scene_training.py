@@ -25,18 +25,18 @@ from edgegrasp_training.scene_images import DEPTH_UNIT, SceneImage
 from edgegrasp_training.scene_layouts import OBJECT
 
 UP_SHARE = 0.5  # share of the images for which the network gets `up`
-UP_ERROR = 0.02  # radians, standard deviation of the `up` that it is given
+UP_ERROR = 0.02  # radians, standard deviation of the error of the given `up`
 BATCH = 16
 SIZES, SIZE_SHARES = ((352, 480), (256, 384), (192, 288)), (0.5, 0.3, 0.2)  # pixels, of batches
-CLOSER_SHARE = 0.5  # of the smaller images, a part of a stored image rather than all of it
+CLOSER_SHARE = 0.5  # share of the smaller images that are a cutout of a stored image
 CROPPED_SHARE = 0.12  # share of the images cropped to the objects' surroundings
-HELD_OUT = 2  # files, the first ones, that the network never learns from
-EVALUATED = 200  # of their images, about
+HELD_OUT = 2  # number of files, the first ones, that are not used for training
+EVALUATED = 200  # approximate number of their images that are evaluated
 WARM_UP = 200  # steps
 SAVE_EVERY = 300  # seconds
-AVERAGED = 0.998  # of the mean weights that stay at each step
+AVERAGED = 0.998  # share of the old mean weights kept at each step
 LINK_WEIGHT, UP_WEIGHT, NEAR_WEIGHT = 0.5, 0.5, 0.3  # in the loss
-NEAR = 4  # output pixels around an object, where the classes of all objects count alike
+NEAR = 4  # output pixels around an object in which classes get extra weight
 APART = 4.0  # weight of a link between different objects
 
 
@@ -46,13 +46,13 @@ class SceneBatch(NamedTuple):
     features: Tensor  # (B, CHANNELS, H, W)
     classes: Tensor  # (B, H/2, W/2) int64; -1 without a reading
     votes: Tensor  # (B, 3, H/2, W/2) metres
-    weight: Tensor  # (B, H/2, W/2) of each pixel's vote: all objects of an image count alike
-    links: Tensor  # (B, 2, H/2, W/2) 1 same object, 0 not, -1 not judged
+    weight: Tensor  # (B, H/2, W/2) of each pixel's vote, lower in large objects
+    links: Tensor  # (B, 2, H/2, W/2) to the next pixel: 1 same object, 0 not, -1 not judged
     up: Tensor  # (B, 3) unit
 
 
 def read_images(files: Iterable[Path]) -> list[SceneImage]:
-    """All images in files of `generate`."""
+    """All images in files written by `generate`."""
     images = []
     for path in files:
         with np.load(path) as stored:
@@ -62,14 +62,14 @@ def read_images(files: Iterable[Path]) -> list[SceneImage]:
 
 
 def image_points(image: SceneImage) -> Float32:
-    """(H, W, 3) camera frame, metres; NaN without a reading."""
+    """The points (H, W, 3) of an image, camera frame, metres; NaN where there is no reading."""
     return unproject(metres(image.depth, DEPTH_UNIT), Intrinsics(*image.camera.tolist()))
 
 
 def make_batch(
     images: Sequence[SceneImage], rng: np.random.Generator, up_known: bool | None = None
 ) -> SceneBatch:
-    """Features and targets of images of one size; `up_known` None: at random, and mirrored."""
+    """Features and targets of images of one size; `up_known` None: random, with augmentation."""
     size = SIZES[0] if up_known is not None else SIZES[int(rng.choice(len(SIZES), p=SIZE_SHARES))]
     rows = [_example(image, rng, up_known, size) for image in images]
     return SceneBatch(*(torch.from_numpy(np.stack(each)) for each in zip(*rows, strict=True)))
@@ -113,7 +113,7 @@ _MIRROR, _HALF_TURN = np.array([[-1, 1, 1], [-1, -1, 1]], dtype=np.float32)
 
 
 def _cropped(points: Float32, label: Int64, plane: Float32, rng: np.random.Generator) -> Float32:
-    """Keep only points above the support and near objects, as callers crop clouds."""
+    """Keep only points above the support and near objects, like a cropped cloud."""
     objects = points[(label >= OBJECT) & ~np.isnan(points[..., 2])]
     if len(objects) < 50:
         return points
@@ -126,7 +126,7 @@ def _cropped(points: Float32, label: Int64, plane: Float32, rng: np.random.Gener
 
 
 def scene_loss(output: SceneOutput, batch: SceneBatch) -> dict[str, Tensor]:
-    """The parts of the loss, weighted."""
+    """The weighted parts of the loss."""
     wrong = functional.cross_entropy(
         output.classes, batch.classes, ignore_index=-1, reduction="none"
     )
@@ -154,7 +154,7 @@ def scene_loss(output: SceneOutput, batch: SceneBatch) -> dict[str, Tensor]:
 
 
 def evaluate(network: SceneNet, images: Sequence[SceneImage]) -> dict[str, float]:
-    """Losses and the intersection over union of each class, half of the images with `up`."""
+    """Losses and the intersection over union of each class; half of the images have `up`."""
     network.eval()
     rng, totals = np.random.default_rng(0), np.zeros((3, 3))
     losses: dict[str, float] = {}
@@ -173,7 +173,7 @@ def evaluate(network: SceneNet, images: Sequence[SceneImage]) -> dict[str, float
 
 
 def fit_confidence(network: SceneNet, images: Sequence[SceneImage]) -> list[float]:
-    """Logistic regression from mean probabilities to whether most of an instance is an object."""
+    """Logistic regression from an instance's mean probability to whether it is mostly an object."""
     means, right = [], []
     for row, image in enumerate(images):
         known = image.up.astype(np.float64) if row % 2 else None
@@ -196,9 +196,9 @@ def fit_confidence(network: SceneNet, images: Sequence[SceneImage]) -> list[floa
 
 
 def batches(data: Path, images: list[SceneImage], rng: np.random.Generator) -> Iterator[SceneBatch]:
-    """Endless batches of the folder's files, prepared ahead; files added meanwhile are read too.
+    """Endless batches from the folder's files, prepared ahead; files added later are read too.
 
-    All that are read are appended to `images`.
+    All images read are appended to `images`.
     """
     read: set[Path] = set()
     orders, draws = rng.spawn(2)  # the latter is used in another thread
@@ -209,7 +209,7 @@ def batches(data: Path, images: list[SceneImage], rng: np.random.Generator) -> I
             read.update(new)
             images += read_images(new)
             if len(images) < BATCH:
-                value = f"{data} with {len(images)} images beside {HELD_OUT} files held out"
+                value = f"{data} with {len(images)} images, without {HELD_OUT} files held out"
                 raise ValueError(f"data: got {value}. Make more with edgegrasp generate-scenes.")
             order = orders.permutation(len(images))
             for start in range(0, len(order) - BATCH + 1, BATCH):
@@ -225,7 +225,7 @@ def train(
     run: Path,  # gets checkpoints and `log.txt`
     seconds: float,
     seed: int = 0,  # of weights and batches
-    start: Path | None = None,  # a checkpoint to go on from
+    start: Path | None = None,  # a checkpoint to continue from
     threads: int = 1,  # of the processor
     rate: float = 3e-3,  # the highest learning rate
 ) -> None:
@@ -275,7 +275,7 @@ def _learn(
     network: SceneNet, optimiser: torch.optim.Optimizer, batch: SceneBatch
 ) -> dict[str, float]:
     network.train()
-    # Products in bfloat16 are some three times as fast on processors that have them.
+    # Products in bfloat16 are about three times as fast on processors that support it.
     with torch.autocast("cpu", torch.bfloat16):
         output = network(batch.features.contiguous(memory_format=torch.channels_last))
     parts = scene_loss(output, batch)

@@ -1,6 +1,6 @@
-"""Training objects of many shapes: objects of a set stretched, computed ones, household objects.
+"""Training objects of many shapes: stretched objects of a set, computed and household objects.
 
-Of a computed object (`drawn_shape`) the engine takes the convex hull, as of scanned objects: many
+The engine uses the convex hull of a computed object (`drawn_shape`), as of scanned objects: many
 have hollows that a camera sees into but nothing can enter. Household objects are truly hollow.
 """
 
@@ -17,25 +17,25 @@ from edgegrasp_sim.objects import ObjectModel, ObjectSet, as_obj, blob, write_ob
 from edgegrasp_training.household import household_mesh, lofted, oval, swept
 
 STRETCH = 1.35  # greatest factor along an axis; its inverse is the least
-MADE_SHARE = 0.5  # of a scene's objects that are computed
-BLOB_SHARE = 0.15  # of them that are convex
-TRAINING_BLOBS = (100, 1000)  # their numbers; the built-in object sets have lower ones
+MADE_SHARE = 0.5  # share of a scene's objects that are computed
+BLOB_SHARE = 0.15  # share of a scene's objects that are convex blobs
+TRAINING_BLOBS = (100, 1000)  # numbers of blobs; the built-in object sets have lower numbers
 BLOB_SCALE = (0.6, 1.1)
-SYMMETRIC_SHARE = 0.5  # of the objects, stretched by one factor along x and y
+SYMMETRIC_SHARE = 0.5  # share of the objects that are stretched equally along x and y
 NUM_VARIED = 16  # objects that a scene is drawn from
 
 NUM_FREE, NUM_PLAIN = 320, 160
 NUM_DRAWN = NUM_FREE + NUM_PLAIN  # different shapes, before a scene stretches them
-CIRCLE, FINE_CIRCLE = 20, 32  # corners of a ring that stands for a circle
+CIRCLE, FINE_CIRCLE = 20, 32  # corners of a ring that approximates a circle
 LONGEST = 0.045, 0.12  # metres, range of the greatest extent
-THINNEST = 0.009  # metres, least extent
+THINNEST = 0.009  # metres, minimum extent
 PLAIN_WIDTH, PLAIN_HEIGHT = (0.03, 0.115), (0.03, 0.17)  # metres: some wider than a hand opens
 
 Rings = Float64  # (R, S, 3) corners of each ring along a part, any unit
 
 
 def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -> ObjectSet:
-    """Draw up to `NUM_VARIED` objects of a set and computed ones, each stretched at random."""
+    """Draw up to `NUM_VARIED` objects from a set and computed objects, each randomly stretched."""
     drawn: dict[str, ObjectModel] = {}
     for _ in range(NUM_VARIED):
         draw = rng.random()
@@ -56,7 +56,7 @@ def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -
 
 
 def household_objects(folder: Path, count: int, rng: np.random.Generator) -> ObjectSet:
-    """Draw household objects, each of its own size and truly hollow, into a folder."""
+    """Write random household objects, which are truly hollow, into a folder."""
     models = []
     for number in range(count):
         family, parts = household_mesh(rng)
@@ -69,7 +69,7 @@ def household_objects(folder: Path, count: int, rng: np.random.Generator) -> Obj
 
 
 def stretched(model: ObjectModel, factors: Float64, folder: Path) -> ObjectModel:
-    """Write an object of meshes stretched by factors (3,) along x, y, z; ValueError: not meshes."""
+    """Write an object of meshes stretched by factors (3,) along x, y, z; ValueError for others."""
     tree = ElementTree.parse(model.urdf)
     for shape in (*tree.iter("visual"), *tree.iter("collision")):
         mesh, origin = shape.find("geometry/mesh"), shape.find("origin")
@@ -89,7 +89,7 @@ def stretched(model: ObjectModel, factors: Float64, folder: Path) -> ObjectModel
 
 
 def drawn_shape(index: int) -> str:
-    """A shape as an OBJ file in metres, always the same for an index below NUM_DRAWN."""
+    """A shape as an OBJ file in metres, determined by an index below NUM_DRAWN."""
     rng = np.random.default_rng([NUM_FREE, index])
     return as_obj([_surface(_plain(rng))]) if index >= NUM_FREE else free_shape(rng, index)
 
@@ -103,7 +103,7 @@ def free_shape(rng: np.random.Generator, index: int) -> str:
 
 
 def joined(rings: Rings, *, closed: bool = True) -> Surface:
-    """The surface between neighbouring rings, or open rows, of corners; two triangles a side."""
+    """The surface between neighbouring rings or open rows of corners, two triangles per side."""
     number = np.arange(rings.size // 3).reshape(rings.shape[:2])
     if closed:
         number = np.hstack([number, number[:, :1]])
@@ -113,7 +113,7 @@ def joined(rings: Rings, *, closed: bool = True) -> Surface:
 
 
 def _surface(rings: Rings) -> Surface:
-    """Join neighbouring rings and close the ends by fans."""
+    """Join neighbouring rings, and close the ends with triangle fans."""
     (points, sides), (count, corners, _) = joined(rings), rings.shape
     points = np.concatenate([points, rings[[0, -1]].mean(axis=1)])
     ring, last = np.arange(corners), (count - 1) * corners
@@ -126,7 +126,7 @@ def _surface(rings: Rings) -> Surface:
 
 
 def _plain(rng: np.random.Generator) -> Rings:
-    """A box, a prism or a can in metres, as on a shelf."""
+    """A box, a prism or a can, in metres, like goods on a shelf."""
     corners = int(rng.choice([4, 4, 6, FINE_CIRCLE, FINE_CIRCLE, FINE_CIRCLE]))
     width, depth = rng.uniform(*PLAIN_WIDTH, size=2)
     half_height = rng.uniform(*PLAIN_HEIGHT) / 2.0

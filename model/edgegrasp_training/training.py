@@ -29,8 +29,8 @@ from edgegrasp_training.views import load_view
 
 VIEWS_IN_MEMORY = 8000
 WEIGHT_DECAY = 1e-4
-AVERAGING = 0.998  # share of the old weights in the running mean that is kept
-UNKNOWN = 0.1  # share of training views without their table, and without their camera
+AVERAGING = 0.998  # share of the running mean of the weights kept at each step
+UNKNOWN = 0.1  # share of training views without a known support, and without a known camera
 DROPOUT_STREAM = 1  # random stream of a step
 STATE_FILE, LOG_FILE = "state.pt", "log.csv"
 # Attributes of a trainer that its state file keeps.
@@ -39,20 +39,20 @@ STATEFUL = ("network", "average", "optimizer")
 
 
 class Trainer:
-    """Trains one network; its run folder holds everything it needs to resume."""
+    """Trains one network; its run folder contains everything needed to resume."""
 
     def __init__(
         self,
         metadata: CheckpointMetadata,  # name, widths and gripper of the network to train
         train_paths: list[Path],  # view files
         validation_paths: list[Path],  # view files of other scenes
-        folder: Path,  # gets `state.pt`, `log.csv` and `NAME.safetensors`, the best so far
+        folder: Path,  # for `state.pt`, `log.csv` and `NAME.safetensors`, the best so far
         options: TrainingOptions,  # the recipe
-        device: torch.device | str = "cpu",  # where the network runs
+        device: torch.device | str = "cpu",  # of the network
         teacher: examples.Teacher | None = None,  # scores further candidates to learn from
-        start: Path | None = None,  # weights to start from; None: random ones
+        start: Path | None = None,  # weights to start from; None: random weights
     ) -> None:
-        """Set up, or resume from the folder's last state; ValueError: the options do not fit."""
+        """Set up, or resume from the folder's last state; ValueError if the options do not fit."""
         if teacher is not None and metadata.network.architecture == "hand":
             raise ValueError(f"teacher: {metadata.name} learns from labels alone. Name none.")
         self.teacher = teacher
@@ -76,7 +76,7 @@ class Trainer:
         )
         self.step, self.best_loss = 0, float("inf")
         self.seconds = 0.0  # spent in training steps
-        # What decides every step.
+        # Everything that determines the training steps.
         self.recipe = options.model_dump(include={*TrainingOptions.model_fields}) | {
             "data": [path.name for path in train_paths],
             "teacher": teacher and teacher.metadata.digest,
@@ -113,7 +113,7 @@ class Trainer:
     def evaluate(self, balls_per_view: int | None = None) -> Evaluation:
         """Score the validation views, or at most `balls_per_view` balls of each.
 
-        Targets are the outcomes of grasps that were tried; with a teacher its scores too.
+        Targets are the outcomes of tried grasps, and with a teacher also its scores.
         """
         logits, labels = [], []
         with torch.inference_mode():
@@ -132,7 +132,7 @@ class Trainer:
         path = self.folder / f"{self.metadata.name}.safetensors"
         best, saved = load_checkpoint(path)
         recipes.start_from(self.average, best)
-        # Mixed once with where it started (Wortsman et al., CVPR 2022).
+        # Mix once with the starting weights (Wortsman et al., CVPR 2022).
         if self.start is not None and not saved.training:
             first = deepcopy(self.average)
             recipes.start_from(first, self.start[0])
@@ -183,14 +183,14 @@ class Trainer:
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimizer.step()
-        # A mean over few steps only at first, so that it does not remember the random weights.
+        # At first the mean covers only few steps, so that it forgets the random weights.
         kept = min(AVERAGING, (self.step + 1) / (self.step + 10))
         for mean, value in zip(self.average.parameters(), self.network.parameters(), strict=True):
             mean.lerp_(value.detach(), 1.0 - kept)
         return float(loss.detach())
 
     def _training_batch(self, rng: np.random.Generator) -> examples.Packed:
-        """Random balls of random views, determined by the seed and the step number alone."""
+        """Random balls of random views, determined only by the seed and the step number."""
         count = min(self.options.views_per_step, len(self.train_paths))
         parts: list[examples.Packed] = []
         for index in rng.choice(len(self.train_paths), count, replace=False):
@@ -204,7 +204,7 @@ class Trainer:
             if packed is None:
                 continue
             # The paper's network, unlike Vector Neurons, is not equivariant. Without a camera the
-            # detector's frame is upright, but may be turned any way about up.
+            # detector's frame is upright, but its yaw is arbitrary.
             upright = self.options.rotations == "none"
             if isinstance(self.network, EdgeGraspNet) and not (upright and camera_known):
                 assert isinstance(packed.batch, BallBatch)
@@ -220,12 +220,12 @@ class Trainer:
         self,
         path: Path,  # of the view
         grasps: examples.TriedGrasps,
-        count: int | None,  # balls at most; None: all
-        rng: np.random.Generator,  # chooses them
+        count: int | None,  # maximum number of balls; None: all
+        rng: np.random.Generator,  # chooses balls
         *,
-        vary: bool = False,  # choose the points of hands at random too
+        vary: bool = False,  # also choose the points of hands at random
     ) -> examples.Packed | None:
-        """Balls of a view whose grasps were tried, or scored by the teacher; None without any."""
+        """Balls of a view with tried grasps or the teacher's scores; None if there are none."""
         network, balls, taught = self.metadata.network, grasps.balls(), None
         if self.teacher is not None:
             taught = self._soft_labels(path)
@@ -238,7 +238,7 @@ class Trainer:
         return packed if len(packed.label) else None
 
     def _standardise(self, network: HandNet) -> None:
-        """Fit mean and spread of the hand descriptions to the training views."""
+        """Fit mean and standard deviation of hand descriptions to the training views."""
         seen = [self._tried(path, True).seen for path in self.train_paths]
         values = np.concatenate([hands.description.numpy() for hands in seen if hands is not None])
         mean, std = values.mean(axis=0, dtype=np.float64), values.std(axis=0, dtype=np.float64)
@@ -266,7 +266,7 @@ class Trainer:
             writer.writerow(row)
 
     def _resume(self, file: Path) -> None:
-        """Continue from a saved state; ValueError: it is damaged, or of another model or recipe."""
+        """Continue from a saved state; ValueError if damaged, or of another model or recipe."""
         try:
             state = torch.load(file, weights_only=True, map_location=self.device)
         except (EOFError, RuntimeError, UnpicklingError) as error:

@@ -1,4 +1,4 @@
-"""Labelled views, which a data generator writes and a trainer reads."""
+"""Labelled views, written by the data generator and read by the trainer."""
 
 import json
 import zlib
@@ -20,14 +20,14 @@ from edgegrasp_model.options import SupportPlane, Workspace
 from edgegrasp_model.scene.scene import near_workspace_side
 
 UNTRIED = -1  # label of a candidate that was not tried
-TOGETHER = 0.009  # metres between points of one object: twice the edge of a voxel
+TOGETHER = 0.009  # metres; nearer points belong to one object; twice the edge of a voxel
 STORED_TYPES = {"normals": np.float16, "approach_index": np.uint16, "contact_index": np.uint16}
-# What the arrays of a file are read as.
+# Types to which the arrays of a file are converted.
 TYPES: dict[str, Callable[[Any], Any]] = {
     **{"normals": np.float32, "approach_index": np.int64, "contact_index": np.int64},
     **{"engine": str, "sensor": str, "gripper": str, "objects": tuple, "object_digests": tuple},
 }
-# The table and the limits of the simulated scenes, for views whose file does not have them.
+# The table and the limits of the simulated scenes, for files without them.
 TABLE = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.05)
 WORKSPACE = Workspace(min=(0.02, 0.02, 0.055), max=(0.28, 0.28, 0.3))
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)
@@ -37,20 +37,20 @@ UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)
 class LabelledView:
     """One observed cloud and some of its edge grasps, tried in simulation; world frame, metres."""
 
-    points: Float32  # (N, 3) voxelised
-    normals: Float32  # (N, 3) unit, turned to the camera
+    points: Float32  # (N, 3) after voxel downsampling
+    normals: Float32  # (N, 3) unit, toward the camera
     camera_position: Float32  # (3,)
     approach_index: Int64  # (E,) rows of `points`
     contact_index: Int64  # (E,) rows of `points`
     success: NDArray[np.int8]  # (E,) 1 held after the lift, 0 not, UNTRIED
-    engine: str = "pybullet"  # that simulated the labels
-    gripper: str = ""  # fields of the hand that tried them, JSON; empty: the Panda's own hand
-    T_world_hand: Float32 | None = None  # (E, 4, 4) hands tried; None: edge grasps as in the paper
+    engine: str = "pybullet"  # engine that simulated the labels
+    gripper: str = ""  # fields of the hand that tried the grasps, JSON; empty: the Panda's hand
+    T_world_hand: Float32 | None = None  # (E, 4, 4) hands tried; None: edge grasps of the paper
     firm: NDArray[np.int8] | None = None  # (E,) 1 held after shaking too, 0 not, UNTRIED
     support: Float32 | None = None  # (4,) unit normal and offset; zeros: unknown; None: TABLE
-    at_side: Bools | None = None  # (N,) cut off there; None: as WORKSPACE cuts it
-    object_of_point: NDArray[np.int16] | None = None  # (N,) -1: on no object; None: not known
-    objects: tuple[str, ...] = ()  # names of the objects in the scene, where they are known
+    at_side: Bools | None = None  # (N,) at a cropped side of the cloud; None: from WORKSPACE
+    object_of_point: NDArray[np.int16] | None = None  # (N,) -1: on no object; None: unknown
+    objects: tuple[str, ...] = ()  # names of the objects in the scene, if known
     object_digests: tuple[str, ...] = ()  # SHA-256 of their files, in the same order
     targets: NDArray[np.str_] | None = None  # (E,) objects between the fingers, "": none
     sensor: str = ""  # kind of depth camera whose faults the cloud has, "": unknown
@@ -72,7 +72,7 @@ class LabelledView:
 
     @property
     def support_plane(self) -> SupportPlane | None:
-        """The support plane, as it was given or found."""
+        """The support plane, given or found; None if unknown."""
         if self.support is None:
             return TABLE
         x, y, z, offset = self.support.astype(np.float64).tolist()
@@ -80,12 +80,12 @@ class LabelledView:
 
     @property
     def up(self) -> Float32:
-        """Away from gravity, as the detector takes it: (3,)."""
+        """Unit vector (3,) away from gravity, as the detector uses it."""
         plane = self.support_plane
         return UP if plane is None else np.asarray(plane.normal, dtype=np.float32)
 
     def cut_off(self) -> Bools:
-        """Which points (N,) lie at a side of the workspace, which cuts the cloud off."""
+        """Which points (N,) are at a side of the workspace, where the cloud is cropped."""
         if self.at_side is not None:
             return self.at_side
         if len(self.points) == 0:
@@ -106,7 +106,7 @@ class LabelledView:
 
 
 def load_view(path: Path) -> LabelledView:
-    """Read a view; raises ValueError for another file."""
+    """Read a view; raises ValueError if the file is not a view."""
     fields = LabelledView.__dataclass_fields__
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
@@ -118,7 +118,7 @@ def load_view(path: Path) -> LabelledView:
 
 
 def find_views(folders: list[Path]) -> list[Path]:
-    """All view files of some folders, sorted by name; FileNotFoundError: a folder has none."""
+    """All view files of some folders, sorted by name; FileNotFoundError if a folder has none."""
     found = {folder: list(folder.glob("*.npz")) for folder in folders}
     if empty := ", ".join(str(folder) for folder, paths in found.items() if not paths):
         raise FileNotFoundError(f"data: no .npz views in {empty}. Run edgegrasp generate-data.")
@@ -126,16 +126,16 @@ def find_views(folders: list[Path]) -> list[Path]:
 
 
 def scene_of(path: Path) -> str:
-    """The scene a view shows: its file name is scene kind, scene number, view."""
+    """The scene of a view, from its file name: scene kind, scene number, view."""
     return path.stem.rsplit("_", 1)[0]
 
 
 def split_by_scene(
     paths: list[Path], validation_share: float, seed: int
 ) -> tuple[list[Path], list[Path]]:
-    """Training and validation views; a scene keeps its side when scenes are added.
+    """Training and validation views; a scene keeps its part when scenes are added.
 
-    ValueError: none is left to train on.
+    Raises ValueError if no view is left to train on.
     """
     place = [zlib.crc32(f"{seed} {scene_of(path)}".encode()) / 2**32 for path in paths]
     kept = np.array(place) < max(validation_share, min(place) + 2**-32)
