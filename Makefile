@@ -1,16 +1,16 @@
-# EdgeGrasp: `make help` lists what there is.
+# EdgeGrasp: `make help` lists the targets.
 #
-# PYTHON names the interpreter that makes .venv: make PYTHON=python3.12 venv
-# TORCH is what pip is given for it: a build without CUDA; with CUDA: make TORCH=torch venv
+# PYTHON is the interpreter that makes .venv: make PYTHON=python3.12 venv
+# TORCH are pip's arguments for PyTorch: a build without CUDA; with CUDA: make TORCH=torch venv
 
 PYTHON ?= python3
 TORCH ?= --no-deps --extra-index-url https://download.pytorch.org/whl/cpu torch
 VENV := .venv
 BIN := $(VENV)/bin
-# Compiled on import, what is used.
+# Without precompiling: Python compiles modules when they are imported.
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-compile
 INSTALLED := $(VENV)/.installed
-# What `make view` needs, which is installed sooner; what only `make lint` and its like need.
+# Marks that packages are installed: for `make view` only (quicker); for `make lint` and the like.
 TO_LOOK := $(VENV)/.to_look
 TOOLS := $(VENV)/.tools
 GENERATED := $(wildcard proto/edgegrasp/*/*_pb2*) proto/edgegrasp/v1/contract.json \
@@ -51,7 +51,7 @@ lint: $(TOOLS) ## style, types, import boundaries, generated code
 	$(BIN)/kubernetes-validate --strict --quiet docker/kubernetes/*.yaml
 	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker/compose*.yaml
 	mkdir -p build
-	rm -f build/audit.json # is not written where advisories cannot be reached, which pip-audit says
+	rm -f build/audit.json # pip-audit does not write it, and says so, if advisories are unreachable
 	$(BIN)/pip-audit --progress-spinner off --disable-pip --require-hashes -r docker/requirements.txt \
 		-f json -o build/audit.json || [ ! -e build/audit.json ]
 	PYTHON=$(BIN)/python scripts/generate_proto.sh build
@@ -64,7 +64,7 @@ format: $(TOOLS) ## rewrite the code in the project's style
 test: $(INSTALLED) ## run the tests, on every core
 	$(BIN)/pytest -q -n auto
 
-fuzz: $(INSTALLED) ## send decoders and a running server what they cannot expect, for some minutes
+fuzz: $(INSTALLED) ## send invalid input to the decoders and to a running server, for some minutes
 	$(BIN)/pytest -q tests/fuzz --hypothesis-profile=fuzz
 
 bench: $(INSTALLED) ## measure speed; rewrites the tables of README and docs/speed.md
@@ -74,19 +74,19 @@ bench: $(INSTALLED) ## measure speed; rewrites the tables of README and docs/spe
 view: $(or $(wildcard $(INSTALLED)),$(TO_LOOK)) ## look at a scene and its grasps in the browser: make view FILE=scene.npz
 	$(BIN)/edgegrasp view $(FILE)
 
-demo: $(INSTALLED) ## scene, server, grasps over gRPC and REST, one executed, a picture
+demo: $(INSTALLED) ## simulate a scene, find grasps over gRPC and REST, execute one, draw a picture
 	$(BIN)/python examples/demo.py
 
 docs: $(TOOLS) ## build the site of docs/ into build/site, without network; warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-image-test: $(INSTALLED) ## build the container image, run it locked up (root, Debian: podman)
+image-test: $(INSTALLED) ## build the container image, run it unprivileged (root, Debian: podman)
 	docker/test_image.sh $(BIN)/python
 
 proto: $(TOOLS) ## generate gRPC code, contract, OpenAPI document and the client's options
 	PYTHON=$(BIN)/python scripts/generate_proto.sh
 
-constraints: ## resolve the dependencies afresh into constraints.txt
+constraints: ## resolve all dependencies again and write constraints.txt
 	scripts/update_constraints.sh $(PYTHON)
 
 clean: ## remove .venv and everything built or cached

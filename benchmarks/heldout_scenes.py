@@ -3,8 +3,8 @@
     python benchmarks/heldout_scenes.py --objects OBJECTS --output SCENES --seed 0
     edgegrasp benchmark-real --scenes SCENES --output RESULTS
 
-Tables, heaps, trays, bins and shelves in rooms, made of the test objects of `OBJECTS`, which are
-for evaluation only, and seen by depth cameras with their faults; with `--robots`, robots too. Files
+Tables, heaps, trays, bins and shelves in rooms, with the test objects of `OBJECTS`, which are for
+evaluation only, observed by depth cameras with their faults; with `--robots`, also robots. Files
 are named by kind.
 """
 
@@ -27,14 +27,14 @@ from edgegrasp_sim.scene import SceneObject, load_object, wait_for_rest
 from edgegrasp_sim.sensor import random_sensor
 
 KINDS = ("table", "heap", "tray", "bin", "shelf")
-FIRST, SUPPORT = 2, 0.01  # the first object's label; least share of the support in an image
+FIRST, SUPPORT = 2, 0.01  # the first object's label; minimum share of the support in an image
 SIZES = ((320, 240), (424, 240), (512, 424), (640, 480))
 TOUCHED = 0.015  # metres from a surface within which a faulty reading keeps its label
-WINDOW = 4  # pixels around one in which the surface is looked for that a reading lies on
-LEAST = 0.001  # of an image's pixels, below which what is seen of an object is not labelled
-FLAT = 0.004  # metres from the plane within which what carries the objects is the support
+WINDOW = 4  # pixels around a reading in which its surface is searched for
+LEAST = 0.001  # share of an image's pixels; an object with fewer is not labelled
+FLAT = 0.004  # metres from the plane within which the body that carries objects is the support
 FAR = 12.0  # metres
-# PyBullet's models: arms, which stand beside the objects, and what hangs over them.
+# PyBullet's models: arms, which stand next to the objects, and robots that hang above them.
 ARMS = ("franka_panda/panda.urdf", "kuka_iiwa/model.urdf", "xarm/xarm6_with_gripper.urdf")
 HANGING = ("pr2_gripper.urdf", "laikago/laikago.urdf", "mini_cheetah/mini_cheetah.urdf")
 HANGING += ("quadruped/vision60.urdf", "aliengo/aliengo.urdf", "quadruped/spirit40.urdf")
@@ -45,10 +45,10 @@ class Made(NamedTuple):
     """A scene at rest; the objects stand on z = 0."""
 
     support: int  # the body that carries the objects
-    polar: tuple[float, float]  # degrees from above that the camera looks from
+    polar: tuple[float, float]  # degrees of the camera from the vertical
     azimuth: tuple[float, float]  # degrees
     distance: tuple[float, float]  # metres
-    reach: float  # metres around the middle within which objects are
+    reach: float  # greatest distance of objects from the middle, metres
 
 
 class Maker:
@@ -60,7 +60,7 @@ class Maker:
         self.objects: list[SceneObject] = []
 
     def box(self, size: object, centre: object, turn: Rotation | None = None) -> int:
-        """A box that never moves, its full extent and its middle in metres."""
+        """A box that never moves; full extent and centre in metres."""
         body = self.world.add_box(np.asarray(size), np.asarray(centre), friction=0.6)
         if turn is not None:
             body.set_pose(np.asarray(centre, dtype=float), turn.as_quat().tolist())
@@ -96,7 +96,7 @@ class Maker:
                 self.box((0.26, 0.2, 0.012), (x, y, 0.006), turn)
 
     def robot(self) -> None:
-        """A robot in a random pose that touches no object, after 40 tries none."""
+        """A robot in a random pose that touches no object; no robot after 40 failed tries."""
         rng, client = self.rng, self.world.client
         for _ in range(40):
             stands, angle = rng.random() < 0.4, rng.uniform(0, 2 * np.pi)
@@ -115,7 +115,7 @@ class Maker:
             client.removeBody(body)
 
     def drop(self, count: int, half: tuple[float, float], height: float, upright: float) -> None:
-        """Let objects fall or stand them up, within half extents (2,) around the middle."""
+        """Drop objects or stand them upright, within half extents (2,) around the middle."""
         for _ in range(count):
             models = self.sets[int(self.rng.random() < 0.5)]
             standing = self.rng.random() < upright
@@ -134,7 +134,7 @@ class Maker:
                 wait_for_rest(self.world, self.objects, 1.5)
 
     def table(self) -> Made:
-        """Objects apart on a table that ends near them."""
+        """Separate objects on a table with an edge near them."""
         size = self.rng.uniform(0.6, 1.4, size=2)
         top = self.box((*size, 0.04), (*self.rng.uniform(-0.15, 0.15, size=2), -0.02))
         self.room(self.rng.uniform(0.5, 0.9))
@@ -172,7 +172,7 @@ class Maker:
         return Made(floor, (0, 35), (0, 360), (near, near + 0.6), max(x, y))
 
     def shelf(self) -> Made:
-        """Objects in a compartment seen from the front, with others around it."""
+        """Objects in a compartment observed from the front, with other compartments around it."""
         wide, deep, high = self.rng.uniform((0.45, 0.25, 0.26), (0.9, 0.45, 0.45))
         board = self.rng.uniform(0.012, 0.03)
         levels = -board / 2, high + board / 2, -high - 2 * board, 2 * high + 2 * board
@@ -186,7 +186,7 @@ class Maker:
         return Made(low, (55, 88), (245, 295), (0.5, 1.1), wide / 2)
 
     def walls(self, x: float, y: float, high: float, slope: float, thick: float) -> None:
-        """Four walls around half extents x and y, which lean outward by degrees."""
+        """Four walls around half extents x and y, which lean outward by `slope` degrees."""
         length = high / np.cos(np.radians(slope))
         for turn in range(4):
             half, along = (x, y) if turn % 2 == 0 else (y, x)
@@ -231,7 +231,7 @@ def picture(maker: Maker, made: Made) -> dict[str, Float64]:
 
 
 def on_the_surface(label: NDArray[np.uint8], true: Float64, depth: Float64) -> NDArray[np.uint8]:
-    """Labels (H, W) of readings: that of the nearby surface each lies on, 0 without one."""
+    """Labels (H, W) of the nearby surface that each reading lies on, 0 without a surface."""
     off = np.abs(depth - true)
     best, found = off.copy(), label.copy()
     for shift in product(range(-WINDOW, WINDOW + 1), repeat=2):
@@ -247,7 +247,7 @@ def main(
     output: Annotated[Path, Option()],
     seed: int = 0,
     each: Annotated[int, Option(help="Scenes of each kind.")] = 12,
-    robots: Annotated[bool, Option(help="One or two in each; no shelves.")] = False,
+    robots: Annotated[bool, Option(help="Add one or two robots to each; no shelves.")] = False,
 ) -> None:
     """Make the scenes."""
     output.mkdir(parents=True, exist_ok=True)

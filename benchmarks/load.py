@@ -1,9 +1,9 @@
 """Measure servers under load: `python -m benchmarks.load` writes load.json.
 
-Clients in threads send clouds or depth images, each its next request once it has an answer: latency
-and throughput by the number of clients. Without `--server` one is started, and measured over both
-transports. Several servers take turns, so that other work on the machine meets all alike: a new
-design beside the old one.
+Clients in threads send clouds or depth images; each sends its next request after an answer. This
+measures latency and throughput by the number of clients. Without `--server` a server is started,
+and measured over both transports. Several servers, such as a new and an old design, take turns, so
+that other work on the machine affects all alike.
 """
 
 import argparse
@@ -30,7 +30,7 @@ POINTS = 20_000
 SAMPLE = Path(edgegrasp_service.__file__).parent / "playground" / "samples" / "seven_depth.png"
 FOCAL = 540.0  # pixels, of the sample's camera
 OPTIONS: DetectOptions = {"num_approach_points": 32, "num_candidates": 500}
-TIMEOUT = 120.0  # seconds until a request is given up
+TIMEOUT = 120.0  # seconds until a client gives up
 OK = "OK"
 
 
@@ -38,7 +38,7 @@ class Sample(NamedTuple):
     """The outcome of one request."""
 
     seconds: float  # until its answer or error
-    beyond: float  # of these, outside of the detector; NaN without an answer
+    beyond: float  # the part of these outside the detector; NaN without an answer
     code: str  # OK, or the name of the client's error
 
 
@@ -81,7 +81,7 @@ def main() -> None:
 
 
 def run_clients(address: str, clients: int, seconds: float, points: int, seed: int) -> list[Sample]:
-    """Send until the time is over; every request that was sent has its sample."""
+    """Send requests until the time is over; returns a sample for each request sent."""
     request: dict[str, Any] = {"cloud": cloud(points, seed)}
     if not points:
         depth = np.asarray(Image.open(SAMPLE))
@@ -113,7 +113,7 @@ def percentiles(seconds: Sequence[float]) -> dict[str, float] | None:
 
 
 def cloud(points: int, seed: int) -> Float32:
-    """(N, 3) metres: a table of 0.3 m with five boxes on it, seen from all sides."""
+    """(N, 3) metres: a table of 0.3 m with five boxes on it, observed from all sides."""
     random = np.random.default_rng([seed, points])
     parts = [random.uniform((0.0, 0.0, 0.0), (0.3, 0.3, 0.001), (points // 3, 3))]
     for count in np.diff(np.linspace(points // 3, points, 6).astype(int)):

@@ -19,11 +19,11 @@ RUNS = 5
 
 
 def interleaved(
-    variants: Mapping[str, Callable[[], object]],  # what to run, by name
-    # Of the processor, which other work on the machine changes little; or of the wall.
+    variants: Mapping[str, Callable[[], object]],  # functions to run, by name
+    # Processor time, which other work on the machine changes little; or wall-clock time.
     clock: Callable[[], float] = time.process_time,
 ) -> dict[str, list[float]]:
-    """Seconds of each variant in each of RUNS rounds, after one that does not count."""
+    """Seconds of each variant in each of RUNS rounds, after a warm-up round."""
     seconds: dict[str, list[float]] = {name: [] for name in variants}
     for number in range(RUNS + 1):
         for name, variant in variants.items():
@@ -46,7 +46,7 @@ def machine() -> dict[str, Any]:
         "cores": len(os.sched_getaffinity(0)),
         "capability": torch.backends.cpu.get_cpu_capability(),
         "threads": torch.get_num_threads(),
-        "gflops": 2e-9 * 4096 * 1024 * 1024 / product,  # float32, each thread
+        "gflops": 2e-9 * 4096 * 1024 * 1024 / product,  # float32, per thread
         "load_average": os.getloadavg()[0],  # other work on the machine makes everything slower
         "python": platform.python_version(),
         "torch": torch.__version__,

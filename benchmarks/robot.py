@@ -1,9 +1,9 @@
-"""Processor time from a depth image to an arm's trajectory, and of reach alone, on one core.
+"""Processor time from a depth image to an arm's trajectory, or to reach only, on one core.
 
 usage: OMP_NUM_THREADS=1 python benchmarks/robot.py [ROBOT ...]
 
-The image is the playground's of seven objects, 640 x 480; the arm stands beside the objects, on
-the support, half a metre from their middle. Each row is of 20 seeds.
+The image is the playground's image of seven objects, 640 x 480; the arm stands next to the objects,
+on the support, half a metre from their middle. Each row has 20 seeds.
 """
 
 import sys

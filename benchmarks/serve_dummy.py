@@ -1,4 +1,4 @@
-"""A server with the dummy detector, whose front does not import what detectors need.
+"""A server with the dummy detector, whose front does not import packages of detectors.
 
 usage: python benchmarks/serve_dummy.py serve [FLAG ...]    `edgegrasp serve` without weights
 """

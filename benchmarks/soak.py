@@ -1,12 +1,12 @@
-"""Ask a server for minutes while it is attacked: `python -m benchmarks.soak --minutes 10`.
+"""Send requests to a server under attack for minutes: `python -m benchmarks.soak --minutes 10`.
 
-Clients send clouds of 32 to 20,000 points to a dummy network, over unary gRPC, streams and REST,
-a few of them malformed and a few abandoned; each answer carries the CRC-32 of the cloud that the
-server saw. Beside them are two attackers with another address: one sends requests made to kill
-workers, one holds connections and streams open without taking or sending anything. A process of
-its own asks for the server's health, each time on a new connection. Fails unless every request has
-an outcome of its own, health is never refused, each attack is answered with an error, memory does
-not grow and the server stops.
+Clients send clouds of 32 to 20,000 points to a dummy network, over unary gRPC, streams and REST, a
+few of them malformed and a few abandoned; each answer contains the CRC-32 of the cloud that the
+server received. Two attackers with another address run at the same time: one sends requests made to
+kill workers, one holds connections and streams open without reading or sending anything. A separate
+process checks the server's health, each time on a new connection. Fails unless every request has
+its own expected outcome, health is never refused, each attack is answered with an error, memory
+does not grow and the server stops.
 """
 
 import asyncio
@@ -46,19 +46,19 @@ REFUSED = "refused"
 CANCELLED = "cancelled"
 EXPECTED = {"good": {ANSWERED}, "malformed": {REFUSED}, "cancelled": {CANCELLED, ANSWERED}}
 FAULTS: tuple[dict[str, Any], ...] = ({"seed": -1}, {"model": "none"}, {"viewpoint": [1e300, 0, 0]})
-SECONDS = 30.0  # of a request
+SECONDS = 30.0  # timeout of a request
 START_SECONDS = 1.0  # for processes to start
 STOP_SECONDS = 30.0  # for the server to stop
-PROBE_SECONDS = 0.1  # between two questions for health
+PROBE_SECONDS = 0.1  # between two health checks
 HEALTH_TIMEOUT = 5.0 * float(os.environ.get("SOAK_PATIENCE", "1"))  # as in docker/kubernetes
 MEMORY_SAMPLES = 60
 MAX_GROWTH = 0.05  # of memory, from the third quarter of the attacks to the last
 ATTACKER = "127.0.0.2"  # fairness is between addresses
-HELD_SECONDS = 8.0  # for which the second attacker holds what it opened
-PAGES, CHECKS, STREAMS = 540, 200, 16  # that it opens
+HELD_SECONDS = 8.0  # for which the second attacker holds its connections
+PAGES, CHECKS, STREAMS = 540, 200, 16  # numbers of these that it opens
 CALLS_PER_CONNECTION = 90  # fewer than the server allows
 CHECK, STREAM = "/grpc.health.v1.Health/Check", "/edgegrasp.v1.GraspService/DetectGraspsStream"
-# Room for all of the clients; every refusal would be a line of the log, and they are thousands.
+# Room for all clients. Thousands of refusals would each be a line in the log.
 FLAGS = ("--max-queue-length", "512", "--max-streams", "64", "--log-level", "error")
 
 
@@ -75,7 +75,7 @@ def main(
         process = psutil.Process(server.pid)
         process.terminate()
         results["exit_code"] = int(process.wait(STOP_SECONDS))
-    # In a shorter time the attacks themselves have only begun.
+    # In a shorter time, memory may still grow because the attacks have just begun.
     results["faults"] = faults(results, grows=minutes >= 2)
     write_results(output, "soak", results)
     print(json.dumps(results, indent=1))
@@ -83,7 +83,7 @@ def main(
 
 
 def run(server: Addresses, clients: int, seconds: float, seed: int) -> dict[str, Any]:
-    """Run clients beside the attacks and the probe, each a process; returns the figures."""
+    """Run clients, attacks and the probe in separate processes; returns the figures."""
     context, works = multiprocessing.get_context("spawn"), (probe, poison, hold_connections)
     with context.Manager() as manager, ProcessPoolExecutor(len(works), context) as pool:
         stop = manager.Event()
@@ -110,12 +110,12 @@ class Plan:
     seed: int
 
     def points(self) -> Float32:
-        """The cloud (N, 3) of this plan, which no other plan has."""
+        """The cloud (N, 3) of this plan, different from those of all other plans."""
         random = np.random.default_rng([self.seed, self.number])
         return random.uniform(-0.2, 0.2, (self.size, 3)).astype(np.float32)
 
     def options(self) -> Any:
-        """The options of the request; faulty ones for a malformed request."""
+        """The options of the request; invalid for a malformed request."""
         return FAULTS[self.number % len(FAULTS)] if self.kind == "malformed" else {}
 
 
@@ -163,7 +163,7 @@ async def run_clients(server: Addresses, clients: int, seconds: float, seed: int
 
 
 async def outcome(client: AsyncGraspClient, way: str, plan: Plan) -> str:
-    """What becomes of a plan."""
+    """The outcome of a plan."""
     try:
         async with asyncio.timeout(plan.wait if plan.kind == "cancelled" else None):
             answer = await ask(client, way, plan)
@@ -178,7 +178,7 @@ async def outcome(client: AsyncGraspClient, way: str, plan: Plan) -> str:
 
 
 async def ask(client: AsyncGraspClient, way: str, plan: Plan) -> Detection:
-    """Send one plan, alone or in a stream of its own; raises the error that it is answered with."""
+    """Send one plan, alone or in its own stream; raises the error if it is answered with one."""
     if way != "stream":
         return await client.detect(plan.points(), **plan.options())
     stream = client.detect_stream([StreamRequest(plan.points(), **plan.options())])
@@ -284,7 +284,7 @@ def probe(url: str, address: str, stop: Any) -> dict[str, int]:
 
 
 def faults(results: dict[str, Any], grows: bool) -> list[str]:
-    """What is wrong, the growth of memory only if asked for; empty if all is well."""
+    """The faults found, empty if none; `grows`: whether growth of memory is a fault."""
     poisoned, held = results["attacks"]
     *_, before, after = np.array_split(results["memory_mb"], 4)
     found = {

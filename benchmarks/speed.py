@@ -1,7 +1,7 @@
 """Measure speed: `python -m benchmarks.speed` writes speed.json.
 
-Most times are processor seconds on one thread, medians of interleaved runs: they hold on a busy
-machine too.
+Most times are processor seconds on one thread, medians of interleaved runs, which are valid on a
+busy machine too.
 """
 
 import itertools
@@ -67,7 +67,7 @@ def main(
 def shipped() -> list[dict[str, Any]]:
     """Time each network in the whole pipeline on a view of each kind of scene, given the table.
 
-    Processor seconds on one thread, and seconds of the clock on two.
+    Processor seconds on one thread, and wall-clock seconds on two.
     """
     scenes, models = {str(kind): observe(kind) for kind in CLUTTER}, ModelCatalogue.load()
     runs, rows = {}, {}
@@ -86,7 +86,7 @@ def shipped() -> list[dict[str, Any]]:
 def camera() -> dict[str, float]:
     """Seconds for camera images with the default weights, given only the camera's position.
 
-    The demo's own scene; each image of SHARED, where it is; and the same enlarged to 1280 x 720.
+    The demo's scene; each image in SHARED, if it exists; and the same enlarged to 1280 x 720.
     """
     ours, seen = ModelCatalogue.load().get(""), observe(SceneKind.PILE, **DEMO)
     sent = {"the demo's scene": (seen.cloud, seen.camera_position)}
@@ -94,7 +94,7 @@ def camera() -> dict[str, float]:
         if len(scene.points) == np.prod(IMAGE):
             image = scene.points.reshape(*IMAGE, 3)
             sent[f"640 x 480, {scene.name}"] = image, np.zeros(3)
-            # Twice as many rows and columns; a little noise keeps points from lying on one another.
+            # Twice as many rows and columns; a little noise keeps points from coinciding.
             large = image.repeat(2, axis=0).repeat(2, axis=1)[120:840]
             noise = np.random.default_rng(0).normal(0.0, ENLARGED_NOISE, large.shape)
             sent[f"1280 x 720, {scene.name}"] = (large + noise).astype(np.float32), np.zeros(3)
@@ -106,7 +106,7 @@ def camera() -> dict[str, float]:
 
 
 def server() -> dict[str, float]:
-    """Seconds of the clock until the server is ready; its memory, MiB, then and after requests."""
+    """Wall-clock seconds until a server is ready, and its memory, MiB, then and after requests."""
     start = time.perf_counter()
     with local_server() as running:
         ready = time.perf_counter() - start
@@ -120,9 +120,9 @@ def server() -> dict[str, float]:
 
 
 def simulator() -> list[dict[str, Any]]:
-    """Labels a second and rounds a minute of each engine and kind, all but the start included."""
+    """Labels per second and rounds per minute of each engine and kind, without the start."""
     protocol, options = load_protocol("edgegrasp"), GenerationOptions(grasps_per_view=LABELS)
-    # Labels, seconds that they took, and seconds of a round.
+    # Number of labels, seconds for them, and seconds of a round.
     runs: dict[tuple[SceneKind, str], list[tuple[float, ...]]] = {
         (kind, engine): [] for kind in CLUTTER for engine in filter(installed, ENGINES)
     }
@@ -137,7 +137,7 @@ def simulator() -> list[dict[str, Any]]:
             labelled = time.process_time()
             RoundDriver(simulation, kind, protocol, seed=seed, index=0).run(plan)
             end = time.process_time()
-        if seed:  # with the first a process loads and compiles
+        if seed:  # the first run loads and compiles
             runs[kind, engine].append((len(view.success), labelled - start, end - labelled))
     rows = []
     for (kind, engine), each in runs.items():
@@ -149,7 +149,7 @@ def simulator() -> list[dict[str, Any]]:
 
 
 def observe(kind: SceneKind, seeds: Sequence[Any] = (1, 1, 2), **asked: Any) -> Observation:
-    """A view of a scene of the built-in objects; seeds of the scene, the camera and its noise."""
+    """A view of a scene with built-in objects; seeds for the scene, the camera and the noise."""
     scene, camera, noise = map(np.random.default_rng, seeds)
     with ClutterSimulation() as simulation:
         simulation.reset(kind, scene, asked.pop("num_objects", 5))

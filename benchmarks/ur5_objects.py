@@ -1,16 +1,16 @@
 """Hard and adversarial objects, for `ur5-hard` and `ur5-adversarial` and for piles.
 
-The paper's objects cannot be had.
+The paper's objects are not available.
 
     python benchmarks/ur5_objects.py FOLDER
     edgegrasp benchmark --robot ur5 --protocol ur5-hard --objects FOLDER/hard
     edgegrasp benchmark --robot ur5 --protocol ur5-adversarial --objects FOLDER/adversarial
     edgegrasp benchmark --scene pile --objects FOLDER/shapes
 
-Hard: twenty household objects, each convex part its own contact. Adversarial: eight meshes, bodies
-stuck together, rings, bottles, plates, pots and bows, made as those of the training data; the
-benchmark scales them to the hand and decomposes them. Shapes: forty more of them. No weights were
-trained on these.
+Hard: twenty household objects of convex parts. Adversarial: eight meshes (joined bodies, rings,
+bottles, plates, pots and bows), made like those of the training data; the benchmark scales them to
+the hand and decomposes them. Shapes: forty more of these meshes. No weights were trained on any of
+them.
 """
 
 from pathlib import Path
@@ -24,7 +24,7 @@ SEED, HARD, ADVERSARIAL, SHAPES = 2211, 20, 8, 40
 
 
 def write(folder: Path) -> None:
-    """Write the three sets, always the same."""
+    """Write the three sets, which are always the same."""
     household_objects(folder / "hard", HARD, np.random.default_rng(SEED))
     for index in range(ADVERSARIAL + SHAPES):
         meshes = folder / ("adversarial" if index < ADVERSARIAL else "shapes")

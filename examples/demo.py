@@ -1,6 +1,6 @@
-"""The main job from end to end, as `make demo` runs it.
+"""The whole task from end to end; `make demo` runs it.
 
-Makes a cluttered scene in simulation, looks at it with a depth camera, starts a server, posts the
+Makes a cluttered scene in simulation, observes it with a depth camera, starts a server, sends the
 cloud over gRPC and over REST, executes the best grasp in the simulator, and writes a picture and
 the cloud.
 """
@@ -22,7 +22,7 @@ from edgegrasp_sim.simulation import ClutterSimulation
 OUTPUT = Path(__file__).resolve().parents[1] / "demo_output"
 FEWEST_GRASPS = 10
 LISTED = 12
-TIMEOUT = 120.0  # seconds; a slow machine is no reason to fail
+TIMEOUT = 120.0  # seconds, enough for a slow machine
 
 
 def main(seed: int, output: Path, engine: str | None = None) -> None:
@@ -67,9 +67,9 @@ def main(seed: int, output: Path, engine: str | None = None) -> None:
 
 
 def detect_over_both(seen: Observation, seed: int) -> tuple[Detection, Detection]:
-    """Grasps of one cloud over gRPC and over REST, from a server of our own.
+    """Grasps of one cloud over gRPC and over REST, from a local server.
 
-    The table is in the cloud: the server finds it, and the objects on it.
+    The cloud contains the table: the server finds it, and the objects on it.
     """
     options: DetectOptions = {
         "seed": seed,
@@ -105,7 +105,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="A scene, its grasps, one executed, a picture.")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=OUTPUT, help="folder to write to")
-    parser.add_argument("--engine", choices=ENGINES, help="by default the first there is")
+    parser.add_argument("--engine", choices=ENGINES, help="default: the first installed")
     arguments = parser.parse_args()
     try:
         main(arguments.seed, arguments.output, arguments.engine)

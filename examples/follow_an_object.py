@@ -17,7 +17,7 @@ T_WORLD_CAMERA = look_at(np.array([0.15, -0.4, 0.6]), np.array([0.15, 0.15, 0.1]
 
 
 def camera() -> Iterator[dict[str, np.ndarray]]:
-    """Thirty images a second of one object that moves by 5 cm a second."""
+    """Thirty images a second of one object that moves at 5 cm/s."""
     with ClutterSimulation() as simulation:
         rng = np.random.default_rng(0)
         simulation.reset("packed", rng, num_objects=1)

@@ -50,7 +50,7 @@ for _ in objects:
     image: Any = {"depth": FAR * NEAR / (FAR - (FAR - NEAR) * seen), **CAMERA}  # metres
     pick = client.detect(depth_images=[image], **OPTIONS).best_pick
     motion: Any = pick and pick.arm and pick.arm.trajectory
-    assert motion, "the arm has no way to any grasp"
+    assert motion, "the arm reaches no grasp"
     start, last = 0, len(motion.times) - 1
     for end, opening in (motion.grasp_row, 0.08), (motion.release_row, 0.0), (last, 0.08):
         drive(motion.positions[[start, start]], [0.0, 1.0], opening)

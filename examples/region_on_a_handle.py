@@ -2,7 +2,7 @@
 
 usage: python examples/region_on_a_handle.py [ADDRESS]
 
-The image is the playground's sample; a region is drawn there with the mouse, too.
+The image is the playground's sample; in the playground a region can be drawn with the mouse.
 """
 
 import sys

@@ -3,9 +3,9 @@
 usage: python examples/several_views.py [ADDRESS] [SCENES]
 
 Packed and pile scenes in turn, rendered from three sides; a robot's camera would take the images
-from several poses, known from its arm. Prints how many grasps each view and all three give with
-default options, and whose best one holds in simulation. An empty ADDRESS: detect in this process,
-with the extra `service`.
+from several poses, known from its arm. Prints the number of grasps in each view and in all three
+with default options, and whether the best grasp holds in simulation. An empty ADDRESS: detect in
+this process, with the extra `service`.
 """
 
 import sys

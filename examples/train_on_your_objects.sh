@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Weights that know your objects: data made with them, training that goes on from those that ship,
-# and a benchmark of the result.
+# Weights for your objects: make data with them, train from the built-in weights, and benchmark the
+# result.
 #
 # usage: examples/train_on_your_objects.sh OBJECTS OUTPUT [SCENES] [STEPS]
 #
-# OBJECTS: packed/train and packed/test, with .urdf files, or .obj or .stl files of any unit (extra meshes).
+# OBJECTS: packed/train and packed/test, with .urdf files, .obj or .stl files, any unit (extra meshes).
 set -euo pipefail
 
 objects=${1:?usage: $0 OBJECTS OUTPUT [SCENES] [STEPS]}

@@ -1,8 +1,8 @@
-"""Grasps of an array in this process: the pipeline as a library, no server.
+"""Grasps in an array of points: the pipeline as a library, without a server.
 
 usage: python examples/without_a_server.py
 
-Needs the extra `service`. The array is the playground's sample, as points of its camera.
+Needs the extra `service`. The array contains the points of the playground's sample, camera frame.
 """
 
 from pathlib import Path

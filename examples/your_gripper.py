@@ -17,14 +17,14 @@ SMALL: GripperGeometry = {
     "name": "small",
     "max_opening": 0.05,
     "tip_z": 0.085,  # fingertips
-    "contact_z": 0.080,  # where contacts are put
+    "contact_z": 0.080,  # position of the contacts
     "tcp_z": 0.080,
     "hand": {"boxes": [((-0.02, -0.04, 0.0), (0.02, 0.04, 0.045))]},
     "finger": {"boxes": [((-0.006, 0.0, 0.045), (0.006, 0.010, 0.085))]},  # inner face at y = 0
 }
 
 with GraspClient(*sys.argv[1:]) as client:
-    for gripper in (SMALL, "panda"):  # the latter comes with EdgeGrasp
+    for gripper in (SMALL, "panda"):  # `panda` is built in
         detection = client.detect(depth_images=[IMAGE], gripper=gripper, top_k=5)
         print("panda:" if gripper == "panda" else "small:")
         for grasp in detection.grasps:

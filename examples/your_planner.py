@@ -1,9 +1,9 @@
-"""A planner of your own in the benchmark: here, from above onto the highest point.
+"""A planner of your own in the benchmark: here, it grasps the highest point from above.
 
 usage: PYTHONPATH=examples edgegrasp benchmark --planner your_planner:plan --scene packed \
            --rounds 5 --output results/mine
 
-docs/benchmark.md says what an observation holds and what a planner may do besides.
+docs/benchmark.md describes what an observation contains and what else a planner may do.
 """
 
 import numpy as np
@@ -11,8 +11,8 @@ import numpy as np
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.trial import PlannedGrasp
 
-REACH = 0.09  # metres from the hand frame to the point that is grasped
-AROUND = 0.02  # metres from the highest point; points this near show where its object is longest
+REACH = 0.09  # metres from the hand frame to the grasped point
+AROUND = 0.02  # metres around the highest point; points in it give its object's narrow direction
 
 
 def plan(observation: Observation, seed: int) -> PlannedGrasp | None:

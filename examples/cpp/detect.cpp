@@ -2,9 +2,9 @@
 //
 // usage: detect DEPTH WIDTH HEIGHT FX FY CX CY [ADDRESS]
 //
-// DEPTH is a file of 16-bit little-endian millimetres, row by row, 0 where there is no reading: what
-// a depth camera gives, and 614 kB at 640 x 480 where points would be 3.7 MB. ADDRESS is host:port,
-// dns:///name:port, or unix:/folder/grpc.sock of a server on this machine.
+// DEPTH is a file of 16-bit little-endian millimetres, row by row, 0 where there is no reading: the
+// output of a depth camera, 614 kB at 640 x 480, where points would take 3.7 MB. ADDRESS is
+// host:port, dns:///name:port, or unix:/folder/grpc.sock of a server on this machine.
 
 #include <chrono>
 #include <fstream>
@@ -16,7 +16,7 @@
 
 #include "edgegrasp/v1/grasp.grpc.pb.h"
 
-// All servers that a name stands for in turn, and again where one is away or lost the request.
+// Use all servers of a name in turn, and retry if one is unavailable or has lost the request.
 constexpr char kPolicy[] = R"({
   "loadBalancingConfig": [{"round_robin": {}}],
   "methodConfig": [{
@@ -58,7 +58,7 @@ int main(int argc, char** argv) {
                                            grpc::InsecureChannelCredentials(), arguments);
   auto stub = edgegrasp::v1::GraspService::NewStub(channel);
 
-  grpc::ClientContext context;  // the server gives up at the deadline, too
+  grpc::ClientContext context;  // the server also stops at the deadline
   context.set_deadline(std::chrono::system_clock::now() + std::chrono::seconds(30));
   edgegrasp::v1::DetectGraspsResponse answer;
   const grpc::Status status = stub->DetectGrasps(&context, request, &answer);
