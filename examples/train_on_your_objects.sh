@@ -4,7 +4,7 @@
 #
 # usage: examples/train_on_your_objects.sh OBJECTS OUTPUT [SCENES] [STEPS]
 #
-# OBJECTS: packed/train and packed/test, with .urdf files, .obj or .stl files, any unit (extra meshes).
+# OBJECTS: packed/train and packed/test, with .urdf files, or .obj or .stl files of any unit (extra meshes).
 set -euo pipefail
 
 objects=${1:?usage: $0 OBJECTS OUTPUT [SCENES] [STEPS]}

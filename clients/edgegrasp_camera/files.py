@@ -81,7 +81,7 @@ def _reading(field: str, file_format: str, size: int, fix: str) -> Iterator[None
         raise
     except Exception as error:
         fault = OBJECT_ADDRESS.sub("", str(error).partition(";")[0])[:100] or type(error).__name__
-        value = f"{size} bytes that are no whole .{file_format} file ({fault})"
+        value = f"{size} bytes that are not a complete .{file_format} file ({fault})"
         raise InvalidRequest(field, value, fix) from None
 
 
@@ -343,7 +343,7 @@ def _unpack_lzf(packed: bytes, size: int) -> bytearray:
         place += 1
         start = len(plain) - distance
         if start < 0:
-            raise ValueError("compressed data that refers to what is before its start")
+            raise ValueError("compressed data that refers to bytes before its start")
         copied = plain[start : start + length]
         plain += (copied * (length // distance + 1))[:length]  # the copy may overlap its own output
     if len(plain) != size or place != len(packed):

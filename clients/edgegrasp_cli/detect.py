@@ -145,7 +145,7 @@ def open_client(asked: DetectorFlags) -> AbstractContextManager[Any]:
         # benchmark-real needs --grippers too, to judge the server's grasps.
         alone = {"weights", "device"} | ({"grippers"} if isinstance(asked, DetectFlags) else set())
         for name in sorted(asked.model_fields_set & alone):
-            raise ValueError(f"--{name}: got --server beside it. Set it at the server.")
+            raise ValueError(f"--{name}: got --server as well. Set it at the server.")
         return asked.connect(asked.server)
     return nullcontext(OwnDetector(asked.weights, asked.grippers, asked.device))
 
@@ -261,7 +261,7 @@ def _depth_images(file: Path | None, asked: DetectFlags) -> "list[DepthImage] | 
     if file is not None:
         of_image = {"intrinsics": intrinsics, "pose": poses, "depth-scale": asked.depth_scale}
         if beside := [flag for flag, value in of_image.items() if value]:
-            raise ValueError(f"--{beside[0]}: got a cloud beside it. Give --depth instead.")
+            raise ValueError(f"--{beside[0]}: got a cloud as well. Give --depth instead.")
         return None
     if not intrinsics:
         raise ValueError(f"--intrinsics: got nothing. Give fx,fy,cx,cy of {depths[0]}, in pixels.")

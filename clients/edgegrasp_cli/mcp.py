@@ -210,7 +210,7 @@ class _Tools:
         from edgegrasp_client.requests import on_mask, plain_options
 
         if "top_k" in (options or {}):
-            raise ValueError("options.top_k: got num_grasps beside it. Give num_grasps alone.")
+            raise ValueError("options.top_k: got num_grasps as well. Give only num_grasps.")
         asked = plain_options(options or {}) | {"top_k": num_grasps}
         if viewpoint:
             asked["viewpoint"] = viewpoint

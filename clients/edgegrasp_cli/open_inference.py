@@ -319,7 +319,7 @@ def _http_infer(
                 end = start + int(each["parameters"]["binary_data_size"])
                 data, start = binary[start:end], end
             if not isinstance(each["name"], str):
-                raise TypeError("a name that is no text")
+                raise TypeError("a name that is not text")
             tensors[each["name"]] = tensor(each["name"], each["datatype"], each["shape"], data)
         parameters = dict((request.get("parameters") or {}).items())
         wanted = [str(each["name"]) for each in request.get("outputs") or ()]

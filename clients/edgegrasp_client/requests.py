@@ -83,10 +83,10 @@ class Request:
         beside = {name: given.pop(name, None) for name in PER_POINT_ARRAYS} | dict(to_score or {})
         self.options = plain_options(given)
         if (cloud is None) == (images is None):
-            value = "nothing" if cloud is None else "a cloud beside depth_images"
+            value = "nothing" if cloud is None else "a cloud and depth_images"
             raise invalid("cloud", value, "Give a cloud or depth_images.")
         if to_score and (to_score["edges"] is None) == (to_score["hand_poses"] is None):
-            value = "nothing" if to_score["edges"] is None else "edges beside hand_poses"
+            value = "nothing" if to_score["edges"] is None else "edges and hand_poses"
             raise invalid("edges", value, "Give edges or hand_poses.")
         if isinstance(cloud, PointCloud2):  # points and normals are all that a grasp depends on
             try:

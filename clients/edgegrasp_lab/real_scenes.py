@@ -160,11 +160,11 @@ def load_scenes(folders: Sequence[Path]) -> list[RealScene]:
     for folder in folders:
         found = sorted(folder.glob("*.npz"))
         if not found:
-            raise ValueError(f"scenes: got {folder}, without .npz files. Give a folder of scenes.")
+            raise ValueError(f"scenes: got {folder} without .npz files. Give a folder of scenes.")
         files += found
     names = [file.stem for file in files]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"scenes: got two of the name {', '.join(twice)}. Rename one.")
+        raise ValueError(f"scenes: got two scenes named {', '.join(twice)}. Rename one.")
     return [load_scene(file) for file in files]
 
 

@@ -78,7 +78,7 @@ class ObjectModel:
             raise ValueError(f"{self.urdf} has {links} links; describe an object as one link")
         named = {self.urdf.parent / mesh.get("filename", "") for mesh in root.iter("mesh")}
         if missing := sorted(str(path) for path in named if not path.is_file()):
-            raise ValueError(f"{self.urdf} names {missing[0]}, which is no file; correct the path")
+            raise ValueError(f"{self.urdf} names {missing[0]}, which is not a file; correct it")
         return sorted({self.urdf} | named)
 
     @property

@@ -74,7 +74,7 @@ class ResultFolder:
             table: dict[str, Any] = json.loads(file.read_text())
             table["run"]
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{file} is no manifest ({error}); choose another folder") from None
+            raise ValueError(f"{file} is not a manifest ({error}); choose another folder") from None
         return table
 
     def finish(self) -> dict[str, Any]:

@@ -159,7 +159,7 @@ def random_sensor(rng: np.random.Generator) -> DepthSensor:
 
 
 def _shadow(depth: Float32, disparity_scale: float) -> Bools:
-    """Pixels of a depth image (H, W), metres, hidden from a viewpoint beside the camera.
+    """Pixels of a depth image (H, W), metres, hidden from a second viewpoint next to the camera.
 
     `disparity_scale` is the viewpoint's distance along the image's x times the focal length, metres
     times pixels.

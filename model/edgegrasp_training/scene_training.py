@@ -209,7 +209,7 @@ def batches(data: Path, images: list[SceneImage], rng: np.random.Generator) -> I
             read.update(new)
             images += read_images(new)
             if len(images) < BATCH:
-                value = f"{data} with {len(images)} images, without {HELD_OUT} files held out"
+                value = f"{data} with {len(images)} images and {HELD_OUT} files held out"
                 raise ValueError(f"data: got {value}. Make more with edgegrasp generate-scenes.")
             order = orders.permutation(len(images))
             for start in range(0, len(order) - BATCH + 1, BATCH):

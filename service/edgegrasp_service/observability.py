@@ -123,7 +123,7 @@ def log_call(call: Call) -> None:
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line, with `fields` of the record beside its message."""
+    """One JSON object per line, with the record's message and `fields`."""
 
     def format(self, record: logging.LogRecord) -> str:
         """A record as one line of JSON."""

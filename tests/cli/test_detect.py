@@ -142,7 +142,7 @@ def test_input_that_cannot_be_used_is_named(camera_files, file, refused, dummy_s
     for flags, sentence in (
         ((absent,), "No such file"),
         ((unknown,), "Give one of: npy, npz, ply, pcd, xyz; a depth image as"),
-        ((foreign,), "cloud: got 7 bytes that are no whole .npy file"),
+        ((foreign,), "cloud: got 7 bytes that are not a complete .npy file"),
         ((foreign, "--top-k", "0"), "options.top_k: got 0."),
         ((*to_server, "--model", "resnet"), "options.model: got 'resnet'. Use one of: dummy."),
         ((*to_server, "--up", "0,0"), "options.up"),
@@ -152,7 +152,7 @@ def test_input_that_cannot_be_used_is_named(camera_files, file, refused, dummy_s
         ((depth, "--intrinsics", "300,300,640,360"), "cx: got 640, outside of an image of 32 x 24"),
         ((depth, *2 * ("--intrinsics", "300")), "--intrinsics: got 2. Give one for all, or one"),
         ((depth, "--intrinsics", "300", *2 * ("--pose", "[]")), "--pose: got 2. Give one for each"),
-        ((file, "--pose", "[]"), "--pose: got a cloud beside it. Give --depth instead."),
+        ((file, "--pose", "[]"), "--pose: got a cloud as well. Give --depth instead."),
         ((file, *ARM, "--joints", "0,a"), "options.robot.joints.0: got '0,a'"),
         ((file, "--place", "[0, 0, 0]"), "--robot: got nothing. Give --robot, --joints, --base"),
         ((file, "--avoid-unseen"), "--robot: got nothing. Give --robot, --joints, --base"),
@@ -177,7 +177,7 @@ def test_models_are_listed_from_a_server_or_from_here(dummy_server, run, refused
     assert "edgegrasp models: " in refused("models", "--server", "127.0.0.1:1")
     for command in (("models", "--device", "cuda"), ("detect", "x.npy", "--grippers", "x.toml")):
         beside = refused(*command, "--server", dummy_server.grpc_address)
-        assert f"{command[-2]}: got --server beside it" in beside
+        assert f"{command[-2]}: got --server as well" in beside
 
 
 def test_a_server_with_tls_and_tokens(file, pem, run, refused, tmp_path, start_dummy, monkeypatch):

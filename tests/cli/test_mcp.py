@@ -143,7 +143,7 @@ MASKED_CLOUD = {"point_cloud_file": "cloud.npy", "mask_file": "mask.png"}
         (CLOUD, {"robot": {"name": "fr3"}}, "options.robot.joints"),
         (CLOUD, {"options": {"tok_k": 1}}, "options.tok_k"),
         (CLOUD, {"options": {"timeout": 1}}, "options.timeout"),
-        (CLOUD, {"options": {"top_k": 1}}, "options.top_k: got num_grasps beside it"),
+        (CLOUD, {"options": {"top_k": 1}}, "options.top_k: got num_grasps as well"),
         (DEPTH, {"depth_file": "depth.png", "intrinsics": [1]}, "fx, fy"),
         (DEPTH, IMAGE | {"robot": {"name": "fr3"}}, "give T_base_camera"),
         ("visualize_grasps", IMAGE | {"T_base_camera": [[1.0], [0.0, 1.0]]}, "T_cloud_camera"),

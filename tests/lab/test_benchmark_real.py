@@ -174,7 +174,7 @@ def test_a_bad_file_is_named_with_field_and_fix(field, value, sentence, scene, r
 
 def test_what_is_no_scene_is_refused(refused, scene: Path, tmp_path: Path) -> None:
     twice = ("--scenes", scene.parent, "--scenes", scene.parent)
-    assert "two of the name box" in refused("benchmark-real", *twice)
+    assert "two scenes named box" in refused("benchmark-real", *twice)
     scene.unlink()
     assert "Give a folder of scenes" in refused("benchmark-real", "--scenes", tmp_path)
     for content in (b"foreign", b"", b"PK\3\4", b"\x93NUMPY\1\0\2\0{}"):

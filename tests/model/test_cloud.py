@@ -287,7 +287,7 @@ def test_views_are_fused_and_doubtful_intrinsics_get_a_warning() -> None:
     images[1]["intrinsics"] |= {"cx": 8.0}
     for some in (images[1:2], images[:2]):
         (warning,) = wire.read_depth_images(some, MANY).warnings
-        assert f"depth_images.{len(some) - 1}.intrinsics: cx 8 lies far from the" in warning
+        assert f"depth_images.{len(some) - 1}.intrinsics: cx 8 is far from the" in warning
     (warning,) = wire.read_depth_images(images[2:] * 2, MANY).warnings
     assert "two have the same camera position" in warning
 

@@ -202,7 +202,7 @@ def test_folders_are_read_in_order_of_names(tmp_path: Path) -> None:
     assert found.name == "packed/train"
     for text, message in (
         ("", "cannot be read"),
-        (SHAPES, r"names .*two\.obj, which is no file"),
+        (SHAPES, r"names .*two\.obj, which is not a file"),
         ("<robot/>", "has 0 links"),
     ):
         (folder / "a.urdf").write_text(text)

@@ -62,5 +62,5 @@ def test_a_file_is_made_and_learned_from(tmp_path: Path, monkeypatch: pytest.Mon
     train(tmp_path / "data", tmp_path / "run", seconds=0.2)
     assert (tmp_path / "run" / "scene.safetensors").is_file()
     assert "iou_object" in (tmp_path / "run" / "log.txt").read_text()
-    with pytest.raises(ValueError, match="with 0 images beside 1 files held out"):
+    with pytest.raises(ValueError, match="with 0 images and 1 files held out"):
         train(tmp_path / "nowhere", tmp_path / "run", seconds=60.0)

@@ -48,7 +48,7 @@ function ending(file) {
 
 /** The flat points of an array (N, 3) or (H, W, 3). */
 function points(array) {
-  if (array.shape.at(-1) !== 3) throw new Error(`a cloud is (N, 3), this is (${array.shape}); a depth image needs its intrinsics beside it`);
+  if (array.shape.at(-1) !== 3) throw new Error(`a cloud is (N, 3), this is (${array.shape}); a depth image needs its intrinsics too`);
   return Float32Array.from(array.values);
 }
 

@@ -233,12 +233,12 @@ def _given(fields: Mapping[str, Any], options: DetectOptions, max_points: int) -
     """The edges or hand poses to score; raises InvalidRequest unless there is one of the two."""
     if options.robot is not None:
         fix = "Leave it out, or detect: reach is planned for detected grasps."
-        raise InvalidRequest("options.robot", "a robot beside given grasps", fix)
+        raise InvalidRequest("options.robot", "a robot with given grasps", fix)
     names = [name for name in GIVEN if fields.get(name) is not None]
     if not names:
         raise InvalidRequest("edges", "nothing", "Send edges or hand_poses.")
     if len(names) == 2:
-        raise InvalidRequest("hand_poses", "poses beside edges", "Send one of the two.")
+        raise InvalidRequest("hand_poses", "poses and edges", "Send one of the two.")
     (name,) = names
     return {name: decode_array(name, fields[name], max_points)}
 
@@ -366,7 +366,7 @@ def _fields_of_form(body: bytes, boundary: str, known: tuple[str, ...]) -> dict[
             fields[name] = read_json(name, data)
     image = {name: fields.pop(name) for name in CAMERA if name in fields}
     if image and "depth_images" in fields:
-        raise InvalidRequest("depth_images", f"images beside {next(iter(image))}", "Send one.")
+        raise InvalidRequest("depth_images", f"images and {next(iter(image))}", "Send one.")
     return fields | ({"depth_images": [image]} if image else {})
 
 
@@ -462,7 +462,7 @@ def plain_options(message: grasp_pb2.DetectOptions, name: str = "options") -> di
     options = _set_fields(message, name)
     if "object_choice" in options:
         if "objects" in options:
-            value = f"{options['objects']!r} beside object_choice"
+            value = f"{options['objects']!r} and object_choice"
             raise InvalidRequest("options.objects", value, "Send one of the two.")
         options["objects"] = options.pop("object_choice")
     return options

@@ -87,7 +87,7 @@ def _loaded(pool: socket.socket, settings: Settings, load: Callable[[Settings], 
 def _work(
     pool: socket.socket, settings: Settings, catalogue: Any, load: Callable[[Settings], Any]
 ) -> None:
-    """Answer jobs, one after the other, until the pool closes the socket."""
+    """Answer jobs, one after another, until the pool closes the socket."""
     from edgegrasp_service.worker.answer import answer, load_robots
 
     catalogue = catalogue or _loaded(pool, settings, load)

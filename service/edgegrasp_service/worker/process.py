@@ -227,7 +227,7 @@ class WorkerPool:
                 return worker
 
     def spawn(self, work: Any) -> None:
-        """Run a coroutine beside the requests, until it ends or the pool is closed."""
+        """Run a coroutine in the background, until it ends or the pool is closed."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)

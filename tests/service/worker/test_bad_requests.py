@@ -150,7 +150,7 @@ CASES = {
     "65 viewpoints": option("viewpoint", [[0.0, 0.0, 1.0]] * 65, "", "", "at most 64"),
     # Edges and hand poses.
     "edges and hand poses": Malformed(
-        "hand_poses", "beside edges", "one", points=POINTS, edges=[[0, 1]], hand_poses=[np.eye(4)],
+        "hand_poses", "and edges", "one", points=POINTS, edges=[[0, 1]], hand_poses=[np.eye(4)],
         scores=True,
     ),
     "edge to no point": Malformed(
@@ -160,7 +160,7 @@ CASES = {
         "edges", "16001", "16000", points=POINTS, edges=[[0, 1]] * 16001, scores=True
     ),
     "robot while scoring": Malformed(
-        "options.robot", "beside given grasps", "detect",
+        "options.robot", "with given grasps", "detect",
         {"robot": {"name": "fr3", "T_base_cloud": POSE, "joints": [0.0] * 7}},
         points=POINTS, edges=[[0, 1]], scores=True,
     ),
