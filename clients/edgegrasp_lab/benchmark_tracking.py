@@ -178,7 +178,7 @@ def benchmark_tracking(
     if unknown := [name for name in names if name not in MOTIONS]:
         raise ValueError(f"--motion: got {unknown[0]!r}. Choose one of {', '.join(MOTIONS)}.")
     if scenes and set(names) != {"still"}:
-        raise ValueError("--motion: got it with --scenes, which are still. Leave it out.")
+        raise ValueError("--motion: got it with --scenes, which stand still. Leave it out.")
     clock = time.perf_counter if asked.server else time.process_time
     done: dict[str, list[Followed]] = {}
     with open_client(asked) as client:

@@ -114,7 +114,7 @@ def test_a_request_in_json(gateway, cloud) -> None:
         (b'{"id": NaN, "inputs": []}', "grasps", 400, "not JSON compliant"),
         (b"[" * 100_000, "grasps", 400, "Give the JSON"),
         (b"[" + b"[]," * 60_000, "grasps", 400, "Give the JSON"),
-        ({"name": 7}, "grasps", 400, "no text"),
+        ({"name": 7}, "grasps", 400, "not text"),
         ({"parameters": [1]}, "grasps", 400, "Give the JSON"),
         ({"parameters": {"seed": "[" * 20_000}}, "grasps", 400, "options.seed"),
         ({"id": "\ud800"}, "grasps", 400, "Give the JSON"),
