@@ -3,6 +3,7 @@
 usage: python examples/without_a_server.py
 
 Needs the extra `service`. The array contains the points of the playground's sample, camera frame.
+In several processes, use `spawn`: PyTorch hangs in a child that is forked after a detection.
 """
 
 from pathlib import Path

@@ -1,8 +1,13 @@
 """Data of depth cameras: depth images, PointCloud2, cloud files and poses; needs only numpy."""
 
+from typing import Any
+
 
 class EdgeGraspError(Exception):
     """Base of every error that the project raises on purpose, except the client's."""
+
+    def __reduce__(self) -> tuple[Any, ...]:  # `args` are not the arguments of `__init__`
+        return Exception.__new__, (type(self), *self.args), vars(self)
 
 
 class InvalidRequest(EdgeGraspError):  # noqa: N818

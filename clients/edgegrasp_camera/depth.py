@@ -70,7 +70,7 @@ def metres(depth: Array, scale: float | None = None, field: str = "depth") -> Fl
         fix = "Send an image (H, W) of uint16 or of floats."
         raise InvalidRequest(field, f"shape {depth.shape}, dtype {depth.dtype}", fix)
     with np.errstate(over="ignore"):  # infinity is a missing reading
-        found = depth.astype(np.float32)
+        found = np.ma.filled(depth, 0).astype(np.float32)
         found *= scale or (MILLIMETRE if whole else 1.0)
     below = (found < 0) & (found > -np.inf)  # ROS and ZED use -inf for surfaces that are too near
     if below.any():

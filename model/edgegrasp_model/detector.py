@@ -338,7 +338,8 @@ class GraspDetector:
                     batch = BallBatch.of_candidates(
                         scene.cloud, some, prepared.crop_radius, network.k
                     )
-            with prepared.timed("network"), torch.inference_mode():
+            exact = torch.autocast(self.device.type, enabled=False)  # even if the caller uses it
+            with prepared.timed("network"), torch.inference_mode(), exact:
                 logits[rows] = self.network(batch.to(self.device)).float().cpu().numpy()
         return logits
 

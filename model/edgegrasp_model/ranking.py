@@ -108,8 +108,9 @@ def densest_first(order: Int64, worth: Floats, T_cloud_tcp: Floats) -> Int64:
     trace = np.maximum(trace, 2 * approach - trace)  # half a turn about z changes nothing
     angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
     away = np.square(cdist(place, place) / SIMILAR_DISTANCE) + np.square(angle / SIMILAR_ANGLE)
-    good = np.exp((worth[best] - worth[best].max(initial=0.0)) / RATING_SCALE)
-    raised = worth[best] + DENSITY_WEIGHT * np.log(np.exp(-away / 2) @ good)
+    with np.errstate(under="ignore"):  # even if the caller raises it
+        good = np.exp((worth[best] - worth[best].max(initial=0.0)) / RATING_SCALE)
+        raised = worth[best] + DENSITY_WEIGHT * np.log(np.exp(-away / 2) @ good)
     return np.concatenate([best[np.argsort(-raised, kind="stable")], order[COMPARED_HANDS:]])
 
 

@@ -118,7 +118,7 @@ class HandNet(nn.Module):
             positions, normals = torch.split(points, 3, dim=2)
             encoded = encoder(torch.cat((positions / POINT_UNIT, normals), dim=2))  # (E, P, C)
             if layers.float32_inference(points):
-                pooled = torch.zeros(len(encoded), 2 * encoded.shape[2])
+                pooled = points.new_zeros(len(encoded), 2 * encoded.shape[2])
                 _pool(encoded.float().numpy(), count.numpy(), pooled.numpy())
             else:
                 there = torch.arange(points.shape[1], device=points.device) < count.unsqueeze(1)

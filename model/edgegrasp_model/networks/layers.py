@@ -22,12 +22,13 @@ Layer = Callable[[Tensor], Tensor]
 # Products of fewer rows are summed in an order that depends on their number.
 MIN_ROWS = 32
 # For networks that tolerate its rounding, on processors that multiply it twice as fast.
-FAST = torch.bfloat16 if torch.cpu._is_avx512_bf16_supported() else torch.float32
+_FAST = torch.cpu._is_avx512_bf16_supported() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+FAST = torch.bfloat16 if _FAST else torch.float32
 ROWS = 512  # points at a time: 1,024 channels of them stay in cache
 CONVOLVED = 128  # points at a time in a graph convolution, each with its neighbours
 EDGE_ROWS = 256  # edge grasps at a time
-# Weights packed for oneDNN, with the version of the weight that was packed, and their type.
-_PACKED: MutableMapping[Tensor, tuple[object, Tensor]] = WeakTensorKeyDictionary()
+# A copy of each weight, and the weight packed for oneDNN.
+_PACKED: MutableMapping[Tensor, tuple[Tensor, Tensor]] = WeakTensorKeyDictionary()
 
 
 def shared_product(
@@ -91,12 +92,12 @@ def packed_linear(
     if len(weight) == 1 or not there or not float32_inference(weight):
         then: Layer = torch.relu_ if rectified else nn.Identity()
         return lambda values: then(row_linear(values, weight, bias))
-    # Inference tensors do not count their changes.
-    state = None if weight.is_inference() else (weight._version, dtype)
-    if state is None or _PACKED.get(weight, (None, weight))[0] != state:
-        reordered = torch.ops.mkldnn._reorder_linear_weight(weight.detach().to(dtype).contiguous())
-        _PACKED[weight] = state, reordered
-    for_onednn, after = _PACKED[weight][1], "relu" if rectified else "none"
+    kept = _PACKED.get(weight)
+    # The counter of a tensor's changes misses some.
+    if kept is None or kept[1].dtype != dtype or not torch.equal(kept[0], weight):
+        copy = weight.detach().clone(memory_format=torch.contiguous_format)
+        kept = _PACKED[weight] = copy, torch.ops.mkldnn._reorder_linear_weight(copy.to(dtype))
+    for_onednn, after = kept[1], "relu" if rectified else "none"
     added = None if bias is None else bias.to(dtype)
     return lambda values: torch.ops.mkldnn._linear_pointwise(
         values.to(dtype), for_onednn, added, after, [], ""

@@ -140,7 +140,8 @@ class VNBallMaximum(nn.Module):
     ) -> Tensor:
         """Maps `both` (p, 3, 2 width), which a layer gives for each chunk, to (B, 3, width)."""
         shape = chunks[-1].balls[-1] + 1, 3, self.reach.in_features
-        furthest, best = torch.zeros(shape), torch.full(shape[::2], -torch.inf)
+        like = chunks[0].values
+        furthest, best = like.new_zeros(shape), like.new_full(shape[::2], -torch.inf)
         for chunk in chunks:
             both, balls = layer(chunk), slice(chunk.balls[0], chunk.balls[-1] + 1)
             if layers.float32_inference(both):
@@ -194,7 +195,8 @@ def _with_reach(layer: nn.Linear, reach: nn.Linear) -> Tensor:
 def relu(both: Tensor) -> Tensor:
     """Remove each vector's component against its direction, if any: (M, 3, 2C) to (M, 3, C)."""
     if layers.float32_inference(both):
-        result, alone = torch.empty(len(both), 3, both.shape[2] // 2), np.arange(len(both))[:, None]
+        result = both.new_empty(len(both), 3, both.shape[2] // 2)
+        alone = np.arange(len(both))[:, None]
         nowhere, offset = np.zeros((len(both), 3), np.float32), np.zeros(both.shape[2], np.float32)
         _gathered_relu_rows(both.numpy(), nowhere, offset, alone, result.numpy())
         return result
@@ -208,9 +210,9 @@ def _convolved(u: Tensor, offset: Tensor, output: layers.Layer, batch: BallBatch
     """The furthest (P, 3, C) of the messages from each point's neighbours; reuses one buffer."""
     (count, k), width = batch.neighbors.shape, len(offset) // 2
     points, neighbors = batch.points.numpy(), batch.neighbors.numpy()
-    hidden = torch.zeros(VN_CONVOLVED * k, 3, width)
+    hidden = u.new_zeros(VN_CONVOLVED * k, 3, width)
     best = np.empty((VN_CONVOLVED, width), np.float32)
-    pooled = torch.zeros(count, 3, width)
+    pooled = u.new_zeros(count, 3, width)
     for first in range(0, count, VN_CONVOLVED):
         part = slice(first, min(first + VN_CONVOLVED, count))
         arrays = (u.numpy(), points[part], offset.numpy(), neighbors[part], hidden.numpy())

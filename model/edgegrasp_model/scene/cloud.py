@@ -93,6 +93,8 @@ def check_cloud(cloud: object, num_approach_points: int = 1, thin: bool = False)
     """
     sent = cloud if isinstance(cloud, CloudInput) else CloudInput(cloud)
     points: Any = sent.points
+    if isinstance(points, np.ma.MaskedArray):
+        points = points.filled(np.nan)
     is_array = isinstance(points, np.ndarray) and points.dtype in (np.float32, np.float64)
     if not is_array or points.ndim not in (2, 3) or points.shape[-1] != 3:
         fix = "Send float32 or float64 metres, (N, 3) or (H, W, 3), or depth_images."

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from threading import RLock
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from edgegrasp_model.scene.cloud import CheckedCloud, grid_cells, subsample, uni
 from edgegrasp_model.scene.network import NEAREST_DEPTH, SceneNet, range_image, scene_features
 
 WEIGHTS = Path(__file__).with_name("network.safetensors")
+_ALONE = RLock()  # held while PyTorch uses one thread
 
 # In place of an object's number. An undecided point may be part of an object.
 BACKGROUND, UNDECIDED = -1, -2
@@ -66,8 +68,9 @@ def shipped() -> tuple[SceneNet, Float64]:
     The calibration (2,) gives the log odds that an instance is an object: a constant, plus a factor
     times the mean probability of an object over the instance's pixels.
     """
-    network = SceneNet()
-    network.load_state_dict(load_file(WEIGHTS))
+    with torch.device("meta"):
+        network = SceneNet()
+    network.load_state_dict(load_file(WEIGHTS), assign=True)
     network.eval().fused().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     with safe_open(WEIGHTS, "pt") as file:
         return network, np.array(json.loads(file.metadata()["confidence"]))
@@ -161,12 +164,13 @@ def run_network(
 @contextmanager
 def one_thread() -> Iterator[None]:
     """A network's output must not depend on the number of threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
+    with _ALONE:  # else another thread restores our number
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(threads)
 
 
 def group_pixels(pixels: Pixels) -> tuple[Int64, Float64]:
