@@ -158,8 +158,8 @@ def on_mask(mask: Array, options: Mapping[str, Any] | None = None) -> DetectOpti
     asked = dict(options or {})
     for name in ("approach_region", "contact_region"):
         region = asked.get(name) or {}
-        outside = {"kind": "mask", "mask": ~kept}
-        asked[name] = {**region, "exclude": [*region.get("exclude", ()), outside]}
+        part, rows = ("exclude", ~kept) if region.get("include") else ("include", kept)
+        asked[name] = {**region, part: [*region.get(part, ()), {"kind": "mask", "mask": rows}]}
     return cast("DetectOptions", asked)
 
 

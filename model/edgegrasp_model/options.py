@@ -401,6 +401,12 @@ class Collision(Strict):
         default=(), max_length=64, description="solid boxes in addition to the cloud"
     )
 
+    @property
+    def behind(self) -> float:
+        """How far behind the grasp the hand moves along its z, metres."""
+        retreat = self.retreat_length if self.retreat_direction == "back" else 0.0
+        return max(self.approach_length, retreat)
+
 
 class ObjectChoice(Strict):
     """Some of the detected objects, by their numbers in an answer to the same cloud."""

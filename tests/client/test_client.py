@@ -150,12 +150,13 @@ def test_a_mask_narrows_the_regions_that_are_asked_for() -> None:
     options = api.on_mask(mask, asked)
     assert options["top_k"] == 3
     assert options["contact_region"]["include"] == [ball]
-    for name in ("approach_region", "contact_region"):
-        (outside,) = options[name]["exclude"]
-        np.testing.assert_array_equal(outside["mask"], [[True, False, True], [True] * 3])
+    (outside,) = options["contact_region"]["exclude"]
+    np.testing.assert_array_equal(outside["mask"], [[True, False, True], [True] * 3])
+    (inside,) = options["approach_region"]["include"]
+    np.testing.assert_array_equal(inside["mask"], [[False, True, False], [False] * 3])
     grey = np.dstack([mask.any(axis=2), np.ones((2, 3))])  # which cannot be seen through
-    (outside,) = api.on_mask(grey)["approach_region"]["exclude"]
-    np.testing.assert_array_equal(outside["mask"], [[True, False, True], [True, True, False]])
+    (inside,) = api.on_mask(grey)["approach_region"]["include"]
+    np.testing.assert_array_equal(inside["mask"], [[False, True, False], [False, False, True]])
     assert "exclude" not in asked["contact_region"]
 
 

@@ -412,6 +412,25 @@ def test_a_hand_among_good_ones_comes_before_a_lone_one_that_is_hardly_better() 
         assert densest_first(order, worth, poses)[0] == first
 
 
+def test_a_long_approach_and_retreat_are_checked_to_their_ends() -> None:
+    wall = np.stack(np.meshgrid(0.4, np.arange(-0.3, 0.3, 0.004), np.arange(0, 0.3, 0.004)), -1)
+    cloud = np.concatenate([CLOUD, wall.reshape(-1, 3).astype(np.float32)])
+    sent = CloudInput(cloud, segment_ids=(np.arange(len(cloud)) < len(CLOUD)).astype(int))
+    aside = {"cones": [{"direction": (-1, 0, 0), "max_angle": 0.2}]}
+    for rule, free in (
+        (("approach_length", 0.1), True),
+        (("approach_length", 0.5), False),
+        (("retreat_length", 0.5), False),
+    ):
+        asked = {"viewpoint": (0.1, 0.5, 0.5), "min_score": 0.0, "collision": dict([rule])}
+        assert bool(detect(sent, approach_direction=aside, **asked).grasps) == free
+
+
+def test_a_place_chooses_no_object_where_all_is_one() -> None:
+    with refusal("options.objects"):
+        detect(objects="off", near=(0.0, 0.0, 0.08))
+
+
 TOP = 0.3  # metres
 FIFTEEN_DEGREES = np.cos(np.radians(15.0))
 

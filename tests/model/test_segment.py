@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from tests.checks import bounded_memory, refusal
 
+from edgegrasp_client import on_mask
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.results import SUPPORT
 from edgegrasp_model.scene.cloud import CloudInput, check_cloud, likely_viewpoint, unit, voxelise
@@ -509,13 +510,26 @@ def test_a_mask_of_the_caller_wins() -> None:
     assert detect(cloud).objects
     (segment,) = detect(CloudInput(cloud, segment_ids=mask.astype(np.int32))).objects
     assert segment.number == 1
-    region = {"include": [{"kind": "mask", "mask": mask}]}
-    held = detect(cloud, approach_region=region, contact_region=region, min_score=0.0)
+    held = detect(cloud, **on_mask(mask.reshape(cloud.shape[:2]), {"min_score": 0.0}))
     assert held.grasps
     on_panel = cloud.reshape(-1, 3)[mask]
     for grasp in held.grasps:
         for point in (grasp.approach_point, grasp.contact_point):
             assert np.linalg.norm(on_panel - point, axis=1).min() < 0.006
+
+
+def test_marked_objects_have_the_scores_they_have_without_a_mask(catalogue) -> None:
+    carton = box((0.35, 0.3, 0.1), (0.05, 0.05, 0.1))
+    cloud = render([table(), carton, *boxes_on_table(1)], camera(0.7, 0.0, 0.9))
+    asked = {"viewpoint": (0.0, 0.0, 0.0), "debug": True}
+    plain = catalogue.get().detect(cloud, parse_options(asked))
+    assert plain.debug is not None
+    assert len(plain.objects) > 2
+    for one in plain.objects:
+        region = {"include": [{"kind": "mask", "mask": plain.debug.labels == one.number}]}
+        fields = parse_options(asked | {"approach_region": region, "contact_region": region})
+        best = catalogue.get().detect(cloud, fields).grasps[0].score
+        assert one.best_score == pytest.approx(best, abs=0.1)
 
 
 def test_segments_stand_on_what_lies_below_them_not_on_the_top_of_a_carton() -> None:

@@ -186,8 +186,8 @@ def test_a_mask_says_where(asked, encoding) -> None:
         pixels = np.stack([pixels * 0, pixels, pixels * 0], axis=-1)
     scene = Scene(None, make_image(DEPTH), CAMERA, make_image(pixels, encoding))
     detect(asked, scene)
-    (outside,) = asked.given["contact_region"]["exclude"]
-    np.testing.assert_array_equal(outside["mask"], ~wanted)
+    (inside,) = asked.given["contact_region"]["include"]
+    np.testing.assert_array_equal(inside["mask"], wanted)
 
 
 @pytest.mark.parametrize("bigendian", [False, True])

@@ -43,13 +43,9 @@ def collides(
     boxes = gripper.open_boxes + request.margin * np.array([[-1.0], [1.0]])  # (B, 2, 3)
     thin = np.maximum(MIN_BOX_WIDTH - (boxes[:, 1] - boxes[:, 0]), 0.0) / 2 * (1.0, 1.0, 0.0)
     boxes += np.stack([-thin, thin], axis=1)
-    behind, lift = request.approach_length, 0.0  # metres along the hand's z, and straight up
-    if request.retreat_direction == "up":
-        lift = request.retreat_length
-    else:
-        behind = max(behind, request.retreat_length)
+    lift = request.retreat_length if request.retreat_direction == "up" else 0.0  # metres
     swept = boxes.copy()
-    swept[:, 0, 2] -= behind
+    swept[:, 0, 2] -= request.behind
     hit = any_point_in_boxes(in_hands(scene.cloud.points, T_cloud_hand), swept)
     if lift > 0:
         free = np.flatnonzero(~hit)
@@ -59,7 +55,7 @@ def collides(
         normal = np.asarray(scene.support.normal)
         height = support_clearance(T_cloud_hand, opening, scene.support, gripper)
         rise = -T_cloud_hand[:, :3, 2] @ normal  # per metre backward
-        lowest = np.minimum(height, height + behind * rise)
+        lowest = np.minimum(height, height + request.behind * rise)
         lowest = np.minimum(lowest, height + lift * (UP @ normal))
         hit |= np.asarray(lowest < request.margin - SLACK)
     side, inner = gripper.pad_half_width, gripper.max_opening / 2

@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.gripper import APPROACH_LENGTH
 from edgegrasp_model.options import (
     AutoPlane,
     Box,
@@ -124,25 +125,24 @@ def select_points(
     sent: CheckedCloud, options: DetectOptions, counts: dict[str, int], warnings: list[str]
 ) -> SelectedPoints:
     """Correct depths, segment, remove the support, and drop what no hand at an object can reach."""
-    viewpoints, given = camera_positions(sent, options), _objects_given(sent, options)
+    viewpoints = camera_positions(sent, options)
+    given = sent.segment_ids is not None or options.objects == "off"
     for name in ("approach_region", "contact_region"):
         if (region := getattr(options, name)) is not None:
             check_region(region, sent, name)
     counts["points"], found = len(sent.points), None
     if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
         sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
-    readings = sent.points
+    readings, further = sent.points, max(options.collision.behind - APPROACH_LENGTH, 0.0)
     if options.workspace is not None:
-        reach = FOLLOWED_REACH if options.follows_only else HAND_REACH
+        reach = further + (FOLLOWED_REACH if options.follows_only else HAND_REACH)
         sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
     rows: Int64 | slice = slice(None)
     if len(viewpoints) == 0 and len(sent.points) > 0:
         rows, viewpoints = _seen_from_above(sent.points, options.known_up)
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
-    # The caller's segments, 0 and below meaning none; else all points are one object.
-    ids, one = sent.segment_ids, np.zeros(len(sent.points), dtype=np.int64)
-    number = one if ids is None else np.where(ids > 0, ids, UNDECIDED)
+    number = callers_objects(sent)
     needed = isinstance(options.support, AutoPlane) or (options.support is not None and not given)
     if needed and len(sent.points) > 0:
         found = segment_cloud(sent, viewpoints, options.known_up, rows)
@@ -169,6 +169,7 @@ def select_points(
             number, confidence = found.number, dict(enumerate(found.confidence.tolist()))
     if not given:
         number = without_long(number, sent.points, options.max_object_size)
+        number = with_marked(number, len(confidence), sent, options)
         if counts["above_support"] and not (inside & (number >= 0)).any():
             warnings.append(NO_OBJECT)
     number = np.where(inside | (number == BACKGROUND), number, UNDECIDED)
@@ -176,17 +177,30 @@ def select_points(
     labels = labels_of_all_pixels(sent, labels) if options.debug else labels
     if options.at or options.near or isinstance(options.objects, ObjectChoice):
         number = chosen_objects(number, sent, options, warnings)
-    kept = near_objects_along(plan, number)
+    kept = near_objects_along(plan, number, HAND_REACH + further)
     near, number = sent.take(kept), number[kept]
     up = _up(options, seen, support, None if options.viewpoint is None else found)
     return SelectedPoints(near, number, support, up, viewpoints, labels, confidence, readings)
 
 
-def _objects_given(sent: CheckedCloud, options: DetectOptions) -> bool:
-    """Whether the caller defines the objects: by segments, by rows, or as one object."""
-    regions = options.approach_region, options.contact_region
-    by_rows = any(isinstance(shape, Rows) for one in regions if one for shape in one.include)
-    return sent.segment_ids is not None or by_rows or options.objects == "off"
+def callers_objects(sent: CheckedCloud) -> Int64:
+    """The caller's segments (N,), 0 and below meaning none; else all points are one object."""
+    ids = sent.segment_ids
+    return np.zeros(len(sent.points), int) if ids is None else np.where(ids > 0, ids, UNDECIDED)
+
+
+def with_marked(number: Int64, count: int, sent: CheckedCloud, options: DetectOptions) -> Int64:
+    """Objects (N,), numbered below `count`; the rows that regions include may be one more.
+
+    They are if no object has most of its points among them: the network did not recognise the
+    object that the caller marked.
+    """
+    regions = filter(None, (options.approach_region, options.contact_region))
+    shapes = [shape for region in regions for shape in region.include if isinstance(shape, Rows)]
+    rows = np.any([np.zeros(len(number), bool), *(_listed(one, sent) for one in shapes)], axis=0)
+    size = np.bincount(number[number >= 0], minlength=count)
+    marked = np.bincount(number[rows & (number >= 0)], minlength=len(size))
+    return number if (2 * marked > size).any() else np.where(rows, len(size), number)
 
 
 def labels_of_all_pixels(sent: CheckedCloud, labels: Int64) -> Int64:
@@ -281,7 +295,7 @@ def _up(
     return np.array([0.0, 0.0, 1.0])
 
 
-def near_objects_along(plan: Float64, number: Int64) -> Bools:
+def near_objects_along(plan: Float64, number: Int64, reach: float) -> Bools:
     """Which points (M,) a hand at any object could reach; `plan` (M, 2) is along the support."""
     if not (number >= 0).any():
         return np.zeros(len(plan), dtype=bool)
@@ -289,7 +303,7 @@ def near_objects_along(plan: Float64, number: Int64) -> Bools:
     held = np.zeros((x.max() + 1, y.max() + 1), dtype=bool)
     held[x[number >= 0], y[number >= 0]] = True
     square = np.ones((3, 3), dtype=bool)
-    near = ndimage.binary_dilation(held, square, iterations=5)
+    near = ndimage.binary_dilation(held, square, iterations=math.ceil(5 * reach / HAND_REACH))
     return np.asarray(near[x, y])
 
 
@@ -354,6 +368,9 @@ def chosen_objects(
     `number` (N,) is the object of each point; negative numbers, no object, stay. `warnings` gets
     objects that are named but not found.
     """
+    if cloud.segment_ids is None and options.objects == "off":
+        fix = "Leave one of the two out: with off, everything is one object."
+        raise InvalidRequest("options.objects", "'off' and at or near", fix)
     held = number[number >= 0]
     # Counting is many times faster, but its memory grows with the caller's highest number.
     found = np.flatnonzero(np.bincount(held)) if cloud.segment_ids is None else np.unique(held)
@@ -430,11 +447,17 @@ def _inside_shape(shape: Shape, points: Float32, voxels: Voxels, cloud: CheckedC
             return np.asarray(apart <= shape.radius)
         case HalfSpace():
             return np.asarray(points @ np.asarray(shape.normal) >= shape.offset)
+    listed = _listed(shape, cloud)
+    return np.asarray(np.bincount(voxels.voxel, listed, len(voxels.size)) >= voxels.size / 2)
+
+
+def _listed(shape: Rows, cloud: CheckedCloud) -> Bools:
+    """Which points (N,) a shape lists by their rows."""
+    match shape:
         case Indices():
-            listed = np.isin(cloud.row, np.asarray(shape.indices, dtype=np.int64))
+            return np.isin(cloud.row, np.asarray(shape.indices, dtype=np.int64))
         case Mask():
-            listed = np.frombuffer(shape.mask, dtype=bool)[cloud.row]
+            return np.frombuffer(shape.mask, dtype=bool)[cloud.row]
         case Segments():
             assert cloud.segment_ids is not None
-            listed = np.isin(cloud.segment_ids, shape.ids)
-    return np.asarray(np.bincount(voxels.voxel, listed, len(voxels.size)) >= voxels.size / 2)
+            return np.isin(cloud.segment_ids, shape.ids)
