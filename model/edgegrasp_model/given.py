@@ -95,7 +95,9 @@ def from_hand_poses(
     view = hand_views(scene.cloud, T_cloud_hand, gripper)
     between = np.flatnonzero(gripper.between_fingers(view.position))
     hand, (x, y, z) = view.candidate[between], view.position[:, between]
+    background = scene.object_of_point < 0
     off_contact = x**2 + (z - gripper.contact_z_at(2 * np.abs(y))) ** 2
+    off_contact += background[view.row[between]]  # points of objects first
     facing = np.full((2, len(T_cloud_hand)), -np.inf)  # (+y, -y): cosine of normal and y axis
     touched = np.zeros((2, len(T_cloud_hand)), dtype=np.int64)  # rows of `view`
     half = np.zeros(len(T_cloud_hand), dtype=np.float32)  # metres from axis to outermost point
@@ -106,9 +108,10 @@ def from_hand_poses(
         first = np.flatnonzero(outward > outermost[hand] - TOUCH_DEPTH)
         hands, best = _least(hand[first], off_contact[first])
         touched[side, hands] = between[first[best]]
-        normal = scene.cloud.normals[view.row[touched[side, hands]]]
+        rows = view.row[touched[side, hands]]
         closing = T_cloud_hand[hands, :3, 1] * (1 - 2 * side)
-        facing[side, hands] = np.einsum("ed,ed->e", normal, closing)
+        facing[side, hands] = np.einsum("ed,ed->e", scene.cloud.normals[rows], closing)
+        facing[side, hands] -= 2.0 * background[rows]
     side = facing.argmax(axis=0)
     contact = touched[side, np.arange(len(T_cloud_hand))]  # rows of `view`
     approach = np.full(len(contact), -1, dtype=np.int64)  # rows of the cloud; -1: none

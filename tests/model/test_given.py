@@ -138,6 +138,16 @@ def test_hand_poses_of_detected_grasps_find_their_own_contacts() -> None:
         np.testing.assert_allclose(one.grasp.contact_point, other.grasp.contact_point, atol=1e-6)
 
 
+def test_hand_poses_hold_the_object_where_specks_of_background_are_on_it() -> None:
+    cloud = box_on_table()
+    found = detector().detect(cloud, ask(collision="ignore", min_score=0.0))
+    poses = np.stack([grasp.T_cloud_hand for grasp in found.grasps])
+    specks = np.floor(cloud / 0.005).astype(int).sum(axis=1) % 3 == 0
+    segmented = CloudInput(cloud, segment_ids=1 - specks.astype(int))
+    scored = detector().score(segmented, ask(collision="ignore"), hand_poses=poses)
+    assert all(one.grasp is None or one.grasp.object == 1 for one in scored.evaluations)
+
+
 def test_fingers_that_swing_are_as_free_when_scored_as_when_found() -> None:
     asked = {"collision": "avoid", "min_score": 0.0, "gripper": "robotiq-2f-85"}
     cloud = box_on_table(size=(0.04, 0.06, 0.02))
