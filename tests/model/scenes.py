@@ -47,19 +47,21 @@ def box_on_table(count: int = 2000, table=False, size=(0.04, 0.06, 0.08)) -> np.
 def scene_of(points: np.ndarray, **fields: object) -> Scene:
     """A scene of one object's points (N, 3) float32, as they are sent: no plane, no obstacles."""
     every = np.ones(len(points), dtype=bool)
-    plain = {"support": None, "obstacles": None, "viewpoints": np.empty((0, 3))} | fields
-    return Scene(
-        up=UP,
-        at_side=~every,
-        frame=CanonicalFrame(np.eye(4)),
-        cloud=Cloud(points, points),
-        points_in_cloud=points,
-        point_of_row=np.arange(len(points)),
-        approach_allowed=every,
-        contact_allowed=every,
-        object_of_point=np.zeros(len(points), dtype=np.int64),
-        **plain,
-    )
+    plain: dict[str, object] = {
+        "up": UP,
+        "support": None,
+        "obstacles": None,
+        "viewpoints": np.empty((0, 3)),
+        "at_side": ~every,
+        "frame": CanonicalFrame(np.eye(4)),
+        "cloud": Cloud(points, points),
+        "points_in_cloud": points,
+        "point_of_row": np.arange(len(points)),
+        "approach_allowed": every,
+        "contact_allowed": every,
+        "object_of_point": np.zeros(len(points), dtype=np.int64),
+    }
+    return Scene(**plain | fields)
 
 
 def random_hands(count: int, seed: int, reach: float = 0.2) -> np.ndarray:

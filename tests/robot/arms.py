@@ -2,18 +2,17 @@
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from tests.model import scenes
 
 from edgegrasp_model.options import SupportPlane, parse_options
-from edgegrasp_model.scene.cloud import UP, CanonicalFrame
-from edgegrasp_model.scene.scene import Scene
+from edgegrasp_model.scene.cloud import CanonicalFrame, pose_matrix
 from edgegrasp_results import DetectedObject, Detection, Grasp, GripperOutline
 from edgegrasp_robot import plan_picks, with_robot
 
 BOXES = ((0.5, 0.0, 0.05), (0.55, 0.2, 0.03), (0.45, -0.2, 0.04))  # x, y, half height; base frame
 HALF = 0.02  # metres
-TURNED = np.eye(4)  # T_base_cloud of a cloud whose frame is turned and moved
-TURNED[:3, :3] = Rotation.from_euler("xyz", (0.3, -0.2, 1.0)).as_matrix()
-TURNED[:3, 3] = (0.2, -0.3, 0.5)
+# T_base_cloud of a cloud whose frame is turned and moved.
+TURNED = pose_matrix(Rotation.from_euler("xyz", (0.3, -0.2, 1.0)).as_matrix(), (0.2, -0.3, 0.5))
 
 
 def grid(*axes):
@@ -21,20 +20,17 @@ def grid(*axes):
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
 
 
-def surface(x, y, half_height, step=0.004):
-    """Points (N, 3) on the sides and top of a box that stands on z = 0."""
-    side = np.arange(-HALF, HALF + 1e-9, step)
-    up = np.arange(0.0, 2 * half_height + 1e-9, step)
+def surface(x, y, half_height):
+    """Points (N, 3), 4 mm apart, on the sides and top of a box that stands on z = 0."""
+    side = np.arange(-HALF, HALF + 1e-9, 0.004)
+    up = np.arange(0.0, 2 * half_height + 1e-9, 0.004)
     walls = grid([-HALF, HALF], side, up), grid(side, [-HALF, HALF], up)
     return np.concatenate([grid(side, side, [2 * half_height]), *walls]) + np.array((x, y, 0.0))
 
 
-def hand_over(gripper, x, y, half_height, tilt=0.0):
+def hand_over(gripper, x, y, half_height):
     """T_base_hand (4, 4) from above, the fingers closing on the box's sides."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("yx", (tilt, np.pi)).as_matrix()
-    pose[:3, 3] = np.array([x, y, 2 * half_height]) - (gripper.tip_z - 0.02) * pose[:3, 2]
-    return pose
+    return pose_matrix(np.diag([1.0, -1.0, -1.0]), (x, y, 2 * half_height + gripper.tip_z - 0.02))
 
 
 def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=(), eyes=()):
@@ -51,14 +47,14 @@ def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=(), eyes=()):
     up = T_cloud_base[:3, 2]
     frame = CanonicalFrame.of_scene(objects, up, T_cloud_base[:3, :3] @ (1.0, 0.0, 0.7))
     foot = frame.points(in_cloud(np.zeros((1, 3))))[0]
-    every = np.ones(len(objects), dtype=bool)
-    scene = Scene(
-        frame=frame, cloud=None, up=UP, points_in_cloud=objects, point_of_row=number,
-        approach_allowed=every, contact_allowed=every, at_side=~every, object_of_point=number,
-        support=SupportPlane(normal=(0.0, 0.0, 1.0), offset=float(foot[2])), obstacles=None,
+    scene = scenes.scene_of(
+        objects,
+        frame=frame,
+        object_of_point=number,
+        support=SupportPlane(normal=(0.0, 0.0, 1.0), offset=float(foot[2])),
         viewpoints=frame.points(in_cloud(np.reshape(eyes, (-1, 3)))),
         readings=np.concatenate([objects, in_cloud(table), *map(in_cloud, more)]),
-    )  # fmt: skip
+    )
     poses = [T_cloud_base @ hand_over(robot.gripper, *box) for box in boxes]
     grasps = [
         Grasp(0.9 - 0.1 * row, pose.astype(np.float32), pose.astype(np.float32), 0.08, pose[:3, 3],

@@ -58,9 +58,9 @@ def plans_of(detection):
     return [(grasp, grasp.arm) for grasp in detection.grasps if grasp.arm and grasp.arm.reachable]
 
 
-def touches(robot, joints, points, distance=0.0):
+def touches(robot, joints, points):
     """Whether the robot, as the planner sees it, holds any of the points (N, 3), base frame."""
-    return bool(_near_robot(robot, joints, points, distance).any())
+    return bool(_near_robot(robot, joints, points, 0.0).any())
 
 
 def test_every_box_gets_a_motion_unless_reach_is_asked_for(robot):
@@ -77,13 +77,11 @@ def test_every_box_gets_a_motion_unless_reach_is_asked_for(robot):
 )
 @given(x=st.floats(0.4, 0.6), y=st.floats(-0.25, 0.25), tilt=st.floats(-3.1, 3.1))
 def test_the_hand_comes_to_the_grasp_and_limits_are_kept(robot, x, y, tilt):
-    T_base_cloud = TURNED.copy()
-    T_base_cloud[:3, :3] = Rotation.from_euler("z", tilt).as_matrix()
+    T_base_cloud = pose_matrix(Rotation.from_euler("z", tilt).as_matrix(), TURNED[:3, 3])
     for grasp, plan in plans_of(picks_of(robot, T_base_cloud, boxes=((x, y, 0.04),))):
         T_base_hand = T_base_cloud @ grasp.T_cloud_hand
         assert_pose(robot.hand_pose(plan.grasp_joints), T_base_hand)
-        before = T_base_hand.copy()
-        before[:3, 3] -= 0.05 * T_base_hand[:3, 2]
+        before = T_base_hand @ pose_matrix(np.eye(3), (0.0, 0.0, -0.05))
         assert_pose(robot.hand_pose(plan.pregrasp_joints), before)
         motion = plan.trajectory
         assert motion is not None

@@ -4,6 +4,7 @@ import json
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from edgegrasp_client.over_grpc import message_of
 from edgegrasp_client.requests import Request
 from edgegrasp_client.results import read_as
 from edgegrasp_model.results import Pace
+from edgegrasp_model.scene.cloud import pose_matrix
 from edgegrasp_results import Detection
 from edgegrasp_robot import load_robots
 from edgegrasp_service.settings import Settings
@@ -28,44 +30,26 @@ from edgegrasp_service.worker.process import Job
 SETTINGS = Settings(robots=(Path("fr3"),))
 
 
-class Catalogue:
-    """A detector that finds a hand over each box, and keeps the options it was asked with."""
-
-    pace = Pace()
-
-    def __init__(self, robot):
-        self.scene, self.detection = scene_of(robot)
-
-    def get(self, name):
-        return self
-
-    def prepare(self, cloud, options, most):
-        self.options = options
-        return SimpleNamespace(scene=self.scene, counts={})
-
-    def evaluate(self, prepared):
-        return None
-
-    def finish(self, prepared, logits):
-        return self.detection
-
-
 @pytest.fixture(scope="module")
 def robot():
     return load_robots(SETTINGS.robots)["fr3"]
 
 
 def ask(robot, transport, settings=SETTINGS, **changes):
-    """The answer to a request about the robot, and the catalogue that it went to."""
-    catalogue = Catalogue(robot)
+    """The answer to a request about the robot, of a detector that finds a hand over each box."""
+    scene, detection = scene_of(robot)
+    detector = Mock()
+    detector.prepare.return_value = SimpleNamespace(scene=scene, counts={})
+    detector.finish.return_value = detection
+    catalogue = Mock(pace=Pace(), get=Mock(return_value=detector))
     asked = {"name": "fr3", "T_base_cloud": TURNED, "joints": robot.home} | changes
-    request = Request(catalogue.scene.readings, {"robot": asked})
+    request = Request(scene.readings, {"robot": asked})
     if transport == "grpc":
-        body = message_of(request).SerializeToString()
-        return answer(Job("DetectGrasps", "grpc", body, 60.0), catalogue, settings), catalogue
-    text = {"points": catalogue.scene.readings.tolist(), "options": dict(request.options)}
-    job = Job("DetectGrasps", "http", json.dumps(text).encode(), 60.0, "application/json")
-    return answer(job, catalogue, settings), catalogue
+        job = Job("DetectGrasps", "grpc", message_of(request).SerializeToString(), 60.0)
+    else:
+        text = {"points": scene.readings.tolist(), "options": dict(request.options)}
+        job = Job("DetectGrasps", "http", json.dumps(text).encode(), 60.0, "application/json")
+    return answer(job, catalogue, settings), detector
 
 
 def read(transport, body):
@@ -75,7 +59,7 @@ def read(transport, body):
 
 
 def test_the_client_reads_the_best_pick(robot, transport):
-    given, catalogue = ask(robot, transport)
+    given, detector = ask(robot, transport)
     assert given.error is None
     detection = read(transport, given.body)
     pick = detection.best_pick
@@ -86,7 +70,8 @@ def test_the_client_reads_the_best_pick(robot, transport):
     T_base_hand = TURNED @ pick.T_cloud_hand
     np.testing.assert_allclose(robot.hand_pose(pick.arm.grasp_joints), T_base_hand, atol=2e-3)
     assert list(detection.counts)[-2:] == ["with_trajectory", "returned"]
-    assert catalogue.options.gripper.name == robot.gripper.name  # for which grasps are
+    options = detector.prepare.call_args.args[1]
+    assert options.gripper.name == robot.gripper.name  # for which grasps are
 
 
 def test_reach_alone_what_is_out_of_reach_and_a_start_that_collides(robot, transport):
@@ -105,9 +90,8 @@ def test_reach_alone_what_is_out_of_reach_and_a_start_that_collides(robot, trans
 
 
 def test_the_client_reads_where_an_object_is_put(robot, transport):
-    pose = np.eye(4)
-    pose[:3, 3] = 0.4, -0.35, 0.1
-    given, _ = ask(robot, transport, place={"T_base_object": pose})
+    place = {"T_base_object": pose_matrix(np.eye(3), (0.4, -0.35, 0.1))}
+    given, _ = ask(robot, transport, place=place)
     plan = read(transport, given.body).best_pick.arm
     np.testing.assert_allclose(robot.hand_pose(plan.place_joints), plan.T_base_place, atol=1e-6)
     assert plan.trajectory.grasp_row < plan.trajectory.release_row < len(plan.trajectory.times)
@@ -135,7 +119,6 @@ def test_a_server_lists_its_robots(start_dummy, robot):
                 np.testing.assert_array_equal(np.ravel(getattr(listed, field)), np.ravel(value))
             T_base_hand = listed.frames[0]
             for axis, turn, frame in zip(listed.axes, joints, listed.frames[1:], strict=True):
-                about = np.eye(4)
-                about[:3, :3] = Rotation.from_rotvec(turn * axis).as_matrix()
-                T_base_hand = T_base_hand @ about @ frame
+                about = Rotation.from_rotvec(turn * axis).as_matrix()
+                T_base_hand = T_base_hand @ pose_matrix(about, np.zeros(3)) @ frame
             np.testing.assert_allclose(T_base_hand, robot.hand_pose(joints), atol=1e-6)
