@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from tests.cli.commands import refused, run
 
 from edgegrasp_cli.flags import option_flags
 from edgegrasp_model.options import DetectOptions
@@ -21,7 +22,7 @@ def file(cloud: np.ndarray, tmp_path: Path) -> str:
 
 
 def test_every_option_is_a_flag_which_wins_over_the_options_file(
-    file, dummy_server, run, refused, tmp_path
+    file, dummy_server, tmp_path
 ) -> None:
     assert [flag.name for flag in option_flags()] == list(DetectOptions.model_fields)
     options = tmp_path / "options.json"
@@ -37,7 +38,7 @@ def test_every_option_is_a_flag_which_wins_over_the_options_file(
 
 
 def test_json_of_a_server_needs_no_package_of_the_server(
-    camera_files, dummy_server, run, monkeypatch
+    camera_files, dummy_server, monkeypatch
 ) -> None:
     """`pip install 'edgegrasp[cli,view]'` is enough."""
     monkeypatch.setitem(sys.modules, "orjson", None)
@@ -46,7 +47,7 @@ def test_json_of_a_server_needs_no_package_of_the_server(
     assert len(json.loads(run("detect", *camera_files, *asked))["grasps"]) == 10
 
 
-def test_a_table_shows_counts_and_warnings(file: str, dummy_server, run) -> None:
+def test_a_table_shows_counts_and_warnings(file: str, dummy_server) -> None:
     output = run("detect", file, "--server", dummy_server.http_url, "--top-k", "3")
     assert len(re.findall(r"^\d +0\.\d{3}.* (?:yes|no) *$", output, re.MULTILINE)) == 3
     assert "500 points" in output
@@ -64,7 +65,7 @@ def camera_files(tmp_path: Path) -> list[str]:
     return [*flags, "--intrinsics", "300,300,15.5,11.5", "--depth-scale", "0.0001"]
 
 
-def test_a_depth_image_is_grasped_where_its_mask_is(camera_files, dummy_server, run) -> None:
+def test_a_depth_image_is_grasped_where_its_mask_is(camera_files, dummy_server) -> None:
     flags = (*camera_files, "--json", "--num-approach-points", "4", "--debug", "--support", "none")
     document = json.loads(run("detect", *flags), parse_constant=pytest.fail)  # NaN is null
     assert document["counts"]["points"] == 24 * 32
@@ -80,7 +81,7 @@ def test_a_depth_image_is_grasped_where_its_mask_is(camera_files, dummy_server, 
 
 
 def test_a_picture_shows_the_cloud_its_grasps_and_the_region(
-    camera_files, file, dummy_server, run, tmp_path
+    camera_files, file, dummy_server, tmp_path
 ) -> None:
     depth, _, color, *camera = camera_files
     asked = ("--server", dummy_server.http_url, "--picture")
@@ -101,7 +102,7 @@ def test_a_picture_shows_the_cloud_its_grasps_and_the_region(
     assert cyan["region"].sum() > 200 > cyan["cloud"].sum()
 
 
-def test_grey_colours_are_those_of_their_pixels(camera_files, dummy_server, run) -> None:
+def test_grey_colours_are_those_of_their_pixels(camera_files, dummy_server) -> None:
     depth, mask, _, *camera = camera_files
     file = mask.removeprefix("--mask=")
     for mode in ("L", "LA"):
@@ -110,7 +111,7 @@ def test_grey_colours_are_those_of_their_pixels(camera_files, dummy_server, run)
         assert json.loads(run(*asked, "--json"))["counts"]["points"] == 24 * 32
 
 
-def test_a_picture_that_cannot_be_written_is_refused_before_any_work(refused, tmp_path) -> None:
+def test_a_picture_that_cannot_be_written_is_refused_before_any_work(tmp_path) -> None:
     for name, message in (
         ("seen.gif", "Name a file .png or"),
         ("seen", "Name a file"),
@@ -122,7 +123,7 @@ def test_a_picture_that_cannot_be_written_is_refused_before_any_work(refused, tm
     assert "--trajectory: there is no folder" in refused("detect", tmp_path / "no.npy", *moved)
 
 
-def test_several_depth_images_are_one_cloud(camera_files, dummy_server, run, refused) -> None:
+def test_several_depth_images_are_one_cloud(camera_files, dummy_server) -> None:
     depth, _, _, *camera = camera_files
     pose = "--pose", json.dumps(np.eye(4).tolist())
     asked = ("detect", depth, depth, *camera, *pose, "--server", dummy_server.grpc_address)
@@ -133,7 +134,7 @@ def test_several_depth_images_are_one_cloud(camera_files, dummy_server, run, ref
 ARM = ("--robot", "fr3", "--base", "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1")
 
 
-def test_input_that_cannot_be_used_is_named(camera_files, file, refused, dummy_server, tmp_path):
+def test_input_that_cannot_be_used_is_named(camera_files, file, dummy_server, tmp_path):
     depth, mask, *_ = camera_files
     absent, foreign, unknown = (tmp_path / name for name in ("no.npy", "foreign.npy", "cloud.las"))
     foreign.write_bytes(b"foreign")
@@ -164,13 +165,13 @@ def test_input_that_cannot_be_used_is_named(camera_files, file, refused, dummy_s
         assert sentence in refused("detect", *flags)
 
 
-def test_a_device_that_is_not_there_is_named(file, refused, monkeypatch) -> None:
+def test_a_device_that_is_not_there_is_named(file, monkeypatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert "edgegrasp detect: device: got 'cuda'" in refused("detect", file, "--device", "cuda")
     assert "Use auto, cpu, cuda" in refused("detect", file, "--device", "gpu")
 
 
-def test_models_are_listed_from_a_server_or_from_here(dummy_server, run, refused) -> None:
+def test_models_are_listed_from_a_server_or_from_here(dummy_server) -> None:
     for address in (dummy_server.grpc_address, dummy_server.http_url):
         assert "dummy" in run("models", "--server", address)
     assert "panda" in run("models")
@@ -180,7 +181,7 @@ def test_models_are_listed_from_a_server_or_from_here(dummy_server, run, refused
         assert f"{command[-2]}: got --server as well" in beside
 
 
-def test_a_server_with_tls_and_tokens(file, pem, run, refused, tmp_path, start_dummy, monkeypatch):
+def test_a_server_with_tls_and_tokens(file, pem, tmp_path, start_dummy, monkeypatch):
     token = tmp_path / "token"
     token.write_text("user-token-0123456789\n")
     names = ("certificate", ""), ("key", "_key")

@@ -11,6 +11,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+from tests.cli.commands import invoke, refused, run
 from tests.programs import EDGEGRASP, started
 from tests.programs import run as run_program
 from typer.testing import CliRunner
@@ -19,8 +20,6 @@ from edgegrasp.v1 import grasp_pb2
 from edgegrasp_cli import main
 from edgegrasp_service.errors import InvalidRequest, report
 from edgegrasp_service.worker.process import Answer, Facts, Job
-
-from .conftest import invoke
 
 HEAVY = {"torch", "open3d", "grpc", "pybullet", "mujoco", "fastapi", "uvicorn", "httpx"}
 HEAVY |= {"matplotlib"}
@@ -50,7 +49,7 @@ def test_help_lists_the_commands_and_loads_nothing_heavy() -> None:
     assert not loaded & HEAVY
 
 
-def test_version_short_help_completion_and_an_unknown_command(run) -> None:
+def test_version_short_help_completion_and_an_unknown_command() -> None:
     assert "Did you mean 'detect'?" in invoke(2, "detec")
     assert loaded_by(["--version"])[0] == f"edgegrasp {importlib.metadata.version('edgegrasp')}\n"
     for words in (["-h"], ["detect", "-h"]):
@@ -106,7 +105,7 @@ def test_a_missing_package_names_the_extra(missing, words, extra) -> None:
         (["generate-scenes", "FOLDER", "--objects", "FOLDER"], "pybullet"),
     ],
 )
-def test_a_missing_engine_is_named(words: list[str], missing: str, refused, monkeypatch) -> None:
+def test_a_missing_engine_is_named(words: list[str], missing: str, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
     monkeypatch.setitem(sys.modules, "mujoco", None)
     assert f"edgegrasp {words[0]}: " in (said := refused(*words))
@@ -127,7 +126,7 @@ def test_arms_are_an_extra(words: tuple[object, ...], tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("transport", ["http", "grpc"])
-def test_a_recorded_request_is_answered_again(transport, run, refused, monkeypatch) -> None:
+def test_a_recorded_request_is_answered_again(transport, monkeypatch) -> None:
     def body(model: str, seconds: float) -> bytes:
         if transport == "http":
             return json.dumps({"model": model, "seconds": {"total": seconds}}).encode()
@@ -147,7 +146,7 @@ def test_a_recorded_request_is_answered_again(transport, run, refused, monkeypat
         assert "differs" in refused("replay", "request", differing)
 
 
-def test_a_scene_is_viewed_until_ctrl_c(tmp_path: Path, refused) -> None:
+def test_a_scene_is_viewed_until_ctrl_c(tmp_path: Path) -> None:
     assert "No such file" in refused("view", "absent.ply", "--no-browser")
     assert "or --depth" in refused("view", "absent.ply", "--depth", "depth.png", "--no-browser")
     depth, color = tmp_path / "frame.npy", tmp_path / "color" / "frame.npy"

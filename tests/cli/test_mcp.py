@@ -16,6 +16,7 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
+from tests.cli.commands import refused
 from tests.programs import EDGEGRASP, free_ports, run, started, until
 
 from edgegrasp_cli.mcp import grasp_tools
@@ -111,7 +112,7 @@ async def test_a_camera_pose_puts_answers_into_the_base_frame(dummy_server, fold
         np.testing.assert_allclose(grasp["tcp_position"], wanted.T_cloud_tcp[:3, 3], atol=1e-4)
 
 
-def test_no_folder_and_an_address_without_a_port_are_named(refused) -> None:
+def test_no_folder_and_an_address_without_a_port_are_named() -> None:
     done = run(sys.executable, *PROGRAM, "--folder", "/nonexistent", code=1)
     assert "/nonexistent is not a folder" in done.stderr
     for http in ("somewhere", "127.0.0.1:", "127.0.0.1:99999"):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cli.commands import refused, run
 
 pytest.importorskip("roboplan", reason="the extra robot is not installed")
 
@@ -17,7 +18,7 @@ UR5 = Path(str(get_package_models_dir())) / "ur_robot_model" / "ur5_gripper.urdf
 LINKS = ("--base", "base_link", "--flange", "tool0")
 
 
-def test_a_robot_file_of_a_urdf_loads(run, refused, tmp_path: Path) -> None:
+def test_a_robot_file_of_a_urdf_loads(tmp_path: Path) -> None:
     file = tmp_path / "mine.toml"
     for unknown in ("tool9", "tool: home: 9"):  # the file goes again, whatever the name
         said = refused("robot", "add", UR5, *LINKS[:3], unknown, "--output", file)
@@ -33,7 +34,7 @@ def test_a_robot_file_of_a_urdf_loads(run, refused, tmp_path: Path) -> None:
     assert load_robot(file).max_velocity[0] == 3.15  # the URDF's
 
 
-def test_a_robot_files_gripper_is_found_from_any_folder(run, tmp_path: Path, monkeypatch) -> None:
+def test_a_robot_files_gripper_is_found_from_any_folder(tmp_path: Path, monkeypatch) -> None:
     mine = resources.files("edgegrasp_model") / "grippers" / "robotiq-2f-85.toml"
     (tmp_path / "mine.toml").write_text(mine.read_text())
     (tmp_path / "robots").mkdir()
@@ -43,7 +44,7 @@ def test_a_robot_files_gripper_is_found_from_any_folder(run, tmp_path: Path, mon
     assert load_robot(tmp_path / "robots" / "arm.toml").gripper.name == "robotiq-2f-85"
 
 
-def test_a_picture_of_a_robot(run, tmp_path: Path) -> None:
+def test_a_picture_of_a_robot(tmp_path: Path) -> None:
     picture = tmp_path / "fr3.png"
     assert "fr3_joint7" in run("robot", "check", "fr3", "--picture", picture)
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -61,12 +62,12 @@ def test_a_picture_of_a_robot(run, tmp_path: Path) -> None:
         (("detect", "x.npy", "--trajectory", "out.json"), "--trajectory: got no robot"),
     ],
 )
-def test_what_is_missing_is_said(refused, words, said, monkeypatch, tmp_path: Path) -> None:
+def test_what_is_missing_is_said(words, said, monkeypatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     assert said in refused(*words)
 
 
-def test_what_no_camera_saw_is_avoided_only_with_a_camera(refused, tmp_path: Path) -> None:
+def test_what_no_camera_saw_is_avoided_only_with_a_camera(tmp_path: Path) -> None:
     robot = load_robot("fr3")
     np.save(tmp_path / "cloud.npy", scene_of(robot, np.eye(4))[0].readings)
     joints, base = (",".join(map(str, values)) for values in (robot.home, np.eye(4).ravel()))

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.cli.conftest import invoke
+from tests.cli.commands import refused, run
 from tests.programs import until
 
 from edgegrasp_lab.benchmark import benchmark_arm
@@ -44,7 +44,7 @@ def benchmark(folder: Path, planner: str, *flags: object, rounds: int = 2) -> di
     """The summary of a small benchmark of packed scenes."""
     where = ("--scene", "packed", "--seed", 0, "--workers", 1, "--output", folder)
     asked = ("--planner", planner, "--rounds", rounds, "--no-report")
-    invoke(0, "benchmark", *where, *asked, *flags)
+    run("benchmark", *where, *asked, *flags)
     return figures(folder)
 
 
@@ -73,7 +73,7 @@ def test_the_shipped_weights_are_not_below_the_gate(tmp_path) -> None:
     assert planner["options"] == {"num_approach_points": 16, "num_candidates": 400}
 
 
-def test_another_hand_is_planned_for_and_simulated(run, refused, tmp_path) -> None:
+def test_another_hand_is_planned_for_and_simulated(tmp_path) -> None:
     few = ("--num-approach-points", 16, "--num-candidates", 400, "--gripper", "robotiq-2f-85")
     assert benchmark(tmp_path, "in-process", *few, rounds=1)["successes"] > 0
     manifest = figures(tmp_path, "manifest.json")["run"]
@@ -83,7 +83,7 @@ def test_another_hand_is_planned_for_and_simulated(run, refused, tmp_path) -> No
     assert "nothere" in refused("benchmark", "--gripper", "nothere")
 
 
-def test_a_result_below_the_gate_fails(top_down: Path, in_process: Path, refused, tmp_path) -> None:
+def test_a_result_below_the_gate_fails(top_down: Path, in_process: Path, tmp_path) -> None:
     gate = figures(in_process)
     for name in ("grasp_success_rate", "declutter_rate"):
         gate[name] |= {"value": 0.99, "wilson_95": [0.98, 1.0]}
@@ -101,13 +101,13 @@ def test_the_report_shows_tables_and_pictures(top_down: Path) -> None:
     assert all(name in page for name in figures(top_down)["objects_by_name"])
 
 
-def test_a_protocol_brings_its_scene(run, tmp_path) -> None:
+def test_a_protocol_brings_its_scene(tmp_path) -> None:
     where = ("--planner", TOP_DOWN, "--rounds", 1, "--no-report", "--output", tmp_path)
     run("benchmark", "--protocol", "shelf", *where)
     assert figures(tmp_path)["scene"] == "shelf"
 
 
-def test_a_recorded_attempt_comes_out_the_same(in_process: Path, run, tmp_path: Path) -> None:
+def test_a_recorded_attempt_comes_out_the_same(in_process: Path, tmp_path: Path) -> None:
     last = attempts(in_process)[-1]
     where = ("--round", last["round"], "--attempt", last["attempt"])
     picture = tmp_path / "attempt.png"
@@ -115,7 +115,7 @@ def test_a_recorded_attempt_comes_out_the_same(in_process: Path, run, tmp_path: 
     assert picture.read_bytes()[1:4] == b"PNG"
 
 
-def test_wrong_replays_and_comparisons_end_with_a_sentence(in_process, refused, tmp_path) -> None:
+def test_wrong_replays_and_comparisons_end_with_a_sentence(in_process, tmp_path) -> None:
     assert "attempt is 99" in refused("replay", "attempt", in_process, "--attempt", 99)
     assert "round is 7" in refused("replay", "attempt", in_process, "--round", 7)
     assert "contains no benchmark" in refused("replay", "attempt", tmp_path)
@@ -128,7 +128,7 @@ def test_wrong_replays_and_comparisons_end_with_a_sentence(in_process, refused, 
     assert "attempts of an arm" in refused("replay", "attempt", tmp_path)
 
 
-def test_two_planners_are_compared_scene_by_scene(in_process, top_down, run, tmp_path) -> None:
+def test_two_planners_are_compared_scene_by_scene(in_process, top_down, tmp_path) -> None:
     output = run("compare", top_down, in_process, "--output", tmp_path / "compared.json")
     assert "2 scenes" in output
     compared = figures(tmp_path, "compared.json")

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.cli.commands import refused, run
 from tests.model.rendered import FOCAL_LENGTH, HEIGHT, WIDTH, box, camera, render, seen_box, table
 
 from edgegrasp_cli.detect import OwnDetector
@@ -110,7 +111,7 @@ def test_clouds_show_the_same_scene_as_depth_images(scene: Path, tmp_path: Path)
     assert (row.min() >= 0) & (row.max() < virtual.camera.shape[0])
 
 
-def test_results_page_and_pictures(scene: Path, run, tmp_path: Path) -> None:
+def test_results_page_and_pictures(scene: Path, tmp_path: Path) -> None:
     output = tmp_path / "results"
     asked = ("--support", '{"kind":"ransac"}', "--up", ",".join(map(str, NORMAL)))
     assert "1 of 1" in run("benchmark-real", "--scenes", scene.parent, "--output", output, *asked)
@@ -124,7 +125,7 @@ def test_results_page_and_pictures(scene: Path, run, tmp_path: Path) -> None:
     assert "box" in (output / "index.html").read_text()
 
 
-def test_of_a_heap_that_hides_its_support_no_plane_and_no_objects_are_judged(scene, run, tmp_path):
+def test_of_a_heap_that_hides_its_support_no_plane_and_no_objects_are_judged(scene, tmp_path):
     heap = tmp_path / "heap" / "heap.npz"
     heap.parent.mkdir()
     np.savez(heap, **{k: v for k, v in seen_scene().items() if not k.startswith("support_")})
@@ -137,7 +138,7 @@ def test_of_a_heap_that_hides_its_support_no_plane_and_no_objects_are_judged(sce
     assert results["scenes"]["heap"]["segmentation"]["pixel_recall"] > 0.9
 
 
-def test_a_scene_that_is_refused_counts_as_one_without_grasps(scene, run, tmp_path) -> None:
+def test_a_scene_that_is_refused_counts_as_one_without_grasps(scene, tmp_path) -> None:
     whole = load_scene(scene)
     row = np.flatnonzero(whole.labels == 2)[:10]  # fewer points than grasps are asked around
     plane = {"support_normal": whole.normal, "support_offset": whole.offset}
@@ -166,13 +167,13 @@ def test_a_scene_that_is_refused_counts_as_one_without_grasps(scene, run, tmp_pa
         ("rgb", np.zeros((2, 2, 3), np.uint8), "box.npz: rgb: got shape (2, 2, 3)"),
     ],
 )
-def test_a_bad_file_is_named_with_field_and_fix(field, value, sentence, scene, refused) -> None:
+def test_a_bad_file_is_named_with_field_and_fix(field, value, sentence, scene) -> None:
     arrays = seen_scene() | {field: value}
     np.savez(scene, **{name: array for name, array in arrays.items() if array is not None})
     assert sentence in refused("benchmark-real", "--scenes", scene.parent)
 
 
-def test_what_is_no_scene_is_refused(refused, scene: Path, tmp_path: Path) -> None:
+def test_what_is_no_scene_is_refused(scene: Path, tmp_path: Path) -> None:
     twice = ("--scenes", scene.parent, "--scenes", scene.parent)
     assert "two scenes named box" in refused("benchmark-real", *twice)
     scene.unlink()
@@ -203,7 +204,7 @@ def test_labels_are_compared_object_by_object(answer, pixels, overlap, called, s
     assert (numbers[numbers != LABELS] > 3).all()
 
 
-def test_the_grasp_of_a_recorded_scene_stays_where_it_is(scene, run, refused, tmp_path) -> None:
+def test_the_grasp_of_a_recorded_scene_stays_where_it_is(scene, tmp_path) -> None:
     asked = ("benchmark-tracking", "--scenes", scene.parent, "--output", tmp_path / "out")
     assert "box" in run(*asked, "--seconds", 0.2)
     assert "which stand still" in refused(*asked, "--motion", "still", "--motion", "pushed")

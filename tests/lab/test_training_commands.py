@@ -1,10 +1,10 @@
 """The commands that make data and train weights; tests/project has them one after the other."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.cli.commands import refused, run
 
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_training.recipes import recipe
@@ -14,13 +14,13 @@ VIEWS += ("--workers", 1)  # processes take longer to start than these scenes to
 
 
 @pytest.fixture(scope="module")
-def data(run: Callable[..., str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data")
     assert "4 scenes made, 0 kept" in run("generate-data", folder, *VIEWS)
     return folder
 
 
-def test_training_pauses_goes_on_and_is_recalibrated(data, run, tmp_path) -> None:
+def test_training_pauses_goes_on_and_is_recalibrated(data, tmp_path) -> None:
     assert "0 scenes made, 4 kept" in run("generate-data", data, *VIEWS)
     amount = ("--steps", 4, "--views-per-step", 2, "--validation-share", 0.3)
     training = ("train", data, "--run", tmp_path, *amount)
@@ -71,7 +71,7 @@ def test_training_pauses_goes_on_and_is_recalibrated(data, run, tmp_path) -> Non
         (("benchmark-tracking", "--motion", "fast"), "Choose one of still, pushed"),
     ],
 )
-def test_wrong_arguments_end_with_a_sentence(words, message, data, refused, tmp_path, monkeypatch):
+def test_wrong_arguments_end_with_a_sentence(words, message, data, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     places = {"DATA": data, "FOLDER": tmp_path}
     assert message in refused(*(places.get(word, word) for word in words))

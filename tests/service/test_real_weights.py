@@ -6,7 +6,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from tests.cli.conftest import invoke
+from tests.cli.commands import run
 from tests.cloud_files import npy
 from tests.many_options import MANY
 from tests.model.rendered import FOCAL_LENGTH, ROOM_INSIDE, SCENE, wavy
@@ -51,7 +51,7 @@ def test_many_options_give_the_same_grasps_everywhere(catalogue, real_server, tm
     body = {name: array.tolist() for name, array in BESIDE.items()}
     body |= {"points": POINTS.tolist(), "options": MANY}
     documents = [httpx.post(f"{real_server.http_url}/v1/grasps", json=body, timeout=60).json()]
-    documents += [json.loads(invoke(0, *each)) for each in (flags, remote)]
+    documents += [json.loads(run(*each)) for each in (flags, remote)]
     for document in documents:
         given = [[v for v in grasp.values() if v is not None] for grasp in document["grasps"]]
         assert given == as_lists(expected)

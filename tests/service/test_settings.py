@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.cli.conftest import invoke
+from tests.cli.commands import run
 
 from edgegrasp_service.errors import InvalidSettings
 from edgegrasp_service.settings import Settings, load_settings
@@ -100,7 +100,7 @@ def test_unknown_variables_are_named_but_for_a_clients(monkeypatch, name: str) -
 def test_the_settings_in_effect_are_printed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EDGEGRASP_GRPC_PORT", "7")
     flags = ("--print-config", "--http-port", "9", "--weights", "/a", "--weights", "/b")
-    printed = json.loads(invoke(0, "serve", *flags))
+    printed = json.loads(run("serve", *flags))
     assert (printed["http_port"], printed["grpc_port"]) == (9, 7)
     assert printed["weights"] == ["/a", "/b"]
     assert set(printed) == set(Settings.model_fields)
