@@ -168,8 +168,7 @@ def test_one_interrupt_ends_it(dummy_server, folder) -> None:
     first = {"protocolVersion": "2025-06-18", "capabilities": {}}
     first |= {"clientInfo": {"name": "me", "version": "1"}}
     line = json.dumps({"jsonrpc": "2.0", "id": 1, "method": "initialize", "params": first})
-    pipes = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
-    with subprocess.Popen([*EDGEGRASP, *words], text=True, **pipes) as serving:
+    with started(*EDGEGRASP, *words, stdin=subprocess.PIPE) as serving:
         serving.stdin.write(line + "\n")
         serving.stdin.flush()
         assert "serverInfo" in serving.stdout.readline()

@@ -74,9 +74,8 @@ def test_tritons_client_gets_grasps(gateway, transport, kind, cloud, tmp_path, d
         sent = {"cloud": cloud} if kind == "points" else {"depth_images": images}
         expected = ours.detect(**sent, top_k=4, up=[0, 0, 1]).grasps
     assert len(told["score"]) == 4
-    np.testing.assert_allclose(told["T_cloud_hand"], [g.T_cloud_hand for g in expected], atol=1e-6)
-    np.testing.assert_allclose(told["score"], [g.score for g in expected], atol=1e-6)
-    np.testing.assert_allclose(told["width"], [g.width for g in expected], atol=1e-6)
+    for name in ("T_cloud_hand", "score", "width"):
+        np.testing.assert_allclose(told[name], [getattr(g, name) for g in expected], atol=1e-6)
 
 
 def test_a_request_in_json(gateway, cloud) -> None:

@@ -7,8 +7,8 @@ import struct
 import sys
 import warnings
 import zlib
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -55,24 +55,23 @@ FILES: dict[str, list[bytes]] = {
 }  # fmt: skip
 
 
-def decodes_or_refuses(work: Callable[[], object], size: int) -> None:
-    """Run a decoder on `size` bytes; anything but an answer or an error of the table fails."""
+@contextmanager
+def decoding(size: int) -> Iterator[None]:
+    """Of `size` bytes; anything but an answer or an error of the table fails."""
     # Text costs most: a list and an object for each word; files unpack to five arrays at most.
     allowed = 200 * size + 5 * (48 * MAX_POINTS + 65536) + 2**20
     with bounded_memory(allowed), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            work()
+            yield
         except EdgeGraspError as error:
             check_problem(report(error))
 
 
 def decode(size: int, **fields: Any) -> None:
-    def work() -> None:
+    with decoding(size):
         cloud, _ = decode_cloud(fields, DetectOptions(), MAX_POINTS)
         check_cloud(cloud, 32)
-
-    decodes_or_refuses(work, size)
 
 
 @pytest.mark.parametrize("file_format", FILES)
@@ -157,8 +156,8 @@ BESIDE = {"edges": [[0, 1], [2, 3]], "hand_poses": [np.eye(4).tolist()], "option
 
 def ask(transport: str, body: bytes, scores: bool, media_type: str = "", query: str = "") -> None:
     """Ask, within memory; anything but an answer or an error of the caller's fails."""
-    asked = partial(ask_worker, transport, body, media_type, query, scores, SETTINGS)
-    decodes_or_refuses(asked, len(body) + len(query))
+    with decoding(len(body) + len(query)):
+        ask_worker(transport, body, media_type, query, scores, SETTINGS)
 
 
 @given(mutated([message.SerializeToString() for message in MESSAGES]), st.booleans())

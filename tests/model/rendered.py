@@ -30,11 +30,11 @@ def table(half_width: float = 0.5, half_depth: float = 0.4) -> SolidBox:
     return box((0, 0, -0.015), (half_width, half_depth, 0.015))
 
 
-def boxes_on_table(seed: int, count: int = 4) -> list[SolidBox]:
-    """Boxes a hand can grasp, standing apart from each other on z = 0."""
+def boxes_on_table(seed: int) -> list[SolidBox]:
+    """Four boxes a hand can grasp, standing apart from each other on z = 0."""
     rng = np.random.default_rng(seed)
     placed: list[SolidBox] = []
-    while len(placed) < count:
+    while len(placed) < 4:
         half = rng.uniform([0.012, 0.02, 0.025], [0.025, 0.05, 0.07])
         x, y = rng.uniform([-0.2, -0.15], [0.2, 0.15])
         new = box((x, y, half[2]), half, rng.uniform(0, np.pi))

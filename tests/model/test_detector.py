@@ -16,7 +16,7 @@ from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, UnknownMode
 from edgegrasp_model.kernels import mean_over_similar
 from edgegrasp_model.networks.checkpoint import save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
-from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, parse_options
+from edgegrasp_model.options import Collision, DetectOptions, parse_options
 from edgegrasp_model.ranking import densest_first
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene import network
@@ -437,10 +437,8 @@ FIFTEEN_DEGREES = np.cos(np.radians(15.0))
 
 def straight_down(points: np.ndarray) -> list[Grasp]:
     """The grasps of what is seen from straight above whose hand moves straight down."""
-    floor = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.0)
-    viewpoint = (0.0, 0.0, 0.9)
-    options = DetectOptions(support=floor, viewpoint=viewpoint, suppression=None, top_k=500)
-    found = detector().detect(points.astype(np.float32), options)
+    above = {"viewpoint": (0.0, 0.0, 0.9), "suppression": None, "top_k": 500}
+    found = detect(points.astype(np.float32), **above)
     return [grasp for grasp in found.grasps if grasp.T_cloud_hand[2, 2] == -1.0]
 
 

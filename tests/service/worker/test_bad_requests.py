@@ -172,9 +172,8 @@ CASES = {
 
 
 @pytest.mark.parametrize("transport", ["http", "grpc"])
-@pytest.mark.parametrize("name", CASES)
-def test_malformed(name: str, transport: str) -> None:
-    case = CASES[name]
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_malformed(case: Malformed, transport: str) -> None:
     body = case.as_json() if transport == "http" else case.as_message()
     error = problem(transport, body, "application/json", scores=case.scores)
     assert error.kind == case.kind
@@ -219,9 +218,8 @@ JSON_CASES = {  # what gRPC cannot get wrong
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", JSON_CASES)
-def test_bad_json(name: str) -> None:
-    document, field, value, fix = JSON_CASES[name]
+@pytest.mark.parametrize(("document", "field", "value", "fix"), JSON_CASES.values(), ids=JSON_CASES)
+def test_bad_json(document: Any, field: str, value: str, fix: str) -> None:
     body = document if isinstance(document, bytes) else json.dumps(document).encode()
     error = problem("http", body, "application/json")
     assert (error.kind, error.field) == ("invalid-request", field)
