@@ -64,6 +64,11 @@ def scene_of(points: np.ndarray, **fields: object) -> Scene:
     return Scene(**plain | fields)
 
 
+def grid(*axes: object) -> np.ndarray:
+    """All points (N, 3) with these coordinates along x, y and z."""
+    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+
+
 def random_hands(count: int, seed: int, reach: float = 0.2) -> np.ndarray:
     """Poses (count, 4, 4) turned at random, not further than `reach` along each axis."""
     rng = np.random.default_rng(seed)

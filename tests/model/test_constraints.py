@@ -17,7 +17,7 @@ from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Detection, Grasp
 
-from .scenes import box_on_table, detector
+from .scenes import box_on_table, detector, grid
 
 CASES = 75  # for each seed
 ROWS = 1500  # of the cloud
@@ -307,7 +307,7 @@ def check_collision(fields: dict, found: Detection, grasp: Grasp, gripper: Gripp
 
 def lattice(box: dict) -> np.ndarray:
     """Points (343, 3) in a box of a request."""
-    steps = np.stack(np.meshgrid(*[np.linspace(-1, 1, 7)] * 3), -1).reshape(-1, 3)
+    steps = grid(*[np.linspace(-1, 1, 7)] * 3)
     if box["kind"] == "oriented_box":
         turn = Rotation.from_quat(box["quaternion"])
         return turn.apply(steps * box["half_extents"]) + box["center"]

@@ -26,7 +26,7 @@ from edgegrasp_training.recipes import build_network
 
 from . import rendered
 from .rendered import FOCAL_LENGTH, HEIGHT, WIDTH, box, boxes_on_table, camera, render, table
-from .scenes import PANDA, TINY, box_on_table, detector, scene_of
+from .scenes import PANDA, TINY, box_on_table, detector, grid, scene_of
 
 CLOUD = box_on_table()
 ASKED = {"viewpoint": (0.3, 0.0, 0.5), "support": {"normal": (0.0, 0.0, 1.0), "offset": 0.0}}
@@ -224,7 +224,7 @@ def test_where_every_hand_collides_further_points_are_tried_and_hands_are_marked
 
 def test_hands_stay_above_the_support_that_is_seen_not_the_one_that_is_given() -> None:
     cloud = box_on_table(table=True, size=(0.03, 0.03, 0.02))
-    ends = np.stack(np.meshgrid(*PANDA.open_boxes[-1].T), axis=-1).reshape(-1, 3)  # of a finger
+    ends = grid(*PANDA.open_boxes[-1].T)  # of a finger
     for offset in (0.0, -0.006):
         found = detect(cloud, support={"normal": (0, 0, 1), "offset": offset}, min_score=0.0)
         assert found.grasps
@@ -345,10 +345,10 @@ def test_a_device_is_chosen_only_where_it_is(monkeypatch, gpus, name, device) ->
     ids=["behind a plate", "an end of it", "beside it", "before it", "on both sides", "unknown"],
 )
 def test_a_palm_in_space_that_no_camera_saw_counts_as_colliding(cameras, edge, blocked) -> None:
-    y, z = np.meshgrid(np.arange(edge, 0.2, 0.004), np.arange(-0.2, 0.3, 0.004))
-    plate = np.stack([np.full_like(y, -0.1), y, z], axis=-1).reshape(-1, 3).astype(np.float32)
+    plate = grid([-0.1], np.arange(edge, 0.2, 0.004), np.arange(-0.2, 0.3, 0.004))
     viewpoints = np.array([(x, 0.0, 0.0) for x in cameras], np.float32).reshape(-1, 3)
-    behind, hand = scene_of(plate, viewpoints=viewpoints), np.eye(4, dtype=np.float32)[None]
+    behind = scene_of(plate.astype(np.float32), viewpoints=viewpoints)
+    hand = np.eye(4, dtype=np.float32)[None]
     assert collides(behind, hand, np.float32([0.04]), PANDA, Collision()).tolist() == [blocked]
 
 
@@ -413,8 +413,8 @@ def test_a_hand_among_good_ones_comes_before_a_lone_one_that_is_hardly_better() 
 
 
 def test_a_long_approach_and_retreat_are_checked_to_their_ends() -> None:
-    wall = np.stack(np.meshgrid(0.4, np.arange(-0.3, 0.3, 0.004), np.arange(0, 0.3, 0.004)), -1)
-    cloud = np.concatenate([CLOUD, wall.reshape(-1, 3).astype(np.float32)])
+    wall = grid([0.4], np.arange(-0.3, 0.3, 0.004), np.arange(0, 0.3, 0.004))
+    cloud = np.concatenate([CLOUD, np.float32(wall)])
     sent = CloudInput(cloud, segment_ids=(np.arange(len(cloud)) < len(CLOUD)).astype(int))
     aside = {"cones": [{"direction": (-1, 0, 0), "max_angle": 0.2}]}
     for rule, free in (
@@ -445,8 +445,7 @@ def straight_down(points: np.ndarray) -> list[Grasp]:
 @pytest.mark.parametrize("turn", [0.0, 0.5])
 def test_a_box_is_grasped_across_its_edges(turn: float) -> None:
     sides = [np.linspace(-side / 2, side / 2, round(side / 0.004) + 1) for side in (0.05, 0.12)]
-    x, y = (grid.ravel() for grid in np.meshgrid(*sides))  # a point every 4 mm
-    top = Rotation.from_euler("z", turn).apply(np.stack([x, y, 0 * x + TOP], axis=1))
+    top = Rotation.from_euler("z", turn).apply(grid(*sides, [TOP]))  # a point every 4 mm
     straight = straight_down(top + np.random.default_rng(0).normal(0.0, 0.0003, top.shape))
     assert len(straight) > 20
     assert all(grasp.collision_free for grasp in straight)

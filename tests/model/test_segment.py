@@ -21,7 +21,7 @@ from edgegrasp_model.scene.support import ViewedPoints, find_support, heights_ov
 from edgegrasp_results import Detection
 
 from .rendered import SolidBox, box, boxes_on_table, camera, render, seen_box, table, to_world
-from .scenes import SEED, detector
+from .scenes import SEED, detector, grid
 
 AROUND = ["floor", "wall", "carton", "edge"]  # of the table, near the objects
 ABOVE = camera(0.8, -1.5, 0.7)
@@ -272,8 +272,7 @@ def test_a_segment_for_every_pixel_takes_no_more_approach_points() -> None:
 
 
 def test_objects_that_one_of_three_views_shows_as_one_stay_apart() -> None:
-    grid = np.stack(np.meshgrid(*[np.arange(0.0, 0.04, 0.002)] * 2), axis=-1).reshape(-1, 2)
-    left = np.pad(grid, ((0, 0), (0, 1)))
+    left = grid(*[np.arange(0.0, 0.04, 0.002)] * 2, [0.0])
     both = np.concatenate([left, left + np.array([0.048, 0, 0])]).astype(np.float32)
     seen = np.tile(both, (3, 1))
     number = np.repeat([0, 0, 1, 2, 3, 4], len(left))

@@ -14,7 +14,7 @@ from edgegrasp_model.options import Collision, parse_options
 from edgegrasp_model.scene.cloud import pose_matrix
 from edgegrasp_results import Evaluation, Grasp
 
-from .scenes import PANDA, scene_of
+from .scenes import PANDA, grid, scene_of
 
 NOTHING = np.zeros((9, 3), np.float32)  # points in one place
 
@@ -69,8 +69,7 @@ def test_a_can_does_not_turn_with_a_camera_that_goes_around_it() -> None:
 
 
 def test_all_points_of_a_large_object_belong_to_it() -> None:
-    places = np.stack(np.meshgrid(np.arange(0, 0.4, 0.0045), np.arange(0, 0.3, 0.0045)), axis=-1)
-    points = np.pad(places.reshape(-1, 2), ((0, 0), (0, 1))).astype(np.float32)
+    points = grid(np.arange(0, 0.4, 0.0045), np.arange(0, 0.3, 0.0045), [0.0]).astype(np.float32)
     surface = seen(points, np.broadcast_to([0, 0, 1], points.shape))
     assert len(surface.near(following.sampled(points).astype(np.float64))) > 0.99 * len(points)
 

@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 from tests.model import scenes
+from tests.model.scenes import grid
 
 from edgegrasp_model.options import SupportPlane, parse_options
 from edgegrasp_model.scene.cloud import CanonicalFrame, pose_matrix
@@ -13,11 +14,6 @@ BOXES = ((0.5, 0.0, 0.05), (0.55, 0.2, 0.03), (0.45, -0.2, 0.04))  # x, y, half 
 HALF = 0.02  # metres
 # T_base_cloud of a cloud whose frame is turned and moved.
 TURNED = pose_matrix(Rotation.from_euler("xyz", (0.3, -0.2, 1.0)).as_matrix(), (0.2, -0.3, 0.5))
-
-
-def grid(*axes):
-    """All points (N, 3) with these coordinates."""
-    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
 
 
 def surface(x, y, half_height):

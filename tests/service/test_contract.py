@@ -132,9 +132,9 @@ START_UP = {"InvalidCheckpoint", "InvalidDevice", "InvalidGripper", "InvalidSett
 START_UP |= {"AddressInUse"}
 
 
-async def ask(running, cloud) -> tuple[httpx.Response, aio.AioRpcError]:
-    """What both transports tell of a fault; it is told to the next two requests."""
-    fault = (running.stages.folder / "fault-prepare").read_text()
+async def ask(running, cloud, fault: str) -> tuple[httpx.Response, aio.AioRpcError]:
+    """What both transports tell of a fault."""
+    running.stages.fail("prepare", fault)
     response = await running.http().post("/v1/grasps", json={"points": cloud.tolist()})
     running.stages.fail("prepare", fault)
     with pytest.raises(aio.AioRpcError) as caught:
@@ -144,8 +144,7 @@ async def ask(running, cloud) -> tuple[httpx.Response, aio.AioRpcError]:
 
 async def test_every_error_of_the_table(running, cloud) -> None:
     for number, (kind, (code, http_status)) in enumerate(STATUS.items(), 1):
-        running.stages.fail("prepare", kind_of(kind))
-        response, status = await ask(running, cloud)
+        response, status = await ask(running, cloud, kind_of(kind))
         assert (response.status_code, status.code().name) == (http_status, code)
         problem = response.json()
         trailers = dict(status.trailing_metadata())
@@ -194,8 +193,7 @@ def check_google_details(data: bytes, ours: grasp_pb2.ErrorDetail) -> None:
     ],
 )
 async def test_unforeseen_errors_tell_nothing(running, cloud, fault: str, expected, caplog) -> None:
-    running.stages.fail("prepare", fault)
-    response, status = await ask(running, cloud)
+    response, status = await ask(running, cloud, fault)
     assert (response.status_code, status.code()) == expected
     assert "secret" not in response.text + (status.details() or "")
     await running.until(

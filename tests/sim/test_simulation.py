@@ -30,9 +30,7 @@ def cube_at(x: float, y: float, z: float = 0.075) -> ObjectPlacement:
 
 def top_down(x: float, y: float, tip: float) -> np.ndarray:
     """A hand that looks straight down with its fingertips at (x, y, tip), closing along y."""
-    T = np.diag([1.0, -1.0, -1.0, 1.0])
-    T[:3, 3] = (x, y, tip + FINGERTIP)
-    return T
+    return translation(x, y, tip + FINGERTIP) @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def test_a_grasp_that_holds_nothing_says_so_and_moves_nothing(simulation) -> None:
