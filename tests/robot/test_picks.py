@@ -1,6 +1,7 @@
 import time
 from dataclasses import replace
 from itertools import count
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("roboplan", reason="the extra robot is not installed")
 
 from tests.checks import refusal
-from tests.robot.arms import BOXES, HALF, TURNED, grid, picks_of, scene_of, surface
+from tests.model.scenes import grid
+from tests.robot.arms import BOXES, HALF, TURNED, picks_of, scene_of, surface
 
 from edgegrasp_model.gripper import HALF_TURN
 from edgegrasp_model.options import parse_options
@@ -117,19 +119,15 @@ def test_searches_without_a_path_end(fr3, monkeypatch):
     """As from a start that is shut in, where the planner would go on for ever."""
     searched = []
 
-    class Lost:
-        def __init__(self, scene, options):
-            self.seconds = options.max_planning_time
-
-        def setRngSeed(self, seed):  # noqa: N802
-            pass
-
-        def plan(self, start, end):
-            searched.append(self.seconds)
-            time.sleep(self.seconds)
+    def lost(scene, options):
+        def plan(start, end):
+            searched.append(options.max_planning_time)
+            time.sleep(options.max_planning_time)
             raise RuntimeError
 
-    monkeypatch.setattr("edgegrasp_robot.picks.RRT", Lost)
+        return Mock(plan=plan)
+
+    monkeypatch.setattr("edgegrasp_robot.picks.RRT", lost)
     monkeypatch.setattr("edgegrasp_robot.picks.PATH_SECONDS", 0.1)
     detection = picks_of(fr3)
     assert detection.counts["reachable"] == len(searched) == len(BOXES)

@@ -146,35 +146,31 @@ def test_a_depth_image_with_its_camera(client, kind, encoding) -> None:
     np.testing.assert_allclose(*both, atol=1e-6)
 
 
-class Asked:
-    """In the place of a client: keeps what was asked, and answers always the same."""
-
-    def __init__(self, answer: Any) -> None:
-        self._answer = answer
-
-    def detect(self, cloud: Any = None, **given: Any) -> Any:
-        self.cloud, self.given = cloud, given
-        return self._answer
-
-
 @pytest.fixture
-def asked(client, cloud) -> Asked:
-    return Asked(replace(client.detect(cloud, top_k=1), grasps=[]))
+def asked(client, cloud) -> Mock:
+    """In the place of a client: keeps what was asked, and answers always the same."""
+    answer = replace(client.detect(cloud, top_k=1), grasps=[])
+    return Mock(detect=Mock(return_value=answer))
+
+
+def given(client: Mock) -> dict[str, Any]:
+    """What it was last asked beside the cloud."""
+    return client.detect.call_args.kwargs
 
 
 def test_frames_say_where_the_camera_stands_and_what_is_up(asked, cloud) -> None:
     settings = Settings(camera_frame="camera", gravity_frame="base")
     detect(asked, Scene(make_cloud(cloud, "base")), settings)
-    np.testing.assert_allclose(asked.given["viewpoint"], [0.4, 0.0, 0.7])
-    np.testing.assert_allclose(asked.given["up"], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(given(asked)["viewpoint"], [0.4, 0.0, 0.7])
+    np.testing.assert_allclose(given(asked)["up"], [0, 0, 1], atol=1e-12)
     detect(asked, Scene(make_cloud(cloud)), settings, {"viewpoint": [1, 2, 3]})
-    assert asked.given["viewpoint"] == [1, 2, 3]
-    np.testing.assert_allclose(asked.given["up"], T_base_camera[2, :3], atol=1e-12)
+    assert given(asked)["viewpoint"] == [1, 2, 3]
+    np.testing.assert_allclose(given(asked)["up"], T_base_camera[2, :3], atol=1e-12)
     in_base = Settings(target_frame="base")
     detect(asked, Scene(make_cloud(cloud)), in_base)
-    np.testing.assert_allclose(asked.given["up"], T_base_camera[2, :3], atol=1e-12)
+    np.testing.assert_allclose(given(asked)["up"], T_base_camera[2, :3], atol=1e-12)
     detect(asked, Scene(make_cloud(cloud)), replace(in_base, gravity_frame="none"))
-    assert "up" not in asked.given
+    assert "up" not in given(asked)
 
 
 @pytest.mark.parametrize("encoding", ["mono8", "32SC1", "rgb8"])
@@ -186,7 +182,7 @@ def test_a_mask_says_where(asked, encoding) -> None:
         pixels = np.stack([pixels * 0, pixels, pixels * 0], axis=-1)
     scene = Scene(None, make_image(DEPTH), CAMERA, make_image(pixels, encoding))
     detect(asked, scene)
-    (inside,) = asked.given["contact_region"]["include"]
+    (inside,) = given(asked)["contact_region"]["include"]
     np.testing.assert_array_equal(inside["mask"], wanted)
 
 
@@ -199,17 +195,19 @@ def test_an_object_and_its_scene_come_apart(asked, bigendian):
     cluster = make_cloud(in_base, "base", bigendian)
     scene = Scene(make_cloud(organised, bigendian=bigendian))
     detect(asked, scene, object_cloud=cluster)
-    np.testing.assert_allclose(asked.cloud[asked.given["segment_ids"] == 1], wanted, atol=1e-5)
-    assert len(wanted) + 100 < len(asked.cloud) <= 150
+    (both,) = asked.detect.call_args.args
+    np.testing.assert_allclose(both[given(asked)["segment_ids"] == 1], wanted, atol=1e-5)
+    assert len(wanted) + 100 < len(both) <= 150
 
     detect(asked, Scene(depth=make_image(DEPTH), camera=CAMERA), object_cloud=cluster)
-    around = asked.cloud[asked.given["segment_ids"] == 0]
+    (both,) = asked.detect.call_args.args
+    around = both[given(asked)["segment_ids"] == 0]
     assert len(around) == DEPTH.size
     column = 60.0 * around[:, 0] / around[:, 2] + 15.5
     np.testing.assert_allclose(column.reshape(24, 32)[0], np.arange(32), atol=1e-3)
 
     detect(asked, Scene(), object_cloud=cluster)
-    assert asked.cloud is cluster
+    assert asked.detect.call_args.args[0] is cluster
 
 
 def test_no_grasp_and_an_aborted_goal_say_why(asked, cloud) -> None:
@@ -278,7 +276,7 @@ def test_images_of_several_cameras_are_one_cloud(asked) -> None:
         bridge.detect(asked, inbox.scene(0.0), Settings(gravity_frame="base"), {}, tf2)
         asked_for = {(*each.args[:2], each.args[2].sec) for each in tf2.call_args_list}
         assert {("base", "camera", 12), ("base", "link8", 11)} < asked_for
-        poses = [image["T_cloud_camera"] for image in asked.given["depth_images"]]
+        poses = [image["T_cloud_camera"] for image in given(asked)["depth_images"]]
         expected = [np.eye(4), np.linalg.inv(T_base_camera) @ PANDA_LINK8]
         np.testing.assert_allclose(poses, expected, atol=1e-12)
 
@@ -335,15 +333,14 @@ ARM = Robot(
 
 
 @pytest.fixture
-def planning(client, cloud) -> Asked:
+def planning(client, cloud) -> Mock:
     """A client of a server with an arm, which plans a motion to the first grasp."""
     found = client.detect(cloud, top_k=1)
     rows = np.arange(14.0).reshape(7, 2)
     motion = ArmTrajectory(["a", "b"], 0.75 * np.arange(7), rows, -rows, 1, 3, 5)
     arm = ArmPlan(True, rows[1], rows[3], motion)
-    asked = Asked(replace(found, grasps=[replace(found.grasps[0], arm=arm)]))
-    asked.robots = Mock(return_value=[ARM])
-    return asked
+    answer = replace(found, grasps=[replace(found.grasps[0], arm=arm)])
+    return Mock(detect=Mock(return_value=answer), robots=Mock(return_value=[ARM]))
 
 
 def test_the_best_pick_is_a_trajectory_of_the_arm(planning, cloud) -> None:
@@ -354,7 +351,7 @@ def test_the_best_pick_is_a_trajectory_of_the_arm(planning, cloud) -> None:
         assert not inbox.take("joints", sent("sensor_msgs/msg/JointState", state), 1.0)
     _, options = bridge.read_parameters(bridge.parameters() | {"options.robot": "arm"})
     found = detect(planning, inbox.scene(1.0), options=options)
-    robot, first = planning.given["robot"], 0
+    robot, first = given(planning)["robot"], 0
     assert robot["joints"] == [0.1, 0.2]
     np.testing.assert_allclose(np.reshape(robot["T_base_cloud"], (4, 4)), T_base_camera)
     for fields, last in zip(bridge.trajectories(found), (3, 5, 6), strict=True):
@@ -371,7 +368,7 @@ def test_a_known_arm_is_where_it_is_before_a_scene(planning, cloud) -> None:
     """The cloud of an action's object may be the only one."""
     scene, options = Scene(joints={"a": 0.1, "b": 0.2}), {"robot": "arm"}
     detect(planning, scene, options=options, object_cloud=make_cloud(cloud))
-    assert planning.given["robot"]["joints"] == [0.1, 0.2]
+    assert given(planning)["robot"]["joints"] == [0.1, 0.2]
     planning.robots.reset_mock()  # they are known until there is an error
     detect(planning, scene, options=options, object_cloud=make_cloud(cloud))
     planning.robots.assert_not_called()
