@@ -16,9 +16,9 @@ ENCODINGS = {"<f8": "64FC1", "<f4": "32FC1", "<u2": "16UC1"}
 PLY = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-def npy(array: np.ndarray, **options: object) -> bytes:
+def npy(array: np.ndarray) -> bytes:
     stream = io.BytesIO()
-    np.save(stream, array, **options)
+    np.save(stream, array)
     return stream.getvalue()
 
 

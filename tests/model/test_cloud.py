@@ -118,8 +118,8 @@ def test_an_image_of_a_wide_angle_camera_is_seen_from_the_origin() -> None:
         assert assumed_viewpoint(check_cloud(cloud), DetectOptions(), []) != (0.0, 0.0, 0.0)
 
 
-def rows(count: int = 40, seed: int = 0, **fields: object) -> CheckedCloud:
-    points = np.random.default_rng(seed).uniform(0, 0.03, (count, 3)).astype(np.float32)
+def rows(seed: int = 0, **fields: object) -> CheckedCloud:
+    points = np.random.default_rng(seed).uniform(0, 0.03, (40, 3)).astype(np.float32)
     return check_cloud(CloudInput(points, **fields))
 
 
@@ -204,8 +204,8 @@ def pose(seed: int) -> np.ndarray:
     return random_hands(1, seed, reach=1.0)[0].astype(np.float64)
 
 
-def depth_of(shape: tuple[int, int] = (24, 32), seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(0.3, 0.9, shape)
+def depth_of(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0.3, 0.9, (24, 32))
 
 
 def image(depth: np.ndarray, T_cloud_camera: np.ndarray) -> dict[str, Any]:

@@ -84,8 +84,7 @@ def picks_of(
     **given,
 ):
     """The detection with the arm's plans, the table raised by metres over the arm's base."""
-    scene, detection = scene_of(robot, T_base_cloud, **given)
-    scene, detection = changed(scene, detection)
+    scene, detection = changed(*scene_of(robot, T_base_cloud, **given))
     T_base_cloud = T_base_cloud.copy()
     T_base_cloud[2, 3] += raised
     asked = {"name": robot.name, "T_base_cloud": T_base_cloud.tolist(), "plan": plan}

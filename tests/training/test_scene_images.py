@@ -1,6 +1,7 @@
 """Labelled depth images, and a few steps of training on them."""
 
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -49,12 +50,9 @@ def test_the_same_scene_is_made_again_from_its_seed(pool: list[PoolMesh]) -> Non
         np.testing.assert_array_equal(mesh[0], again[0])
 
 
-def test_a_file_is_made_and_learned_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    few = {"SCENES_PER_FILE": 2, "NUM_POOL": 12, "make_arms": lambda rng: []}
-    for name, value in few.items():
-        monkeypatch.setattr(scene_images, name, value)
-    for name, value in {"HELD_OUT": 1, "BATCH": 2}.items():
-        monkeypatch.setattr(scene_training, name, value)
+@patch.multiple(scene_images, SCENES_PER_FILE=2, NUM_POOL=12, make_arms=lambda rng: [])
+@patch.multiple(scene_training, HELD_OUT=1, BATCH=2)
+def test_a_file_is_made_and_learned_from(tmp_path: Path) -> None:
     mesh = tmp_path / "block.obj"
     mesh.write_text(block_obj(0.05, 0.04, 0.06))
     generate(tmp_path / "data", [mesh], seed=1, numbers=range(2))
