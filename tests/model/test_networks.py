@@ -15,10 +15,9 @@ from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud, unit
-from edgegrasp_model.scene.scene import Surroundings
 from edgegrasp_training.recipes import RECIPES, build_network
 
-from .scenes import PANDA, SEED, TINY
+from .scenes import PANDA, SEED, TINY, VIEW, scene_of
 
 SMALL, HAND = RECIPES["edgegrasp-small"], RECIPES["edgegrasp-plus"]
 architectures = pytest.mark.parametrize("architecture", ["edgegrasp", "vn-edgegrasp"])
@@ -143,11 +142,9 @@ def look(seed: int) -> HandBatch:
     points = (rng.uniform(-0.5, 0.5, (150, 3)) * (0.06, 0.05, 0.07)).astype(np.float32)
     cloud = Cloud(points, unit(points))
     candidates, _ = edge_grasps(cloud, *rng.integers(150, size=(2, 60)), PANDA)
-    up, camera = np.float32([0.0, 0.0, 1.0]), np.float32([[0.3, 0.2, 0.5]])
     support = SupportPlane(normal=(0.0, 0.0, 1.0), offset=-0.05)
-    at_side, number = np.zeros(150, dtype=bool), np.zeros(150, dtype=np.int64)
-    around = Surroundings(cloud, up, support, camera, at_side, number)
-    return HandBatch.of_hands(around, candidates, PANDA, 400)
+    scene = scene_of(points, cloud=cloud, support=support, viewpoints=np.float32([VIEW]))
+    return HandBatch.of_hands(scene, candidates, PANDA, 400)
 
 
 def hand_scores(batch: HandBatch, config: NetworkConfig = TINY["hand"]) -> torch.Tensor:
