@@ -177,10 +177,12 @@ CASES = {
 def test_malformed(case: Malformed, transport: str) -> None:
     body = case.as_json() if transport == "http" else case.as_message()
     error = problem(transport, body, "application/json", scores=case.scores)
-    assert_told(error, case.field, case.value, case.fix, case.kind)
+    assert_refused_as(error, case.field, case.value, case.fix, case.kind)
 
 
-def assert_told(error: Problem, field: str, value: str, fix="", kind="invalid-request") -> None:
+def assert_refused_as(
+    error: Problem, field: str, value: str, fix="", kind="invalid-request"
+) -> None:
     assert (error.kind, error.field) == (kind, field)
     assert value in error.value
     assert fix in error.fix
@@ -225,7 +227,7 @@ JSON_CASES = {  # what gRPC cannot get wrong
 @pytest.mark.parametrize(("document", "field", "value", "fix"), JSON_CASES.values(), ids=JSON_CASES)
 def test_bad_json(document: Any, field: str, value: str, fix: str) -> None:
     body = document if isinstance(document, bytes) else json.dumps(document).encode()
-    assert_told(problem("http", body, "application/json"), field, value, fix)
+    assert_refused_as(problem("http", body, "application/json"), field, value, fix)
 
 
 def test_the_shortest_points_and_edges_there_are() -> None:
@@ -313,7 +315,7 @@ def test_a_good_form() -> None:
 )
 def test_bad_messages(body: Any, field: str, value: str) -> None:
     body = body if isinstance(body, bytes) else body.SerializeToString()
-    assert_told(problem("grpc", body), field, value)
+    assert_refused_as(problem("grpc", body), field, value)
 
 
 @pytest.mark.parametrize(
@@ -327,7 +329,7 @@ def test_unknown_fields_in_a_message(field: str) -> None:
     for name in field.split(".")[1:]:
         part = part.add() if name == "0" else getattr(part, name)
     part.MergeFromString(b"\xfa\x3f\x01a")  # number 1023, one byte
-    assert_told(problem("grpc", message.SerializeToString()), field, "1023")
+    assert_refused_as(problem("grpc", message.SerializeToString()), field, "1023")
 
 
 MANY = 200_000
