@@ -1,12 +1,10 @@
 """Data of depth cameras: depth images, PointCloud2, cloud files and poses; needs only numpy."""
 
-from typing import Any
-
 
 class EdgeGraspError(Exception):
     """Base of every error that the project raises on purpose, except the client's."""
 
-    def __reduce__(self) -> tuple[Any, ...]:  # `args` are not the arguments of `__init__`
+    def __reduce__(self) -> tuple[object, ...]:  # `args` are not the arguments of `__init__`
         return Exception.__new__, (type(self), *self.args), vars(self)
 
 
