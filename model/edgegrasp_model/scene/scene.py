@@ -197,7 +197,9 @@ def with_marked(number: Int64, count: int, sent: CheckedCloud, options: DetectOp
     """
     regions = filter(None, (options.approach_region, options.contact_region))
     shapes = [shape for region in regions for shape in region.include if isinstance(shape, Rows)]
-    rows = np.any([np.zeros(len(number), bool), *(_listed(one, sent) for one in shapes)], axis=0)
+    if not shapes:
+        return number
+    rows = np.any([_listed(shape, sent) for shape in shapes], axis=0)
     size = np.bincount(number[number >= 0], minlength=count)
     marked = np.bincount(number[rows & (number >= 0)], minlength=len(size))
     return number if (2 * marked > size).any() else np.where(rows, len(size), number)
