@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import product
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
 from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
 from edgegrasp_model.kernels import compiled, distance_behind
 
@@ -89,10 +90,20 @@ def leaves_image(
     """Which hands (E,) reach out of the image on the approach, into unknown surroundings."""
     places = np.stack(_palm_ways(gripper))  # (slices, S, 3)
     P_image_hand = P_image_cloud @ T_cloud_hand.astype(np.float64)  # (E, 3, 4)
-    seen = P_image_hand[:, :, :3] @ places.reshape(-1, 3).T + P_image_hand[:, :, 3:]
-    outside = (np.abs(seen[:, :2]) > seen[:, 2:]).any(axis=1)  # (E, slices * S)
+    # Most hands have even the corners of the box around these points inside the image.
+    sides = zip(places.min(axis=(0, 1)), places.max(axis=(0, 1)), strict=True)
+    corners = np.array(list(product(*sides)))
+    leaves: Bools = np.asarray(_outside_image(P_image_hand, corners).any(axis=1))
+    outside = _outside_image(P_image_hand[leaves], places.reshape(-1, 3))
     shares = outside.reshape(-1, *places.shape[:2]).mean(axis=2)
-    return np.asarray(shares.max(axis=1) > OUTSIDE_SHARE)
+    leaves[leaves] = shares.max(axis=1) > OUTSIDE_SHARE
+    return leaves
+
+
+def _outside_image(P_image_hand: Float64, points: Floats) -> Bools:
+    """Which points (S, 3) of hands project beyond the image, (E, S), by (E, 3, 4) matrices."""
+    seen = P_image_hand[:, :, :3] @ points.T + P_image_hand[:, :, 3:]
+    return np.asarray((np.abs(seen[:, :2]) > seen[:, 2:]).any(axis=1))
 
 
 def unseen(behind: Float32) -> Float32:
