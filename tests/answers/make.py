@@ -16,8 +16,9 @@ import numpy as np
 import torch
 
 from edgegrasp_model.detector import ModelCatalogue
-from edgegrasp_model.networks import layers
+from edgegrasp_model.networks import hand
 from edgegrasp_model.options import parse_options
+from edgegrasp_model.scene import segment
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Grasp
 
@@ -164,8 +165,10 @@ def answer(case: Case, catalogue: ModelCatalogue) -> Any:
     """The detection or scoring of a case, without a server, in float32 on every processor."""
     cloud, asked = CloudInput(case.points, **case.beside), parse_options(case.options)
     detector = catalogue.get(asked.model)
-    slow = patch.object(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
-    with slow, patch.object(layers, "FAST", torch.float32):
+    with (
+        patch.object(segment, "FAST", torch.float32),
+        patch.object(hand, "FAST", torch.float32),
+    ):
         if case.given:
             return detector.score(cloud, asked, **case.given)
         return detector.detect(cloud, asked)

@@ -25,6 +25,7 @@ from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks import layers
 from edgegrasp_model.networks.config import HAND_DESCRIPTION_SIZE, NetworkConfig
 from edgegrasp_model.scene.cloud import UP, unit
+from edgegrasp_model.scene.network import FAST
 from edgegrasp_model.scene.scene import Surroundings
 from edgegrasp_model.scene.support import heights_over
 from edgegrasp_model.unseen import unseen_space, visible_extents
@@ -113,7 +114,7 @@ class HandNet(nn.Module):
         """Logits (E,) of success; in training, `left_out` draws the inputs that dropout removes."""
         known = batch.description[:, : self.config.description_size]
         description = (known - self.mean) / self.std  # (E, F)
-        encoder, chunks = layers.packed(self.point_encoder, layers.FAST), []
+        encoder, chunks = layers.packed(self.point_encoder, FAST), []
         for points, count in layers.in_chunks(HANDS_AT_A_TIME, batch.points, batch.point_count):
             positions, normals = torch.split(points, 3, dim=2)
             encoded = encoder(torch.cat((positions / POINT_UNIT, normals), dim=2))  # (E, P, C)
@@ -130,7 +131,7 @@ class HandNet(nn.Module):
         if left_out is not None:
             draws = torch.rand(seen.shape, generator=left_out, device=left_out.device)
             seen = seen * (draws >= DROPOUT).to(seen.device) / (1.0 - DROPOUT)
-        classifier = layers.packed(self.classifier, layers.FAST)
+        classifier = layers.packed(self.classifier, FAST)
         logits = layers.by_chunks(classifier, seen, layers.EDGE_ROWS)
         return logits.squeeze(1)  # (E,)
 

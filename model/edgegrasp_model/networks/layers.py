@@ -21,9 +21,6 @@ Layer = Callable[[Tensor], Tensor]
 
 # Products of fewer rows are summed in an order that depends on their number.
 MIN_ROWS = 32
-# For networks that tolerate its rounding, on processors that multiply it twice as fast.
-_FAST = torch.cpu._is_avx512_bf16_supported() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
-FAST = torch.bfloat16 if _FAST else torch.float32
 ROWS = 512  # points at a time: 1,024 channels of them stay in cache
 CONVOLVED = 128  # points at a time in a graph convolution, each with its neighbours
 EDGE_ROWS = 256  # edge grasps at a time

@@ -10,6 +10,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from scipy import ndimage
 from torch import Tensor, nn
 from torch.nn import functional
@@ -31,6 +32,9 @@ CLASSES = ("other", "support", "object")
 INPUT_CHANNELS = 12  # of `scene_features`
 LAYER_WIDTHS = (16, 32, 48, 64, 96, 128)  # channels at each resolution, the output's first
 VOTE_UNIT = 0.05  # metres
+# For networks that tolerate its rounding, on processors that multiply it twice as fast.
+_FAST = torch.cpu._is_avx512_bf16_supported() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+FAST = torch.bfloat16 if _FAST else torch.float32
 
 
 class SceneOutput(NamedTuple):

@@ -20,7 +20,7 @@ from torch.nn import functional
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.scene.cloud import CheckedCloud, grid_cells, subsample, unit
-from edgegrasp_model.scene.network import NEAREST_DEPTH, SceneNet, range_image, scene_features
+from edgegrasp_model.scene.network import FAST, NEAREST_DEPTH, SceneNet, range_image, scene_features
 
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 _ALONE = RLock()  # held while PyTorch uses one thread
@@ -147,7 +147,7 @@ def run_network(
     footprint: float,  # width of a pixel at a depth of one metre, metres
 ) -> tuple[Pixels, Float64]:
     """A network's output for a range image, and its estimate of up (3,); camera frame."""
-    fast = torch.autocast("cpu", torch.bfloat16, enabled=torch.cpu._is_avx512_bf16_supported())
+    fast = torch.autocast("cpu", torch.bfloat16, enabled=FAST is torch.bfloat16)
     with torch.inference_mode(), one_thread(), fast:
         output = network(torch.from_numpy(features)[None])
         classes = output.classes[0].softmax(dim=0).contiguous().numpy()
