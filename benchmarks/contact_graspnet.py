@@ -22,7 +22,7 @@ from torch import Tensor
 from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_lab.planners import request_options
 from edgegrasp_model.candidates.collision import collides
-from edgegrasp_model.candidates.edge_grasps import spread_out
+from edgegrasp_model.candidates.edge_grasps import coarse_to_fine_sample
 from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.scene.cloud import CloudInput
@@ -70,7 +70,7 @@ class ContactGraspNet:
         if len(row) == 0:
             return None
         best = row[score[row].argmax()]
-        T_world_hand = scene.frame.poses_in_cloud(T_hand[best])
+        T_world_hand = scene.frame.poses_to_cloud(T_hand[best])
         return PlannedGrasp(T_world_hand, float(score[best]), float(width[best]))
 
     def _grasps(self, points: Float32) -> tuple[Float32, Float32, Float32, Float32]:
@@ -78,7 +78,7 @@ class ContactGraspNet:
         places, feature = [points], [torch.empty(len(points), 0)]
         for level, (count, radii) in enumerate(LEVELS):
             here = places[-1]
-            centre = spread_out(here, count)
+            centre = coarse_to_fine_sample(here, count)
             scales = []
             for scale, radius in enumerate(radii):
                 near = _near(here, here[centre], radius)
@@ -130,7 +130,7 @@ class ContactGraspNet:
 
 def _points(scene: Scene, observation: Observation, rng: np.random.Generator) -> Float64:
     """The points around the objects, in the scene's frame: (N, 3), in random order."""
-    points = scene.frame.points(observation.cloud)
+    points = scene.frame.points_from_cloud(observation.cloud)
     objects = scene.cloud.points[scene.object_of_point >= 0]
     low, high = objects.min(axis=0) - AROUND, objects.max(axis=0) + AROUND
     if observation.table == "known" and scene.support is not None:

@@ -13,7 +13,7 @@ from edgegrasp_model.errors import UnknownModel
 from edgegrasp_model.given import check_edges, check_hand_poses
 from edgegrasp_model.gripper import choose_gripper, load_gripper
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.results import NoGrasp, Outcome, Pace
+from edgegrasp_model.results import NoGraspReason, Outcome, UnitCosts
 from edgegrasp_model.scene.cloud import CloudInput, check_cloud
 from edgegrasp_results import DebugInfo, Detection, Evaluation, Grasp, GripperOutline, Scoring
 
@@ -96,7 +96,7 @@ class DummyDetector:
             is_grasp = np.ones(len(poses), dtype=bool)
         scores = np.random.default_rng(options.seed).random(len(contacts), dtype=np.float32)
         evaluations = [
-            Evaluation(grasp, None) if one else Evaluation(None, NoGrasp.TOO_SHORT)
+            Evaluation(grasp, None) if one else Evaluation(None, NoGraspReason.TOO_SHORT)
             for grasp, one in zip(map(_top_down, contacts, scores.tolist()), is_grasp, strict=True)
         ]
         counts = {"points": len(checked.points), "scored": int(is_grasp.sum())}
@@ -106,7 +106,7 @@ class DummyDetector:
 class DummyCatalogue:
     """A catalogue with only the dummy detector."""
 
-    pace = Pace()
+    unit_costs = UnitCosts()
     _detector = DummyDetector()
 
     def get(self, name: str = "") -> DummyDetector:

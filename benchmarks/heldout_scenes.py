@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from typer import Option, run
 
 from edgegrasp_camera.arrays import Float64
-from edgegrasp_sim.camera import FARTHEST, look_at, points_of
-from edgegrasp_sim.engine import Intrinsics
+from edgegrasp_sim.camera import FAR_SHARE, look_at, unproject_to_world
+from edgegrasp_sim.engine import SimCamera
 from edgegrasp_sim.engine.with_pybullet import PybulletWorld
 from edgegrasp_sim.objects import CLUTTER, ObjectSet
 from edgegrasp_sim.scene import SceneObject, load_object, wait_for_rest
@@ -41,7 +41,7 @@ HANGING += ("quadruped/vision60.urdf", "aliengo/aliengo.urdf", "quadruped/spirit
 CLEAR = 0.015  # metres between a robot and the objects
 
 
-class Made(NamedTuple):
+class SceneAtRest(NamedTuple):
     """A scene at rest; the objects stand on z = 0."""
 
     support: int  # the body that carries the objects
@@ -51,7 +51,7 @@ class Made(NamedTuple):
     reach: float  # greatest distance of objects from the middle, metres
 
 
-class Maker:
+class SceneBuilder:
     """A world, with the objects and background of its scenes."""
 
     def __init__(self, objects: Path, rng: np.random.Generator) -> None:
@@ -133,24 +133,24 @@ class Maker:
                 self.objects.append(new)
                 wait_for_rest(self.world, self.objects, 1.5)
 
-    def table(self) -> Made:
+    def table(self) -> SceneAtRest:
         """Separate objects on a table with an edge near them."""
         size = self.rng.uniform(0.6, 1.4, size=2)
         top = self.box((*size, 0.04), (*self.rng.uniform(-0.15, 0.15, size=2), -0.02))
         self.room(self.rng.uniform(0.5, 0.9))
         self.background(int(self.rng.integers(1, 4)), 0.2)
         self.drop(int(self.rng.integers(3, 10)), (0.2, 0.18), 0.004, 0.6)
-        return Made(top, (15, 75), (190, 350), (0.5, 1.4), 0.3)
+        return SceneAtRest(top, (15, 75), (190, 350), (0.5, 1.4), 0.3)
 
-    def heap(self) -> Made:
+    def heap(self) -> SceneAtRest:
         """Objects in a heap on a table, or on a floor."""
         top = self.box((1.6, 1.2, 0.05), (0, 0, -0.025))
         self.room(self.rng.choice([0.05, self.rng.uniform(0.5, 0.9)]))
         self.background(int(self.rng.integers(0, 3)), 0.25)
         self.drop(int(self.rng.integers(7, 14)), (0.05, 0.05), 0.16, 0.0)
-        return Made(top, (0, 65), (190, 350), (0.45, 1.2), 0.3)
+        return SceneAtRest(top, (0, 65), (190, 350), (0.45, 1.2), 0.3)
 
-    def tray(self) -> Made:
+    def tray(self) -> SceneAtRest:
         """Objects on a tray with a low rim that stands on a table."""
         x, y = self.rng.uniform((0.32, 0.24), (0.5, 0.36)) / 2
         floor, rim = self.box((2 * x, 2 * y, 0.008), (0, 0, -0.004)), self.rng.uniform(0.01, 0.04)
@@ -159,9 +159,9 @@ class Maker:
         self.room(self.rng.uniform(0.5, 0.9))
         self.background(int(self.rng.integers(0, 3)), 0.3)
         self.drop(int(self.rng.integers(3, 9)), (x - 0.05, y - 0.05), 0.01, 0.5)
-        return Made(floor, (0, 65), (190, 350), (0.45, 1.1), max(x, y))
+        return SceneAtRest(floor, (0, 65), (190, 350), (0.45, 1.1), max(x, y))
 
-    def bin(self) -> Made:
+    def bin(self) -> SceneAtRest:
         """Objects poured into a bin, with or without a rim, its walls upright or sloped."""
         x, y = self.rng.uniform((0.28, 0.22), (0.6, 0.42)) / 2
         floor, deep = self.box((2 * x, 2 * y, 0.3), (0, 0, -0.15)), self.rng.uniform(0.06, 0.25)
@@ -169,9 +169,9 @@ class Maker:
         self.room(0.3)
         self.drop(int(self.rng.integers(4, 22)), (x / 2, y / 2), deep * 0.6, 0.0)
         near = max(0.45, 1.1 * deep + 0.3)
-        return Made(floor, (0, 35), (0, 360), (near, near + 0.6), max(x, y))
+        return SceneAtRest(floor, (0, 35), (0, 360), (near, near + 0.6), max(x, y))
 
-    def shelf(self) -> Made:
+    def shelf(self) -> SceneAtRest:
         """Objects in a compartment observed from the front, with other compartments around it."""
         wide, deep, high = self.rng.uniform((0.45, 0.25, 0.26), (0.9, 0.45, 0.45))
         board = self.rng.uniform(0.012, 0.03)
@@ -183,7 +183,7 @@ class Maker:
             self.box((wide, 0.01, 3 * high), (0, deep / 2, high / 2))
         self.room(1.0)
         self.drop(int(self.rng.integers(2, 7)), (wide / 2 - 0.06, deep / 2 - 0.05), 0.004, 0.6)
-        return Made(low, (55, 88), (245, 295), (0.5, 1.1), wide / 2)
+        return SceneAtRest(low, (55, 88), (245, 295), (0.5, 1.1), wide / 2)
 
     def walls(self, x: float, y: float, high: float, slope: float, thick: float) -> None:
         """Four walls around half extents x and y, which lean outward by `slope` degrees."""
@@ -197,12 +197,12 @@ class Maker:
             self.box(size, foot + lean.apply((0, 0, length / 2)), lean)
 
 
-def picture(maker: Maker, made: Made) -> dict[str, Float64]:
+def render_labelled_image(maker: SceneBuilder, made: SceneAtRest) -> dict[str, Float64]:
     """The image of a random depth camera, and its labels."""
     rng = maker.rng
     width, height = SIZES[int(rng.integers(len(SIZES)))]
     focal = width / 2 / np.tan(np.radians(rng.uniform(40, 75)) / 2)
-    camera = Intrinsics(width, height, float(focal), width / 2, height / 2, 0.1, FAR)
+    camera = SimCamera(width, height, float(focal), width / 2, height / 2, 0.1, FAR)
     polar, azimuth = np.radians(rng.uniform(*made.polar)), np.radians(rng.uniform(*made.azimuth))
     level = np.sin(polar) * np.array([np.cos(azimuth), np.sin(azimuth)])
     target = np.array([*rng.uniform(-0.05, 0.05, size=2), 0.05])
@@ -213,7 +213,7 @@ def picture(maker: Maker, made: Made) -> dict[str, Float64]:
     true, body = maker.world.render(T_world_camera, camera)
     depth = random_sensor(rng).apply(true, camera, rng)
     heights = np.full(true.shape, np.inf)
-    heights[true < FARTHEST * FAR] = points_of(true, T_world_camera, camera)[:, 2]
+    heights[true < FAR_SHARE * FAR] = unproject_to_world(true, T_world_camera, camera)[:, 2]
     label = ((body == made.support) & (np.abs(heights) < FLAT)).astype(np.uint8)
     for number, item in enumerate(maker.objects):
         label[body == item.body.uid] = FIRST + number
@@ -255,11 +255,11 @@ def main(
         rng = np.random.default_rng([seed, number, index])
         labels = np.zeros((1, 1))
         while labels.max() < FIRST or (labels == 1).mean() < SUPPORT:
-            maker = Maker(objects, rng)
+            maker = SceneBuilder(objects, rng)
             made = getattr(maker, KINDS[number])()
             for _ in range(int(rng.integers(1, 3)) if robots else 0):
                 maker.robot()
-            arrays = picture(maker, made)
+            arrays = render_labelled_image(maker, made)
             labels = arrays["labels"]
             maker.world.close()
         np.savez_compressed(output / f"{KINDS[number]}_{index:02d}.npz", **arrays)

@@ -18,7 +18,7 @@ RESULTS = Path(__file__).parent / "results"
 RUNS = 5
 
 
-def interleaved(
+def time_interleaved(
     variants: Mapping[str, Callable[[], object]],  # functions to run, by name
     # Processor time, which other work on the machine changes little; or wall-clock time.
     clock: Callable[[], float] = time.process_time,
@@ -40,7 +40,7 @@ def machine() -> dict[str, Any]:
 
     model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
     left, right = torch.rand(4096, 1024), torch.rand(1024, 1024)
-    product = statistics.median(interleaved({"product": lambda: left @ right})["product"])
+    product = statistics.median(time_interleaved({"product": lambda: left @ right})["product"])
     return {
         "processor": model[1] if model else platform.processor(),
         "cores": len(os.sched_getaffinity(0)),

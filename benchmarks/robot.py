@@ -18,7 +18,7 @@ from PIL import Image
 from edgegrasp_camera.depth import Intrinsics, metres, unproject
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.options import parse_options
-from edgegrasp_robot import Robot, load_robot, plan_picks, with_robot
+from edgegrasp_robot import Robot, load_robot, options_for_robot, plan_picks
 
 SAMPLE = "service/edgegrasp_service/playground/samples/seven_depth.png"
 FOCAL, SEEDS = 540.0, 20  # pixels; seeds
@@ -37,7 +37,7 @@ def measure(detector: GraspDetector, robot: Robot, cloud: Any, fields: dict[str,
     for seed in range(-1, SEEDS):  # the first warms up
         options = parse_options({"viewpoint": (0.0, 0.0, 0.0), "seed": max(seed, 0)} | fields)
         start = time.process_time()
-        prepared = detector.prepare(cloud, with_robot(options, robot))
+        prepared = detector.prepare(cloud, options_for_robot(options, robot))
         detection = detector.finish(prepared, detector.evaluate(prepared))
         detected = time.process_time()
         found = plan_picks(detection, prepared.scene, options, robot)

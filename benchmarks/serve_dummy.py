@@ -9,14 +9,14 @@ from pathlib import Path
 
 
 def main() -> None:
-    """Run `edgegrasp` with the dummy detector; given settings as JSON, run its nursery instead."""
-    from edgegrasp_service.worker import nursery, process
+    """Run `edgegrasp` with the dummy detector; with settings as JSON, its fork server."""
+    from edgegrasp_service.worker import fork_server, process
 
     if sys.argv[1].startswith("{"):
         dummy = runpy.run_path(str(Path(__file__).with_name("dummy.py")))
-        nursery.main(sys.argv[1], lambda settings: dummy["DummyCatalogue"]())
+        fork_server.main(sys.argv[1], lambda settings: dummy["DummyCatalogue"]())
         return
-    process.NURSERY_COMMAND = (sys.executable, "-P", __file__)
+    process.FORK_SERVER_COMMAND = (sys.executable, "-P", __file__)
     from edgegrasp_cli.main import main
 
     main()

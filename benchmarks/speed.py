@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 import typer
-from benchmarks.measuring import RESULTS, interleaved, machine, memory, write_results
+from benchmarks.measuring import RESULTS, machine, memory, time_interleaved, write_results
 from examples.your_planner import plan
 
 from edgegrasp_client import GraspClient
@@ -31,7 +31,7 @@ from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trial import RoundDriver
 from edgegrasp_training import views
-from edgegrasp_training.generation import label
+from edgegrasp_training.generation import label_view
 from edgegrasp_training.options import GenerationOptions
 
 WEIGHTS = ("edgegrasp-plus", "edgegrasp-small", "edgegrasp", "vn-edgegrasp")
@@ -54,7 +54,7 @@ def main(
     """Measure everything, write the results and the pages' tables."""
     torch.set_num_threads(1)
     results: dict[str, Any] = {"machine": machine()}
-    for part in (camera, shipped, simulator, server):
+    for part in (time_camera, time_networks, time_simulator, time_server_start):
         name = part.__name__
         results[name] = part()
         print(name, results[name], flush=True)
@@ -64,7 +64,7 @@ def main(
         write_table(ROOT / "docs" / "speed.md", table(results))
 
 
-def shipped() -> list[dict[str, Any]]:
+def time_networks() -> list[dict[str, Any]]:
     """Time each network in the whole pipeline on a view of each kind of scene, given the table.
 
     Processor seconds on one thread, and wall-clock seconds on two.
@@ -77,13 +77,13 @@ def shipped() -> list[dict[str, Any]]:
         rows[key] = {"model": name, "scene": scene, "points": len(seen.cloud)}
     for threads, clock in ((1, time.process_time), (2, time.perf_counter)):
         torch.set_num_threads(threads)
-        for key, times in interleaved(runs, clock=clock).items():
+        for key, times in time_interleaved(runs, clock=clock).items():
             rows[key][f"seconds_{threads}"] = statistics.median(times)
     torch.set_num_threads(1)
     return list(rows.values())
 
 
-def camera() -> dict[str, float]:
+def time_camera() -> dict[str, float]:
     """Seconds for camera images with the default weights, given only the camera's position.
 
     The demo's scene; each image in SHARED, if it exists; and the same enlarged to 1280 x 720.
@@ -102,10 +102,10 @@ def camera() -> dict[str, float]:
         name: partial(ours.detect, cloud, DetectOptions(viewpoint=tuple(viewpoint.tolist())))
         for name, (cloud, viewpoint) in sent.items()
     }
-    return {name: statistics.median(times) for name, times in interleaved(runs).items()}
+    return {name: statistics.median(times) for name, times in time_interleaved(runs).items()}
 
 
-def server() -> dict[str, float]:
+def time_server_start() -> dict[str, float]:
     """Wall-clock seconds until a server is ready, and its memory, MiB, then and after requests."""
     start = time.perf_counter()
     with local_server() as running:
@@ -119,7 +119,7 @@ def server() -> dict[str, float]:
         return {"ready_seconds": ready, "rest_mb": at_rest, "used_mb": memory(running.pid)}
 
 
-def simulator() -> list[dict[str, Any]]:
+def time_simulator() -> list[dict[str, Any]]:
     """Labels per second and rounds per minute of each engine and kind, without the start."""
     protocol, options = load_protocol("edgegrasp"), GenerationOptions(grasps_per_view=LABELS)
     # Number of labels, seconds for them, and seconds of a round.
@@ -133,7 +133,7 @@ def simulator() -> list[dict[str, Any]]:
             camera, noise, choice = (np.random.default_rng([seed, k]) for k in range(3))
             observation = simulation.observe_from(EVALUATION_VIEWS.sample(camera), noise)
             query = observation, request(observation)
-            view, _ = label(simulation, query, options, choice, None)
+            view, _ = label_view(simulation, query, options, choice, None)
             labelled = time.process_time()
             RoundDriver(simulation, kind, protocol, seed=seed, index=0).run(plan)
             end = time.process_time()

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from edgegrasp_camera.picture import Picture, View
+from edgegrasp_camera.picture import Camera, Picture
 from edgegrasp_client import Detection, DetectOptions, GraspClient, GraspClientError
 from edgegrasp_client.connection import local_server
 from edgegrasp_sim.camera import EVALUATION_VIEWS, Observation, crop
@@ -59,7 +59,7 @@ def main(seed: int, output: Path, engine: str | None = None) -> None:
     trimesh.Trimesh(seen.cloud, vertex_colors=colors, process=False).export(output / "scene.ply")
     drawn = over_grpc.grasps[:LISTED]
     title = f"The {len(drawn)} best grasps among {placed} objects. Executed the best: {verdict}."
-    view = View.of(crop(seen.cloud, seen.workspace, 0.05), seen.camera_position)
+    view = Camera.facing(crop(seen.cloud, seen.workspace, 0.05), seen.camera_position)
     picture = Picture(view, seen.cloud, colors, title=title)
     picture.grasps(drawn)
     picture.save(output / "grasps.png")

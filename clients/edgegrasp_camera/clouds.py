@@ -63,7 +63,7 @@ def too_many(count: int, max_points: int, field: str = "cloud") -> PayloadTooLar
 PCL_FIELDS = ("x", "y", "z", "normal_x", "normal_y", "normal_z", "rgb", "rgba")  # all fields read
 
 
-def cloud_of_records(rows: Records) -> CloudInput:
+def cloud_from_records(rows: Records) -> CloudInput:
     """A cloud of points whose fields have the names of PCL and ROS.
 
     Args:
@@ -118,7 +118,7 @@ def read_point_cloud2(cloud: PointCloud2, max_points: int = sys.maxsize) -> Clou
         return CloudInput(np.empty((0, 3), np.float32))
     data = bytes(cloud.data) if isinstance(cloud.data, (list, tuple)) else cloud.data
     rows = np.ndarray(shape, record, data, strides=strides).astype(record.newbyteorder("="))
-    return cloud_of_records(rows[0] if cloud.height == 1 else rows)
+    return cloud_from_records(rows[0] if cloud.height == 1 else rows)
 
 
 def _record(cloud: PointCloud2) -> np.dtype[Any]:

@@ -36,7 +36,7 @@ class DepthView(NamedTuple):
     depth_scale: float | None = None  # metres per unit; None: 0.001 for integers, 1 for floats
 
 
-def intrinsics_of(value: Any) -> Intrinsics:
+def to_intrinsics(value: Any) -> Intrinsics:
     """Intrinsics from fx, fy, cx, cy by name or in this order, or from the (3, 3) or (9,) matrix.
 
     The numbers are not checked.

@@ -22,8 +22,8 @@ from numpy.lib.recfunctions import unstructured_to_structured
 
 from edgegrasp_camera import EdgeGraspError, InvalidRequest, PayloadTooLarge, UnsupportedMediaType
 from edgegrasp_camera.arrays import Array, Float64
-from edgegrasp_camera.clouds import PCL_FIELDS, CloudInput, Records, cloud_of_records, too_many
-from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
+from edgegrasp_camera.clouds import PCL_FIELDS, CloudInput, Records, cloud_from_records, too_many
+from edgegrasp_camera.depth import DepthView, fuse_depth_images, to_intrinsics
 
 MAX_HEADER = 65536  # bytes of a PLY or PCD header; each line takes 50 times its size to read
 MAX_NPY_HEADER = 1024  # bytes; deeply nested brackets would exhaust the memory of Python's parser
@@ -137,7 +137,7 @@ def _read_npz(data: bytes, max_points: int) -> CloudInput:
     said = (f"arrays of the file that are not read: {', '.join(unread[:5])}.",) if unread else ()
     if "depth" in arrays:
         try:
-            view = DepthView(intrinsics_of(np.ravel(arrays["intrinsics"])))
+            view = DepthView(to_intrinsics(np.ravel(arrays["intrinsics"])))
         except ValueError as error:
             value = f"{arrays['intrinsics'].size} numbers that {error}"
             raise InvalidRequest("cloud.intrinsics", value, FIXES["npz"]) from None
@@ -270,7 +270,7 @@ def _read_ply(data: bytes, max_points: int) -> CloudInput:
     layout = [(PLY_FIELDS.get(name, ""), PLY_TYPES[kind], 1) for kind, name in fields]
     record = _record(layout, PLY_ORDERS[encoding])
     count, body = int(lines[elements[0]][2]), data[end.end() :]
-    return cloud_of_records(_read_records(body, record, count, max_points, encoding))
+    return cloud_from_records(_read_records(body, record, count, max_points, encoding))
 
 
 # .pcd
@@ -294,7 +294,7 @@ def _read_pcd(data: bytes, max_points: int) -> CloudInput:
         for name, kind, count in zip(names, kinds, counts, strict=True)
     ]
     record, count, body = _record(fields, "<"), int(header["POINTS"][0]), data[end.end() :]
-    cloud = cloud_of_records(_read_records(body, record, count, max_points, end[1].decode()))
+    cloud = cloud_from_records(_read_records(body, record, count, max_points, end[1].decode()))
     place = tuple(map(float, header.get("VIEWPOINT", [])[:3]))  # of the camera
     if any(place):  # zeros: unknown
         if len(place) < 3 or not max(map(abs, place)) <= MAX_VIEWPOINT_DISTANCE:

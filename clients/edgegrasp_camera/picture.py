@@ -37,7 +37,7 @@ REGION_COLOUR = "#4cc9f0"
 
 
 @dataclass(frozen=True)
-class View:
+class Camera:
     """A pinhole camera: column = fx * x / z + cx, row = fy * y / z + cy in its own frame."""
 
     shape: tuple[int, int]  # rows and columns of its image
@@ -49,7 +49,7 @@ class View:
     T_cloud_camera: Floats = field(default_factory=lambda: np.eye(4))
 
     @classmethod
-    def of(cls, points: ArrayLike, eye: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Self:
+    def facing(cls, points: ArrayLike, eye: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Self:
         """A camera at `eye` (3,) whose image contains most of the points (N, 3)."""
         seen = np.asarray(points, dtype=np.float64)
         (rows, columns), position = CLOUD_PICTURE_SIZE, np.asarray(eye, dtype=np.float64)
@@ -68,7 +68,7 @@ class View:
         return cls(CLOUD_PICTURE_SIZE, focal, focal, *middle, T)
 
     @classmethod
-    def of_image(cls, points: Floats) -> Self | None:
+    def from_image(cls, points: Floats) -> Self | None:
         """The camera at the origin that saw an organised cloud (H, W, 3); None if none could."""
         rows, columns = np.nonzero(np.isfinite(points).all(axis=2) & (points[..., 2] != 0))
         if len(np.unique(rows)) < 2 or len(np.unique(columns)) < 2:
@@ -114,7 +114,7 @@ class Picture:
 
     def __init__(
         self,
-        view: View,  # the camera
+        view: Camera,  # the camera
         points: ArrayLike,  # (N, 3) metres, cloud frame; NaN where there is no reading
         colors: NDArray[np.uint8] | None = None,  # (N, 3)
         image: NDArray[np.uint8] | None = None,  # (H, W, 3) of the camera; None: draw the cloud
@@ -239,7 +239,7 @@ def draw_detection(
     if given is not None:
         shades = np.asarray(given).reshape(-1, 3)
         shades = 255 * shades if shades.dtype.kind == "f" else shades
-    view = None if from_above or points.ndim != 3 else View.of_image(points)
+    view = None if from_above or points.ndim != 3 else Camera.from_image(points)
     if view is not None:
         image = None if shades is None else shades.reshape(points.shape).astype(np.uint8)
     else:
@@ -253,7 +253,7 @@ def draw_detection(
             other = np.zeros(3) if up[2] < 0 else eye + aside
             eyes = options.get("viewpoint"), sent.viewpoint, other
             eye = np.ravel(next(each for each in eyes if each is not None))[:3]
-        view = View.of(near if len(near) else seen, eye, up)
+        view = Camera.facing(near if len(near) else seen, eye, up)
     title = f"the {len(shown)} best of {len(detection.grasps)} grasps, {detection.model}"
     picture = Picture(view, flat, shades, image, title)
     picture.regions(options)

@@ -20,7 +20,7 @@ from typer import Argument, Option
 from edgegrasp_camera.clouds import CloudInput
 from edgegrasp_camera.files import pixels
 from edgegrasp_camera.picture import draw_detection
-from edgegrasp_cli.flags import Connection, option_flags, parse_option_flags, takes_flags
+from edgegrasp_cli.flags import ConnectionFlags, option_flags, parse_option_flags, takes_flags
 from edgegrasp_model.options import DetectOptions, parse_options
 from edgegrasp_model.request_cloud import File, decode_cloud, value_of_text
 from edgegrasp_results import plain
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 PICTURES = (".png", ".jpg", ".jpeg")
 
 
-class DetectorFlags(Connection):
+class DetectorFlags(ConnectionFlags):
     """The flags that choose a server, or a detector in this process."""
 
     server: str | None = None
@@ -86,7 +86,7 @@ def detect(
         Path | None, Option("--options", help="JSON file with options; flags override it.")
     ] = None,
     *,
-    asked: DetectFlags,
+    flags: DetectFlags,
     options: dict[str, Any],
 ) -> None:
     """Find grasps in a point cloud file or a depth image, on a server or in this process.
@@ -101,24 +101,24 @@ def detect(
 
     edgegrasp detect --depth a.png --depth b.png --intrinsics 615,615,320,240 --pose A --pose B
     """
-    fields = _options(options_file, options) | _robot_option(asked)
-    _check_outputs(asked, fields)
-    images = _depth_images(file, asked)
-    colors = None if asked.color is None else np.atleast_3d(pixels(asked.color))
+    fields = _options(options_file, options) | _robot_option(flags)
+    _check_outputs(flags, fields)
+    images = _depth_images(file, flags)
+    colors = None if flags.color is None else np.atleast_3d(pixels(flags.color))
     if colors is not None:  # (H, W, 3); a grey image gets three equal channels
         colors = colors[..., :3] if colors.shape[2] > 2 else colors[..., [0, 0, 0]]
-    if asked.mask is not None:
+    if flags.mask is not None:
         from edgegrasp_client import on_mask
 
-        fields = dict(on_mask(pixels(asked.mask), fields))
+        fields = dict(on_mask(pixels(flags.mask), fields))
     waiting = Console(stderr=True).status("Looking for grasps; the first run compiles loops…")
-    with waiting, open_client(asked) as client:
+    with waiting, open_client(flags) as client:
         detection = client.detect(file, depth_images=images, colors=colors, **fields)
-    if asked.picture is not None:
-        sent, _ = decoded(file, {"depth_images": images})
-        draw_detection(asked.picture, detection, sent, fields, colors)
-    if asked.trajectory is not None:
-        _write_trajectory(asked.trajectory, detection)
+    if flags.picture is not None:
+        sent, _ = decode_request(file, {"depth_images": images})
+        draw_detection(flags.picture, detection, sent, fields, colors)
+    if flags.trajectory is not None:
+        _write_trajectory(flags.trajectory, detection)
     if as_document:
         text = json.dumps(detection, default=plain)
         print(json.dumps(json.loads(text, parse_constant=lambda _: None)))  # NaN is null
@@ -127,11 +127,11 @@ def detect(
 
 
 @takes_flags()
-def models(*, asked: DetectorFlags) -> None:
+def models(*, flags: DetectorFlags) -> None:
     """List the available weights, in this process or on a server."""
     names = (Column(name, no_wrap=True) for name in ("model", "architecture"))
     table = Table(*names, "parameters", "gripper", "device", box=box.SIMPLE)
-    with Console(stderr=True).status("Loading weights…"), open_client(asked) as client:
+    with Console(stderr=True).status("Loading weights…"), open_client(flags) as client:
         found = client.models()
     for row in found:
         name = f"{row.name} (default)" if row.default else row.name
@@ -139,19 +139,19 @@ def models(*, asked: DetectorFlags) -> None:
     Console().print(table)
 
 
-def open_client(asked: DetectorFlags) -> AbstractContextManager[Any]:
+def open_client(flags: DetectorFlags) -> AbstractContextManager[Any]:
     """A client of a server, or an OwnDetector if no server is given."""
-    if asked.server:
+    if flags.server:
         # benchmark-real needs --grippers too, to judge the server's grasps.
-        alone = {"weights", "device"} | ({"grippers"} if isinstance(asked, DetectFlags) else set())
-        for name in sorted(asked.model_fields_set & alone):
+        alone = {"weights", "device"} | ({"grippers"} if isinstance(flags, DetectFlags) else set())
+        for name in sorted(flags.model_fields_set & alone):
             raise ValueError(f"--{name}: got --server as well. Set it at the server.")
-        return asked.connect(asked.server)
-    return nullcontext(OwnDetector(asked.weights, asked.grippers, asked.device))
+        return flags.connect(flags.server)
+    return nullcontext(InProcessDetector(flags.weights, flags.grippers, flags.device))
 
 
 @dataclass(eq=False)
-class OwnDetector:
+class InProcessDetector:
     """A detector in this process, with the interface of `GraspClient`."""
 
     weights: Sequence[Path] = ()
@@ -161,14 +161,14 @@ class OwnDetector:
 
     def detect(self, cloud: Any = None, **asked: Any) -> Any:
         """Find grasps like `GraspClient.detect`; also raises the errors of the detector."""
-        sent, parsed = decoded(cloud, asked)
+        sent, parsed = decode_request(cloud, asked)
         detector = self._catalogue.get(parsed.model)
         if parsed.robot is None:
             return detector.detect(sent, parsed)
-        from edgegrasp_robot import load_robot, plan_picks, with_robot
+        from edgegrasp_robot import load_robot, options_for_robot, plan_picks
 
         robot = load_robot(self.robot or parsed.robot.name)
-        prepared = detector.prepare(sent, with_robot(parsed, robot))
+        prepared = detector.prepare(sent, options_for_robot(parsed, robot))
         detection = detector.finish(prepared, detector.evaluate(prepared))
         return plan_picks(detection, prepared.scene, parsed, robot)
 
@@ -188,7 +188,7 @@ class OwnDetector:
         return ModelCatalogue.load(self.weights, "", choose_device(self.device), self.grippers)
 
 
-def decoded(cloud: Any, asked: Mapping[str, Any]) -> tuple[CloudInput, DetectOptions]:
+def decode_request(cloud: Any, asked: Mapping[str, Any]) -> tuple[CloudInput, DetectOptions]:
     """The cloud and the options of a request, decoded as on a server."""
     from edgegrasp_client.requests import Request, cloud_file
 
@@ -201,14 +201,14 @@ def decoded(cloud: Any, asked: Mapping[str, Any]) -> tuple[CloudInput, DetectOpt
     return decode_cloud(fields, parse_options(request.options), sys.maxsize)
 
 
-def _check_outputs(asked: DetectFlags, fields: Mapping[str, Any]) -> None:
+def _check_outputs(flags: DetectFlags, fields: Mapping[str, Any]) -> None:
     """Raise ValueError, before any work, if a picture or trajectory could not be written."""
-    if asked.trajectory is not None and "robot" not in fields:
+    if flags.trajectory is not None and "robot" not in fields:
         raise ValueError("--trajectory: got no robot. Give --robot, --joints and --base.")
-    for flag, file in (("--picture", asked.picture), ("--trajectory", asked.trajectory)):
+    for flag, file in (("--picture", flags.picture), ("--trajectory", flags.trajectory)):
         if file is not None and not file.absolute().parent.is_dir():
             raise ValueError(f"{flag}: there is no folder {file.parent}. Make it first.")
-    if (path := asked.picture) is None:
+    if (path := flags.picture) is None:
         return
     if path.suffix.lower() not in PICTURES:
         raise ValueError(f"--picture: got {path.name!r}. Name a file {' or '.join(PICTURES)}.")
@@ -226,21 +226,21 @@ def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
     return fields | parse_option_flags(given)
 
 
-def _robot_option(asked: DetectFlags) -> dict[str, Any]:
+def _robot_option(flags: DetectFlags) -> dict[str, Any]:
     """The option `robot` from the flags; empty if none of them is given."""
-    given = {"--robot": asked.robot, "--joints": asked.joints, "--base": asked.base}
+    given = {"--robot": flags.robot, "--joints": flags.joints, "--base": flags.base}
     missing = [flag for flag, value in given.items() if value is None]
-    if len(missing) == len(given) and asked.place is None and not asked.avoid_unseen:
+    if len(missing) == len(given) and flags.place is None and not flags.avoid_unseen:
         return {}
     if missing:
         raise ValueError(f"{missing[0]}: got nothing. Give {', '.join(given)} together.")
-    joints = value_of_text("--joints", str(asked.joints))
+    joints = value_of_text("--joints", str(flags.joints))
     joints = joints if isinstance(joints, list) else [joints]  # an arm with one joint
-    pose = value_of_text("--base", str(asked.base))
-    robot = {"name": asked.robot, "joints": joints, "T_base_cloud": pose}
-    robot["avoid_unseen"] = asked.avoid_unseen
-    if asked.place is not None:
-        robot["place"] = value_of_text("--place", asked.place)
+    pose = value_of_text("--base", str(flags.base))
+    robot = {"name": flags.robot, "joints": joints, "T_base_cloud": pose}
+    robot["avoid_unseen"] = flags.avoid_unseen
+    if flags.place is not None:
+        robot["place"] = value_of_text("--place", flags.place)
     return {"robot": robot}
 
 
@@ -253,13 +253,13 @@ def _write_trajectory(file: Path, detection: Any) -> None:
     file.write_text(json.dumps(motion, default=np.ndarray.tolist))
 
 
-def _depth_images(file: Path | None, asked: DetectFlags) -> "list[DepthImage] | None":
+def _depth_images(file: Path | None, flags: DetectFlags) -> "list[DepthImage] | None":
     """The images of --depth with their cameras; None if a cloud is given."""
-    depths, intrinsics, poses = asked.depth, asked.intrinsics, asked.pose
+    depths, intrinsics, poses = flags.depth, flags.intrinsics, flags.pose
     if (file is None) != bool(depths):
         raise ValueError("give a cloud file, or --depth and --intrinsics")
     if file is not None:
-        of_image = {"intrinsics": intrinsics, "pose": poses, "depth-scale": asked.depth_scale}
+        of_image = {"intrinsics": intrinsics, "pose": poses, "depth-scale": flags.depth_scale}
         if beside := [flag for flag, value in of_image.items() if value]:
             raise ValueError(f"--{beside[0]}: got a cloud as well. Give --depth instead.")
         return None
@@ -271,7 +271,7 @@ def _depth_images(file: Path | None, asked: DetectFlags) -> "list[DepthImage] | 
         raise ValueError(f"--intrinsics: got {len(intrinsics)}. Give one for all, or {each}")
     if len(poses) != len(depths) and (poses or len(depths) > 1):
         raise ValueError(f"--pose: got {len(poses)}. Give {each}")
-    images: list[Any] = [{"depth": depth, "depth_scale": asked.depth_scale} for depth in depths]
+    images: list[Any] = [{"depth": depth, "depth_scale": flags.depth_scale} for depth in depths]
     for image, camera, pose in zip_longest(images, intrinsics, poses):
         image["intrinsics"] = value_of_text("intrinsics", camera)
         if pose is not None:

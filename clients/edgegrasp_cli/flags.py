@@ -21,7 +21,7 @@ PLAIN_TYPES = (bool, int, float, str, Path)  # types that a flag takes directly
 TOKEN_VARIABLE = "EDGEGRASP_CLIENT_TOKEN"
 
 
-class Connection(BaseModel, use_attribute_docstrings=True):
+class ConnectionFlags(BaseModel, use_attribute_docstrings=True):
     """The flags for the connection to a server."""
 
     timeout: float = 60.0
@@ -54,7 +54,7 @@ class Connection(BaseModel, use_attribute_docstrings=True):
         return GraspClient(address, timeout=self.timeout, token=token, tls=tls)
 
 
-class Server(Connection):
+class ServerFlags(ConnectionFlags):
     """The flags of a command that needs a server."""
 
     server: str = "127.0.0.1:50051"

@@ -21,8 +21,8 @@ from typer import Option
 from edgegrasp_camera import EdgeGraspError
 from edgegrasp_camera.files import pixels
 from edgegrasp_camera.picture import draw_detection
-from edgegrasp_cli.detect import decoded
-from edgegrasp_cli.flags import Server, takes_flags
+from edgegrasp_cli.detect import decode_request
+from edgegrasp_cli.flags import ServerFlags, takes_flags
 
 if TYPE_CHECKING:
     from mcp.server import MCPServer
@@ -60,7 +60,7 @@ def mcp(
         str | None, Option(help="HOST:PORT to serve /mcp at; default: stdin and stdout.")
     ] = None,
     *,
-    asked: Server,
+    flags: ServerFlags,
 ) -> None:
     """Serve grasps to language-model agents (Model Context Protocol).
 
@@ -72,7 +72,7 @@ def mcp(
     host, _, port = (http or "0").rpartition(":")
     if not (port.isdecimal() and int(port) < 2**16):
         raise ValueError(f"--http: got {http!r}. Give HOST:PORT, such as 127.0.0.1:8090.")
-    with asked.connect(asked.server) as client:
+    with flags.connect(flags.server) as client:
         tools = grasp_tools(client, folder.resolve())
         if http is None:
             # A thread that waits for standard input would prevent Python from exiting.
@@ -171,7 +171,7 @@ class _Tools:
             raise ValueError("Give point_cloud_file alone, or depth_file and intrinsics.")
         asked = self._request(options, num_grasps, robot, viewpoint, point_cloud_file, image)
         found = self._client.detect(**asked)
-        sent, _ = decoded(asked.get("cloud"), {"depth_images": asked.get("depth_images")})
+        sent, _ = decode_request(asked.get("cloud"), {"depth_images": asked.get("depth_images")})
         best = found.grasps[0].score if found.grasps else 0.0
         text = f"{len(found.grasps)} grasps, the best {best:.2f}. {' '.join(found.warnings)}"
         pictures = []

@@ -24,7 +24,7 @@ from typer import Option
 
 from edgegrasp.oip import open_inference_pb2 as messages
 from edgegrasp_camera.arrays import Array
-from edgegrasp_cli.flags import Server, takes_flags
+from edgegrasp_cli.flags import ServerFlags, takes_flags
 from edgegrasp_client import GraspClient, errors
 from edgegrasp_client.connection import invalid
 from edgegrasp_client.requests import option_of_text, plain_options
@@ -68,14 +68,14 @@ def open_inference(
     grpc_port: Annotated[int, Option(help="Port of gRPC.")] = 8081,
     name: Annotated[str, Option(help="Model name for the server's default weights.")] = "default",
     *,
-    asked: Server,
+    flags: ServerFlags,
 ) -> None:
     """Answer the Open Inference Protocol v2 (KServe, Triton's clients) for a grasp server.
 
     It does not require a token: put a gateway in front of it that checks tokens.
     """
-    with asked.connect(asked.server) as client:
-        models = Models(client, name, asked.timeout)
+    with flags.connect(flags.server) as client:
+        models = Models(client, name, flags.timeout)
         place = f"[{host}]" if ":" in host else host  # IPv6 is in brackets
         with grpc_server(models, f"{place}:{grpc_port}"):
             addresses = f"http://{place}:{http_port} and gRPC {place}:{grpc_port}"
@@ -106,7 +106,7 @@ class Models:
         """The models' names."""
         return [self._default, *(model.name for model in self._client.models())]
 
-    def check(self, name: str, version: str = "") -> bool:
+    def require(self, name: str, version: str = "") -> bool:
         """Return True; raises UnknownModelError for an unknown name or version."""
         known = self.names()
         if name not in known:
@@ -117,7 +117,7 @@ class Models:
 
     def metadata(self, name: str, version: str = "") -> dict[str, Any]:
         """The inputs and outputs of a model, as the protocol describes them."""
-        self.check(name, version)
+        self.require(name, version)
         inputs, outputs = (
             [{"name": each, "datatype": kind, "shape": shape} for each, (kind, shape) in table]
             for table in (INPUTS.items(), OUTPUTS.items())
@@ -140,7 +140,7 @@ class Models:
         answer has the protocol's form, with an array as the `data` of each output.
         """
         if version:
-            self.check(name, version)
+            self.require(name, version)
         asked = {key: option_of_text(value) for key, value in parameters.items()}
         options: Any = {key: value for key, value in asked.items() if key not in SERVING_PARAMETERS}
         if name != self._default:
@@ -196,7 +196,7 @@ def grpc_server(models: Models, address: str) -> Iterator[int]:
         "ServerLive": lambda *_: {"live": True},
         "ServerReady": lambda *_: {"ready": models.ready()},
         "ServerMetadata": lambda *_: {"name": PLATFORM, "version": VERSION},
-        "ModelReady": lambda asked, _: {"ready": models.check(asked.name, asked.version)},
+        "ModelReady": lambda asked, _: {"ready": models.require(asked.name, asked.version)},
         "ModelMetadata": lambda asked, _: models.metadata(asked.name, asked.version),
         "ModelInfer": partial(_grpc_infer, models),
     }
@@ -264,7 +264,7 @@ def http_app(models: Models) -> Starlette:
         return JSONResponse({"ready": is_ready}, 200 if is_ready else 503)
 
     def model_ready(name: str, version: str = "") -> dict[str, Any]:
-        return {"name": name, "ready": models.check(name, version)}
+        return {"name": name, "ready": models.require(name, version)}
 
     async def infer(request: Request) -> Response:
         body = bytearray()

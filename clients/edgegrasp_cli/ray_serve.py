@@ -18,7 +18,7 @@ from starlette.responses import JSONResponse, Response
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError
-from edgegrasp_service.errors import problem_document, report
+from edgegrasp_service.errors import problem_document, to_problem
 from edgegrasp_service.front.grpc import ERROR_METADATA, error_detail
 from edgegrasp_service.front.http import METHODS, requested_timeout
 from edgegrasp_service.settings import Settings
@@ -73,7 +73,7 @@ class Grasps:
             job = Job(cast(Method, method), "http", body, seconds, content_type, query)
             found = await self._answer(job)
         except EdgeGraspError as error:
-            found = Answer(b"", Facts(), report(error))
+            found = Answer(b"", Facts(), to_problem(error))
         if found.error is None:
             return Response(found.body, media_type="application/json")
         document = problem_document(found.error)

@@ -74,7 +74,7 @@ def check(
     for name, value in found.describe().items():
         if name not in ("frames", "axes", "sliding"):  # long, for programs that draw the arm
             print(f"{name}: {value}")
-    hand = found.hand_pose(found.home)
+    hand = found.forward_kinematics(found.home)
     x, y, z = hand[:3, 3]
     print(f"hand at home: {x:.3f} {y:.3f} {z:.3f} m from {found.base_frame}")
     if picture is None:

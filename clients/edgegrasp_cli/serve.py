@@ -42,15 +42,15 @@ def serve(
     if print_config:
         print(loaded.model_dump_json(indent=2))
         return
-    from edgegrasp_service.worker.process import Nursery
+    from edgegrasp_service.worker.process import ForkServer
 
-    nursery = Nursery(loaded)  # it loads while this process imports the rest
+    fork_server = ForkServer(loaded)  # it loads while this process imports the rest
     try:
         from edgegrasp_service.server import run
 
-        run(loaded, nursery)
+        run(loaded, fork_server)
     finally:
-        nursery.close()
+        fork_server.close()
 
 
 def view(

@@ -23,7 +23,7 @@ from typing_extensions import Unpack
 
 from edgegrasp_camera.arrays import Array
 from edgegrasp_client import errors
-from edgegrasp_client.connection import RETRIES, Tls, invalid, is_rest, retry_delay, seconds_of
+from edgegrasp_client.connection import RETRIES, Tls, checked_timeout, invalid, is_rest, retry_delay
 from edgegrasp_client.over_grpc import GrpcTransport
 from edgegrasp_client.over_rest import RestTransport
 from edgegrasp_client.requests import Cloud, Request, RequestFields, StreamRequest
@@ -67,7 +67,7 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
         token: str | None = None,
         tls: Tls | None = None,
     ) -> None:
-        self._timeout = seconds_of(timeout)
+        self._timeout = checked_timeout(timeout)
         self._retry, self._closed, self._answered = retry, False, False
         self._pid = os.getpid()
         kind = RestTransport if is_rest(address) else GrpcTransport
@@ -91,7 +91,7 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
                 options; an option left out has the server's default.
         """
         request = Request(cloud, fields)
-        return await self._retried(partial(self._transport.ask, Detection, request), timeout)
+        return await self._retried(partial(self._transport.request, Detection, request), timeout)
 
     async def score(
         self,
@@ -111,7 +111,7 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
             An evaluation for each edge or pose, in their order.
         """
         request = Request(cloud, fields, {"edges": edges, "hand_poses": hand_poses})
-        return await self._retried(partial(self._transport.ask, Scoring, request), timeout)
+        return await self._retried(partial(self._transport.request, Scoring, request), timeout)
 
     def detect_stream(
         self,
@@ -140,11 +140,11 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
 
     async def models(self, *, timeout: float | None = None) -> list[Model]:
         """The weights that `model` can name."""
-        return await self._retried(partial(self._transport.listed, Model), timeout)
+        return await self._retried(partial(self._transport.list_all, Model), timeout)
 
     async def robots(self, *, timeout: float | None = None) -> list[Robot]:
         """The robots that `robot` can name."""
-        return await self._retried(partial(self._transport.listed, Robot), timeout)
+        return await self._retried(partial(self._transport.list_all, Robot), timeout)
 
     async def record_outcome(
         self, detection: Detection, grasp: Grasp, held: bool, *, timeout: float | None = None
@@ -162,7 +162,7 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
 
     async def wait_until_ready(self, timeout: float = 60.0) -> None:
         """Wait until the server can answer; raises DeadlineError after `timeout` seconds."""
-        end = time.monotonic() + seconds_of(timeout)
+        end = time.monotonic() + checked_timeout(timeout)
         while not await self.ready(timeout=max(POLL_SECONDS, end - time.monotonic())):
             if time.monotonic() >= end:
                 raise errors.DeadlineError(f"The server was not ready within {timeout:g} s.")
@@ -180,7 +180,7 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
         """The timeout of a call; raises GraspClientError if it cannot be made any more."""
         if self._closed or self._pid != os.getpid():  # a fork would read its parent's answers
             raise errors.GraspClientError(CLOSED)
-        return self._timeout if timeout is None else seconds_of(timeout)
+        return self._timeout if timeout is None else checked_timeout(timeout)
 
     async def _retried(
         self, call: Callable[[float], Awaitable[Answer]], timeout: float | None

@@ -48,7 +48,7 @@ def is_local(address: str) -> bool:
     return re.match(local, address) is not None
 
 
-def seconds_of(timeout: float) -> float:
+def checked_timeout(timeout: float) -> float:
     """A timeout, at most LONGEST_TIMEOUT; raises InvalidRequestError unless it is above 0."""
     try:
         seconds = float(timeout)

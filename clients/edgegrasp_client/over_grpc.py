@@ -58,12 +58,12 @@ class GrpcTransport:
         self._service: Any = grasp_pb2_grpc.GraspServiceStub(self._channel)
         self._check = self._channel.unary_unary(HEALTH_CHECK, bytes, bytes)
 
-    async def ask(self, kind: type[Answer], request: Request, timeout: float) -> Answer:
+    async def request(self, kind: type[Answer], request: Request, timeout: float) -> Answer:
         """The answer to a request."""
         name = "ScoreGrasps" if request.scores else "DetectGrasps"
         return read_as(kind, await self._call(name, message_of(request), timeout))
 
-    async def listed(self, kind: type[Answer], timeout: float) -> list[Answer]:
+    async def list_all(self, kind: type[Answer], timeout: float) -> list[Answer]:
         """The server's models or robots."""
         name = f"List{kind.__name__}s"
         answer = await self._call(name, getattr(grasp_pb2, f"{name}Request")(), timeout)
@@ -121,7 +121,7 @@ class GrpcTransport:
             if error.code() != grpc.StatusCode.UNIMPLEMENTED:
                 return False
         try:  # a server without gRPC's health service, such as Ray's: try a request
-            return bool(await self.listed(Model, timeout))
+            return bool(await self.list_all(Model, timeout))
         except GraspClientError:
             return False
 

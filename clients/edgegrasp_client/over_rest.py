@@ -59,11 +59,11 @@ class RestTransport:
         except httpx.InvalidURL as error:
             raise invalid("address", f"{address!r} ({error})", "Give http://host:port.") from None
 
-    async def ask(self, kind: type[Answer], request: Request, timeout: float) -> Answer:
+    async def request(self, kind: type[Answer], request: Request, timeout: float) -> Answer:
         """The answer to a request."""
         return await self._call(partial(read_as, kind), call_of(request), timeout)
 
-    async def listed(self, kind: type[Answer], timeout: float) -> list[Answer]:
+    async def list_all(self, kind: type[Answer], timeout: float) -> list[Answer]:
         """The server's models or robots."""
         name = f"{kind.__name__.lower()}s"
         call = {"method": "GET", "url": f"/v1/{name}"}
@@ -82,7 +82,7 @@ class RestTransport:
         """An answer to each request, one after another; a request comes with its id and timeout."""
         async for name, request, seconds in requests:
             try:
-                yield StreamAnswer(name, await self.ask(Detection, request, seconds))
+                yield StreamAnswer(name, await self.request(Detection, request, seconds))
             except errors.GraspClientError as error:
                 yield StreamAnswer(name, error=error)
 

@@ -19,12 +19,12 @@ from typing_extensions import NotRequired, TypedDict, Unpack
 from edgegrasp_camera import InvalidRequest
 from edgegrasp_camera.arrays import Array, Float32
 from edgegrasp_camera.clouds import PointCloud2, read_point_cloud2
-from edgegrasp_camera.depth import ENCODINGS, Intrinsics, intrinsics_of
+from edgegrasp_camera.depth import ENCODINGS, Intrinsics, to_intrinsics
 from edgegrasp_camera.files import FILE_FORMATS
-from edgegrasp_client.connection import invalid, seconds_of
+from edgegrasp_client.connection import checked_timeout, invalid
 from edgegrasp_client.options import DetectOptions
 
-SCENE_CELL = 0.005  # metres, side of a cell: scene points in the object's cells are left out
+SCENE_VOXEL = 0.005  # metres, side of a cell: scene points in the object's cells are left out
 DEPTH_ENCODINGS = {np.dtype(kind).name: name for name, kind in ENCODINGS.items()}  # by dtype
 
 
@@ -113,7 +113,7 @@ class StreamRequest(Request):
     ) -> None:
         super().__init__(cloud, fields)
         self.request_id = request_id
-        self.timeout = None if timeout is None else seconds_of(timeout)
+        self.timeout = None if timeout is None else checked_timeout(timeout)
 
 
 def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -177,7 +177,7 @@ def object_in_scene(
     clouds = [np.asarray(each, np.float32).reshape(-1, 3) for each in (object_points, scene_points)]
     wanted, scene = (each[np.isfinite(each).all(axis=1)] for each in clouds)
     digits = np.array([2**42, 2**21, 1])  # combines three cell indices; coordinates below 5 km
-    cells = [np.floor(each / SCENE_CELL).astype(np.int64) @ digits for each in (wanted, scene)]
+    cells = [np.floor(each / SCENE_VOXEL).astype(np.int64) @ digits for each in (wanted, scene)]
     rest = scene[~np.isin(cells[1], cells[0])]
     segment_ids = np.repeat(np.array([1, 0], np.int32), [len(wanted), len(rest)])
     return np.concatenate([wanted, rest]), segment_ids
@@ -243,7 +243,7 @@ def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
         raise invalid(f"{path}.T_cloud_camera", repr(given)[:80], "Give a 4 x 4 matrix.")
     depth = _depth_fields(image["depth"], f"{path}.depth")
     try:
-        intrinsics = intrinsics_of(image["intrinsics"])._asdict()
+        intrinsics = to_intrinsics(image["intrinsics"])._asdict()
     except ValueError:
         fix = "Give fx, fy, cx, cy in pixels, or the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."
         raise invalid(f"{path}.intrinsics", repr(image["intrinsics"])[:80], fix) from None

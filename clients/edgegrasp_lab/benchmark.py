@@ -12,16 +12,16 @@ from rich.progress import Progress, TimeElapsedColumn
 from typer import Argument, Option
 
 from edgegrasp_cli.flags import option_flags, parse_option_flags, takes_flags
-from edgegrasp_lab.flags import Cluster, PlannerFlags
+from edgegrasp_lab.flags import ClusterFlags, PlannerFlags
 from edgegrasp_model.gripper import gripper_fields
 from edgegrasp_sim import results
 from edgegrasp_sim.benchmark import BenchmarkConfig, manifest, run_benchmark
 from edgegrasp_sim.engine import ArmModel
+from edgegrasp_sim.fixed_parts import MIDDLE, TABLE_HEIGHT
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import CameraRules, load_protocol
 from edgegrasp_sim.report import key_figures, write_report
-from edgegrasp_sim.results import RATE_LABELS, ResultFolder, percent
-from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
+from edgegrasp_sim.results import RATE_LABELS, ResultFolder, rate_text
 
 FAR = 0.5  # metres from the arm's base to the middle of a scene
 LIFT = {"retreat_length": 0.1, "retreat_direction": "up"}  # metres
@@ -32,7 +32,7 @@ DECIDED = (
 )
 
 
-class BenchmarkFlags(Cluster, PlannerFlags):
+class BenchmarkFlags(ClusterFlags, PlannerFlags):
     """The flags of `edgegrasp benchmark`."""
 
     scene: str | None = None
@@ -58,56 +58,56 @@ class BenchmarkFlags(Cluster, PlannerFlags):
 
 
 @takes_flags(options=option_flags(*DECIDED, defaults=False))
-def benchmark(*, asked: BenchmarkFlags, options: dict[str, Any]) -> None:
+def benchmark(*, flags: BenchmarkFlags, options: dict[str, Any]) -> None:
     """Clear simulated clutter with a planner's grasps and count the successes.
 
     GSR: successes / attempts. DR: objects removed / present. The protocol defines a round.
     Options of the detection are the protocol's unless a flag is given.
     """
     with TemporaryDirectory() as scratch:
-        folder = ResultFolder(asked.output or Path(scratch))
-        config, fields = _plan(asked, parse_option_flags(options))
+        folder = ResultFolder(flags.output or Path(scratch))
+        config, fields = _plan(flags, parse_option_flags(options))
         print(f"engine: {config.engine}")
-        run_rounds(config, asked, fields, folder)
+        run_rounds(config, flags, fields, folder)
         summary = folder.finish()
-        if asked.output is not None and asked.report:
+        if flags.output is not None and flags.report:
             print(f"report: {write_report(folder, summary)}")
         planner = results.planner_title(folder.manifest()["run"]["planner"])
         lines = (f"{name}: {value}" for name, value in key_figures(summary))
         print(f"{planner}: " + "\n".join(lines))
-    if asked.gate is not None:
-        if below := results.below_gate(summary, asked.gate):
+    if flags.gate is not None:
+        if below := results.gate_failures(summary, flags.gate):
             sys.exit("edgegrasp benchmark: below the gate: " + "; ".join(below))
         print("not below the gate")
 
 
-def _plan(asked: BenchmarkFlags, options: dict[str, Any]) -> tuple[BenchmarkConfig, dict[str, Any]]:
+def _plan(flags: BenchmarkFlags, options: dict[str, Any]) -> tuple[BenchmarkConfig, dict[str, Any]]:
     """The benchmark to run, and the options of its requests."""
-    rules = load_protocol(asked.protocol)
+    rules = load_protocol(flags.protocol)
     # The Panda's hand has its own shapes.
-    hand = gripper_fields(asked.gripper) if asked.gripper not in (None, "panda") else None
+    hand = gripper_fields(flags.gripper) if flags.gripper not in (None, "panda") else None
     arm = None
     if hand is not None:
         options = options | {"gripper": hand}
-    if asked.robot is not None:
-        if asked.gripper is not None:
-            raise ValueError(f"gripper is {asked.gripper}; leave it out: {asked.robot} has its own")
-        arm, hand, fields = benchmark_arm(asked.robot, rules.camera)
+    if flags.robot is not None:
+        if flags.gripper is not None:
+            raise ValueError(f"gripper is {flags.gripper}; leave it out: {flags.robot} has its own")
+        arm, hand, fields = benchmark_arm(flags.robot, rules.camera)
         options = fields | options
     config = BenchmarkConfig(
-        SceneKind(asked.scene or rules.kind or SceneKind.PILE),
-        rules.rounds if asked.rounds is None else asked.rounds,
-        asked.seed or rules.seeds,
+        SceneKind(flags.scene or rules.kind or SceneKind.PILE),
+        rules.rounds if flags.rounds is None else flags.rounds,
+        flags.seed or rules.seeds,
         rules,
-        asked.objects.resolve() if asked.objects is not None else None,
-        asked.split,
-        asked.engine or ("mujoco" if asked.robot else ""),
+        flags.objects.resolve() if flags.objects is not None else None,
+        flags.split,
+        flags.engine or ("mujoco" if flags.robot else ""),
         hand,
         arm,
     )
-    if asked.ray not in (None, "local") and asked.planner == "server" and asked.server is None:
+    if flags.ray not in (None, "local") and flags.planner == "server" and flags.server is None:
         wanted = "pass --server with an address that the cluster reaches, or --planner in-process"
-        raise ValueError(f"ray is {asked.ray!r}; {wanted}")
+        raise ValueError(f"ray is {flags.ray!r}; {wanted}")
     return config, options
 
 
@@ -142,7 +142,7 @@ def benchmark_arm(
     )
     T_base_world = np.linalg.inv(T_world_base).tolist()
     asked = {"name": robot.name, "T_base_cloud": T_base_world, "joints": robot.home.tolist()}
-    hand = None if robot.gripper.name == "panda" else robot.hand.model_dump()
+    hand = None if robot.gripper.name == "panda" else robot.gripper_geometry.model_dump()
     return arm, hand, {"robot": asked, "collision": LIFT}
 
 
@@ -158,8 +158,8 @@ def compare(
     for name, label in RATE_LABELS.items():
         row = figures[name]
         difference = {"value": row["difference"], "wilson_95": row["difference_95"]}
-        rates = " and ".join(percent(row[run]) for run in ("first", "second"))
-        print(f"{label} %: {rates}; paired difference {percent(difference)}")
+        rates = " and ".join(rate_text(row[run]) for run in ("first", "second"))
+        print(f"{label} %: {rates}; paired difference {rate_text(difference)}")
     better, worse = figures["second_better"], figures["second_worse"]
     print(
         f"{figures['scenes']} scenes: the second removed more objects in {better}, fewer in "
@@ -168,7 +168,7 @@ def compare(
 
 
 def run_rounds(
-    config: BenchmarkConfig, asked: BenchmarkFlags, options: dict[str, Any], folder: ResultFolder
+    config: BenchmarkConfig, flags: BenchmarkFlags, options: dict[str, Any], folder: ResultFolder
 ) -> None:
     """Run the rounds that a folder lacks, with a progress bar."""
     from edgegrasp_lab.planners import open_planner  # loads gRPC, which --help does not need
@@ -177,16 +177,16 @@ def run_rounds(
     with Console(stderr=True).status("reading objects"):
         config.object_set()
     counts = np.zeros(len(results.COUNTS), np.int64)
-    with open_planner(asked, config.protocol.planning, options) as planner:
+    with open_planner(flags, config.protocol.planning, options) as planner:
         facts = manifest(config, planner.facts)
-        if asked.gate is not None:  # another file fails here, not after hours
-            results.below_gate(results.summary_of(facts["run"], []), asked.gate)
+        if flags.gate is not None:  # another file fails here, not after hours
+            results.gate_failures(results.summary_of(facts["run"], []), flags.gate)
         folder.open(facts)
         with Progress(*Progress.get_default_columns(), TimeElapsedColumn()) as progress:
             kept, total = len(folder.rounds()), config.rounds * len(config.seeds)
             bar = progress.add_task(config.scene, total=total, completed=kept)
-            for done in run_benchmark(config, planner.make, folder, asked.workers, asked.ray):
-                counts += results.count([done])[:, 0]
+            for done in run_benchmark(config, planner.make, folder, flags.workers, flags.ray):
+                counts += results.count_outcomes([done])[:, 0]
                 successes, attempts, objects = counts
                 text = f"{config.scene} GSR {successes}/{attempts} DR {successes}/{objects}"
                 progress.update(bar, advance=1, description=text)

@@ -44,7 +44,7 @@ def benchmark_real(
         Path, Option(help="Folder for results.json, index.html and pictures of each scene.")
     ] = Path("results/real"),
     *,
-    asked: DetectorFlags,
+    flags: DetectorFlags,
     options: dict[str, Any],
 ) -> None:
     """Find grasps in scenes that real cameras saw, and judge them by the scenes' labels.
@@ -57,9 +57,9 @@ def benchmark_real(
     fields, loaded = parse_option_flags(options), load_scenes(scenes)
     output.mkdir(parents=True, exist_ok=True)
     done: dict[str, SceneFigures] = {}
-    with open_client(asked) as client:
+    with open_client(flags) as client:
         model = model_used(client, fields.get("model", ""))
-        own = {file.stem: load_gripper(file) for file in asked.grippers}
+        own = {file.stem: load_gripper(file) for file in flags.grippers}
         gripper = choose_gripper(parse_options(fields), load_gripper(model.gripper), own)
         _ask(client, loaded[0], fields)  # loading and compiling take time
         for scene in track(loaded, "scenes", console=Console(stderr=True)):

@@ -74,7 +74,7 @@ class RecordedScene:
     def __init__(self, scene: RealScene) -> None:
         self.points = scene.points
 
-    def look(self, seconds: float) -> dict[str, Any]:
+    def image_at(self, seconds: float) -> dict[str, Any]:
         """The image at a time, as arguments of `GraspClient.detect`; points (R, 3)."""
         rng, depth = np.random.default_rng(round(seconds * RATE)), self.points[:, 2]
         apart = (NOISE[0] + NOISE[1] * depth**2) * rng.standard_normal(len(depth)) / depth
@@ -82,10 +82,10 @@ class RecordedScene:
         seen = np.isfinite(noisy[:, 0]) & (rng.random(len(depth)) > MISSING)
         return {"cloud": noisy[seen], "viewpoint": (0.0, 0.0, 0.0)}
 
-    def hold(self, T_cloud_tcp: Float64) -> None:
+    def choose_object(self, T_cloud_tcp: Float64) -> None:
         """Choose the object nearest to a grasp, which moves from now on; here no object moves."""
 
-    def moved(self, seconds: float) -> Float64:
+    def object_motion(self, seconds: float) -> Float64:
         """(4, 4) T_now_start of the chosen object, cloud frame."""
         return np.eye(4)
 
@@ -103,7 +103,7 @@ class SimulatedScene:
         self.way = np.array([np.cos(angle), np.sin(angle), 0.0])
         self.sense = float(rng.choice([-1.0, 1.0]))
 
-    def look(self, seconds: float) -> dict[str, Any]:
+    def image_at(self, seconds: float) -> dict[str, Any]:
         """The points (H, W, 3)."""
         self._place(seconds)
         nearer = self.motion.camera * seconds / np.linalg.norm(TARGET - EYE)
@@ -113,11 +113,11 @@ class SimulatedScene:
         )
         return {"cloud": seen.image, "viewpoint": tuple(eye.tolist())}
 
-    def hold(self, T_cloud_tcp: Float64) -> None:
+    def choose_object(self, T_cloud_tcp: Float64) -> None:
         """Choose the object whose centre is nearest."""
         self.held = int(np.linalg.norm(self.places - T_cloud_tcp[:3, 3], axis=1).argmin())
 
-    def moved(self, seconds: float) -> Float64:
+    def object_motion(self, seconds: float) -> Float64:
         """A translation, and a rotation about the object's centre."""
         motion, place, T = self.motion, self.places[self.held], np.eye(4)
         gone = min(motion.speed * seconds, motion.shift)
@@ -139,7 +139,7 @@ class SimulatedScene:
 
     def _place(self, seconds: float) -> None:
         """Move objects to their poses at a time."""
-        T = self.moved(seconds)
+        T = self.object_motion(seconds)
         for number, start in enumerate(self.start):
             if self.motion.belt or number == self.held:
                 place = T[:3, :3] @ start.position + T[:3, 3]
@@ -167,7 +167,7 @@ def benchmark_tracking(
         "results/tracking"
     ),
     *,
-    asked: DetectorFlags,
+    flags: DetectorFlags,
 ) -> None:
     """Follow a grasp at 30 images a second, then execute it in simulation.
 
@@ -179,9 +179,9 @@ def benchmark_tracking(
         raise ValueError(f"--motion: got {unknown[0]!r}. Choose one of {', '.join(MOTIONS)}.")
     if scenes and set(names) != {"still"}:
         raise ValueError("--motion: got it with --scenes, which stand still. Leave it out.")
-    clock = time.perf_counter if asked.server else time.process_time
+    clock = time.perf_counter if flags.server else time.process_time
     done: dict[str, list[Followed]] = {}
-    with open_client(asked) as client:
+    with open_client(flags) as client:
         for name in names:
             moving = MOTIONS[name] if seconds is None else replace(MOTIONS[name], seconds=seconds)
             if scenes:
@@ -212,7 +212,7 @@ def follow(client: Any, scene: Scene, seconds: float, clock: Callable[[], float]
     tracker, done, now, shown = GraspTracker(top_k=10), Followed(), 0.0, None
     while now < seconds:
         taken = np.floor(now * RATE + 1e-6) / RATE  # the latest image
-        image, start = scene.look(taken), clock()
+        image, start = scene.image_at(taken), clock()
         found = client.detect(**image, **tracker.options())
         spent = clock() - start
         tracker.take(found)
@@ -221,14 +221,14 @@ def follow(client: Any, scene: Scene, seconds: float, clock: Callable[[], float]
             if best is None:
                 return done
             done.first, shown = best, best.id
-            scene.hold(best.T_cloud_tcp)
+            scene.choose_object(best.T_cloud_tcp)
             continue
         now = max(taken + 1.0 / RATE, taken + spent)
         done.latency.append(spent)
         done.switches += int(best is None or best.id != shown)
         done.last, shown = best or done.last, best and best.id
         if best is not None and best.id == done.first.id:
-            true = scene.moved(now) @ done.first.T_cloud_tcp
+            true = scene.object_motion(now) @ done.first.T_cloud_tcp
             apart = np.linalg.norm(best.T_cloud_tcp[:3, 3] - true[:3, 3])
             done.off.append((now, 1000 * float(apart), _degrees(best.T_cloud_tcp, true)))
     return done
@@ -236,7 +236,7 @@ def follow(client: Any, scene: Scene, seconds: float, clock: Callable[[], float]
 
 def found_again(client: Any, scene: Scene) -> float:
     """Share of image pairs of a still scene with the same first grasp, without tracking."""
-    images = [client.detect(**scene.look(number / RATE)).grasps for number in range(REPEATED)]
+    images = [client.detect(**scene.image_at(number / RATE)).grasps for number in range(REPEATED)]
     alike = [
         bool(some and others) and _alike(some[0].T_cloud_tcp, others[0].T_cloud_tcp)
         for some, others in itertools.combinations(images, 2)

@@ -4,10 +4,10 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from edgegrasp_cli.flags import Connection
+from edgegrasp_cli.flags import ConnectionFlags
 
 
-class Cluster(BaseModel, use_attribute_docstrings=True):
+class ClusterFlags(BaseModel, use_attribute_docstrings=True):
     """The flags that choose the engine, the processes and the cluster."""
 
     engine: str | None = None
@@ -18,7 +18,7 @@ class Cluster(BaseModel, use_attribute_docstrings=True):
     """Address of a Ray cluster to run on; local: this machine"""
 
 
-class PlannerFlags(Connection):
+class PlannerFlags(ConnectionFlags):
     """The flags that choose a planner of the benchmark."""
 
     timeout: float = 300.0

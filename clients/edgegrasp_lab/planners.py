@@ -8,7 +8,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from edgegrasp_cli.detect import OwnDetector
+from edgegrasp_cli.detect import InProcessDetector
 from edgegrasp_client import GraspClientError, Model, ServerUnavailableError, StartCollisionError
 from edgegrasp_client.connection import local_server
 from edgegrasp_lab.flags import PlannerFlags
@@ -108,7 +108,7 @@ def _loaded(name: str) -> Any:
     return found
 
 
-class _OneThread(OwnDetector):
+class _OneThread(InProcessDetector):
     """A detector on one thread, so that results do not depend on the number of threads."""
 
     def detect(self, cloud: Any = None, **options: Any) -> Any:
@@ -123,7 +123,7 @@ class ClientPlanner:
 
     def __init__(
         self,
-        open_client: Callable[[], Any],  # returns a GraspClient or an OwnDetector
+        open_client: Callable[[], Any],  # returns a GraspClient or an InProcessDetector
         rules: PlanningRules,  # of the protocol
         options: Mapping[str, Any],  # of each request, besides the protocol's
         timeout: float,  # seconds

@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 from scipy.stats.contingency import crosstab
 
 from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Int64
-from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
-from edgegrasp_camera.picture import View
+from edgegrasp_camera.depth import DepthView, fuse_depth_images, to_intrinsics
+from edgegrasp_camera.picture import Camera
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
 
@@ -39,7 +39,7 @@ class RealScene:
     labels: Int64  # (R,) 0 anything else, 1 the support plane, 2 and up objects
     normal: Float64  # (3,) of the support plane, toward the camera; 0: it is hidden
     offset: float  # normal . x of the plane's points x
-    camera: View
+    camera: Camera
     rgb: NDArray[np.uint8] | None  # (H, W, 3)
 
     @property
@@ -193,7 +193,10 @@ def load_scene(file: Path) -> RealScene:
         checked.get("rgb", "u", "a colour of three bytes for each pixel", points.shape)
     if camera is None:  # unknown, or no camera could have seen the points
         seen = points[np.isfinite(points).all(axis=-1)].reshape(-1, 3)
-        camera, rgb = View.of(seen, np.zeros(3), normal if normal.any() else (0, -1, 0)), None
+        camera, rgb = (
+            Camera.facing(seen, np.zeros(3), normal if normal.any() else (0, -1, 0)),
+            None,
+        )
     return RealScene(file.stem, request, points.reshape(-1, 3), labels, normal, offset, camera, rgb)
 
 
@@ -233,12 +236,12 @@ def judge(
 
 def _meet_points(scene: RealScene, grasps: Sequence[Any], gripper: Gripper) -> Bools:
     """Which open hands (E,) contain a measured point, before any cleaning, deeper than NOISE."""
-    from edgegrasp_model.kernels import any_point_in_boxes, in_hands  # loads Numba
+    from edgegrasp_model.kernels import any_point_in_boxes, loop_input  # loads Numba
 
     seen = scene.points[np.isfinite(scene.points).all(axis=1)]
     hands = np.reshape([grasp.T_cloud_hand for grasp in grasps], (-1, 4, 4)).astype(np.float32)
     boxes = np.add(gripper.boxes(gripper.max_opening), [[NOISE], [-NOISE]])
-    return any_point_in_boxes(in_hands(seen, hands), boxes)
+    return any_point_in_boxes(loop_input(seen, hands), boxes)
 
 
 def _objects_held(scene: RealScene, grasps: Sequence[Any]) -> Int64:
@@ -297,14 +300,14 @@ def _plane(arrays: _Arrays) -> tuple[Float64, float]:
     return normal.astype(np.float64), offset
 
 
-def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32, View | None]:
+def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32, Camera | None]:
     """The detector's input, points (H, W, 3) or (N, 3), NaN without a reading, and the camera."""
     if "depth" in arrays.arrays:
         depth = arrays.get("depth", "u", "(H, W) uint16 millimetres")
         values = arrays.get("intrinsics", "fiu", "fx, fy, cx, cy beside depth", (4,)).tolist()
-        view = DepthView(intrinsics_of(values))
+        view = DepthView(to_intrinsics(values))
         points = np.asarray(fuse_depth_images([depth], [view]).points, dtype=np.float32)
-        camera = View((depth.shape[0], depth.shape[1]), *values)
+        camera = Camera((depth.shape[0], depth.shape[1]), *values)
         return {"depth_images": [{"depth": depth, "intrinsics": values}]}, points, camera
     wanted = "(H, W, 3) or (N, 3) float32 metres, or depth and intrinsics"
     points = arrays.get("points", "f", wanted)
@@ -312,4 +315,4 @@ def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32, View | None]:
         arrays.refuse("points", f"shape {points.shape}", wanted)
     points = points.astype(np.float32)
     request = {"cloud": points, "viewpoint": (0.0, 0.0, 0.0)}
-    return request, points, View.of_image(points) if points.ndim == 3 else None
+    return request, points, Camera.from_image(points) if points.ndim == 3 else None

@@ -12,12 +12,12 @@ from rich.progress import Progress, track
 from typer import Argument, Option
 
 from edgegrasp_cli.flags import takes_flags
-from edgegrasp_lab.flags import Cluster
+from edgegrasp_lab.flags import ClusterFlags
 from edgegrasp_sim.engine import choose_engine
 from edgegrasp_training.options import GenerationOptions, TrainingOptions
 
 
-class DataFlags(GenerationOptions, Cluster):
+class DataFlags(GenerationOptions, ClusterFlags):
     """The flags of `edgegrasp generate-data`."""
 
     objects: Path | None = None
@@ -28,7 +28,7 @@ class DataFlags(GenerationOptions, Cluster):
 def generate_data(
     output: Annotated[Path, Argument(help="Folder for the views, one file each.")],
     *,
-    asked: DataFlags,
+    flags: DataFlags,
 ) -> None:
     """Make labelled edge grasps: views of random clutter, grasps tried in simulation.
 
@@ -36,14 +36,14 @@ def generate_data(
     """
     from edgegrasp_training.generation import generate, missing_scenes
 
-    print(f"engine: {choose_engine(asked.engine)}")
-    missing = len(missing_scenes(output, asked))
+    print(f"engine: {choose_engine(flags.engine)}")
+    missing = len(missing_scenes(output, flags))
     tried = held = 0
-    made = generate(output, asked.objects, asked, asked.workers, asked.ray)
+    made = generate(output, flags.objects, flags, flags.workers, flags.ray)
     for _, grasps, successes in track(made, "scenes", total=missing):
         tried, held = tried + grasps, held + successes
     share = f", {100 * held / tried:.1f} % held" if tried else ""
-    print(f"{missing} scenes made, {asked.scenes - missing} kept; {tried} grasps tried{share}.")
+    print(f"{missing} scenes made, {flags.scenes - missing} kept; {tried} grasps tried{share}.")
 
 
 class TrainFlags(TrainingOptions, use_attribute_docstrings=True):
@@ -73,7 +73,7 @@ def train(
         list[Path] | None, Argument(help="Folders of views from generate-data.")
     ] = None,
     *,
-    asked: TrainFlags,
+    flags: TrainFlags,
 ) -> None:
     """Train weights on labelled views.
 
@@ -87,32 +87,32 @@ def train(
     from edgegrasp_training.training import Trainer
     from edgegrasp_training.views import find_views, split_by_scene
 
-    if asked.outcomes is not None:
-        if asked.start_from is None or data:
+    if flags.outcomes is not None:
+        if flags.start_from is None or data:
             raise ValueError("--outcomes: name the weights with --start-from, and give no data.")
-        print(recalibrate(asked.start_from, asked.outcomes, asked.run))
+        print(recalibrate(flags.start_from, flags.outcomes, flags.run))
         return
     if not data:
         raise ValueError("data: got nothing. Name folders of views, or --outcomes.")
-    if asked.keep and asked.start_from is None:
+    if flags.keep and flags.start_from is None:
         raise ValueError("--keep: got no weights. Name them with --start-from.")
-    views, validation = split_by_scene(find_views(data), asked.validation_share, asked.seed)
-    metadata, teacher = recipe(asked.model), None
-    if asked.teacher is not None:
-        teacher = Teacher(asked.teacher, metadata.network.crop_radius)
-    device = choose_device(asked.device)
+    views, validation = split_by_scene(find_views(data), flags.validation_share, flags.seed)
+    metadata, teacher = recipe(flags.model), None
+    if flags.teacher is not None:
+        teacher = Teacher(flags.teacher, metadata.network.crop_radius)
+    device = choose_device(flags.device)
     trainer = Trainer(
-        metadata, views, validation, asked.run, asked, device, teacher, asked.start_from
+        metadata, views, validation, flags.run, flags, device, teacher, flags.start_from
     )
     print(f"{len(views)} training and {len(validation)} validation views")
     with Progress() as progress:
-        task = progress.add_task("steps", total=asked.steps, completed=trainer.step)
-        for step, loss in trainer.run(asked.until):
+        task = progress.add_task("steps", total=flags.steps, completed=trainer.step)
+        for step, loss in trainer.run(flags.until):
             progress.update(task, completed=step, description=f"loss {loss:.3f}")
     if trainer.finished:
         provenance = {"data": [folder.name for folder in data], "date": time.strftime("%Y-%m-%d")}
         evaluation = trainer.finish(provenance, shlex.join(["edgegrasp", *sys.argv[1:]]))
-        print(f"validation loss {evaluation.loss:.4f}, AUROC {evaluation.auroc:.4f}: {asked.run}")
+        print(f"validation loss {evaluation.loss:.4f}, AUROC {evaluation.auroc:.4f}: {flags.run}")
     else:
         print(f"paused at step {trainer.step}; the same command continues")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from edgegrasp_sim import engine as engines
-from edgegrasp_sim import hand, scene, surroundings
+from edgegrasp_sim import fixed_parts, hand, scene
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.results import ResultFolder
@@ -119,7 +119,7 @@ def constants(engine: str) -> dict[str, float]:
         "time_step": engines.TIME_STEP,
         "gravity": engines.GRAVITY,
         "collision_depth": world.collision_depth,
-        "table_friction": surroundings.TABLE_FRICTION,
+        "table_friction": fixed_parts.TABLE_FRICTION,
         "packed_attempts": scene.PACKED_ATTEMPTS,
         "pile_drop_height": scene.PILE_DROP_HEIGHT,
         "rest_speed": scene.REST_SPEED,

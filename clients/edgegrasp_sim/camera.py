@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, PositiveFloat
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
-from edgegrasp_sim.engine import Intrinsics
+from edgegrasp_sim.engine import SimCamera
 
-CAMERA = Intrinsics()
-FARTHEST = 0.999  # share of the camera's range; at larger depths a pixel is empty
+CAMERA = SimCamera()
+FAR_SHARE = 0.999  # share of the camera's range; at larger depths a pixel is empty
 TableView = Literal["known", "seen", "around", "auto"]
 Float = TypeVar("Float", bound=np.floating)
 
@@ -96,9 +96,9 @@ def look_at(eye: Float64, target: Float64) -> Float64:
     return T
 
 
-def points_of(depth: Float64, T_world_camera: Float64, camera: Intrinsics) -> Float64:
+def unproject_to_world(depth: Float64, T_world_camera: Float64, camera: SimCamera) -> Float64:
     """The points of a depth image (height, width) nearer than `far`: (N, 3) metres, world frame."""
-    seen = depth < FARTHEST * camera.far
+    seen = depth < FAR_SHARE * camera.far
     # The renderer samples a pixel at its lower left corner.
     right = (np.arange(camera.width) - camera.centre_x) * depth
     down = (np.arange(1, camera.height + 1)[:, None] - camera.centre_y) * depth

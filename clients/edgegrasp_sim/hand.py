@@ -73,7 +73,7 @@ class GraspResult:
 
 
 def run_grasp(
-    gripper: "Gripper",  # the hand to use
+    gripper: "HandDriver",  # the hand to use
     T_world_hand: Float64,  # pose of the `panda_hand` link at the grasp, (4, 4)
     objects: Mapping[int, SceneObject],  # objects that may be held, by the id of their bodies
     obstacles: Set[int] = frozenset(),  # bodies; a collision with one fails the grasp
@@ -106,7 +106,7 @@ def run_grasp(
     missed = gripper.is_shut
     caught = _touched(gripper, objects)
     if not missed or to_the_end:
-        clear = _is_clear(gripper, objects, gripper.body.opening)
+        clear = _outcome_decided(gripper, objects, gripper.body.opening)
         for _ in gripper.go(T_world_hand, away=True):
             if not to_the_end and next(clear):
                 break
@@ -134,7 +134,7 @@ def retreat_pose(T_world_hand: Float64) -> Float64:
     return T_world_hand @ translation(0.0, 0.0, -RETREAT_DISTANCE)
 
 
-class Gripper:
+class HandDriver:
     """The simulated hand, in the hand frame of its file: z out of the palm, y the closing axis."""
 
     body: Hand
@@ -184,7 +184,7 @@ class Gripper:
             yield
 
 
-class ArmGripper(Gripper):
+class ArmDriver(HandDriver):
     """The hand on an arm."""
 
     def __init__(self, world: World, hand: HandModel, arm: ArmModel, min_opening: float) -> None:
@@ -219,7 +219,7 @@ class ArmGripper(Gripper):
             yield
 
 
-def seconds_of(motion: ArmTrajectory) -> float:
+def motion_seconds(motion: ArmTrajectory) -> float:
     """Seconds of the motion from home to the grasp, away from it, and home on the same path."""
     return float(motion.times[-1] + motion.times[motion.pregrasp_row]) + CLOSE_SECONDS
 
@@ -241,7 +241,7 @@ def panda() -> HandModel:
     )
 
 
-def hand_of(gripper: Mapping[str, Any]) -> HandModel:
+def hand_model(gripper: Mapping[str, Any]) -> HandModel:
     """The hand of boxes described by the fields of a valid gripper file, see docs/frames.md."""
     palm, finger = (np.array(gripper[part]["boxes"], float) for part in ("hand", "finger"))
     opening, root = float(gripper["max_opening"]), float(finger[:, 0, 2].min())
@@ -274,7 +274,7 @@ def _corners(boxes: Float64) -> Parts:
     return tuple(box[pick, np.arange(3)] for box in boxes)
 
 
-def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: bool) -> None:
+def _close(gripper: HandDriver, objects: Mapping[int, SceneObject], *, to_the_end: bool) -> None:
     """Close the fingers; unless `to_the_end`, stop when they are shut or hold firmly."""
     opening, still_steps = gripper.body.opening, 0
     gripper.body.close_fingers()
@@ -287,8 +287,8 @@ def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: 
             return
 
 
-def _is_clear(
-    gripper: Gripper, objects: Mapping[int, SceneObject], opening: float
+def _outcome_decided(
+    gripper: HandDriver, objects: Mapping[int, SceneObject], opening: float
 ) -> Iterator[bool]:
     """Yields, after every time step of a retreat, whether the outcome is clear.
 
@@ -312,7 +312,10 @@ def _is_clear(
 
 
 def _holds_when_shaken(
-    gripper: Gripper, T_world_hand: Float64, held: SceneObject, objects: Mapping[int, SceneObject]
+    gripper: HandDriver,
+    T_world_hand: Float64,
+    held: SceneObject,
+    objects: Mapping[int, SceneObject],
 ) -> bool:
     """Shake the lifted hand; returns whether it still holds the object."""
     world = gripper.world
@@ -327,19 +330,19 @@ def _holds_when_shaken(
     return not gripper.is_shut and held in _touched(gripper, objects)
 
 
-def _cut_into(gripper: Gripper) -> list[Contact]:
+def _cut_into(gripper: HandDriver) -> list[Contact]:
     contacts, depth = gripper.body.contacts(), gripper.world.collision_depth
     return [each for each in contacts if each.distance < -depth]
 
 
-def _touched(gripper: Gripper, objects: Mapping[int, SceneObject]) -> list[SceneObject]:
+def _touched(gripper: HandDriver, objects: Mapping[int, SceneObject]) -> list[SceneObject]:
     """The objects in contact with the hand, in the order of the contacts."""
     uids = [contact.other_uid for contact in gripper.body.contacts()]
     return [objects[uid] for uid in dict.fromkeys(uids) if uid in objects]
 
 
 def _object_between_fingers(
-    gripper: Gripper, T_world_hand: Float64, objects: Mapping[int, SceneObject]
+    gripper: HandDriver, T_world_hand: Float64, objects: Mapping[int, SceneObject]
 ) -> SceneObject | None:
     """The object between the fingers at the grasp: the first hit by rays from finger to finger."""
     half, depths = 0.5 * gripper.model.max_opening, [gripper.model.tip - d for d in _TARGET_DEPTHS]

@@ -65,7 +65,7 @@ class ObjectModel:
     name: str  # unique within its set
     urdf: Path  # its description
     scale: float = 1.0  # factor that fits it to the hand, before a scene's own scale
-    origin: "ObjectModel | None" = None  # the original, if it is a stretched copy
+    unstretched: "ObjectModel | None" = None  # the original, if it is a stretched copy
 
     @property
     def files(self) -> list[Path]:

@@ -13,9 +13,9 @@ from pydantic import ConfigDict, Field, NonNegativeFloat, PositiveInt, TypeAdapt
 from pydantic.dataclasses import dataclass
 
 from edgegrasp_sim.camera import Sizes, TableView, ViewRange
+from edgegrasp_sim.fixed_parts import OPEN_THICKNESS
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.sensor import SENSORS, DepthNoise, DepthSensor, Share, random_sensor
-from edgegrasp_sim.surroundings import OPEN_THICKNESS
 
 FOLDER = Path(__file__).parent / "protocols"
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)

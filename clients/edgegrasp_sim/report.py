@@ -9,12 +9,12 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from edgegrasp_camera.picture import Picture, View
+from edgegrasp_camera.picture import Camera, Picture
 from edgegrasp_sim.benchmark import BenchmarkConfig
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import protocol_from
-from edgegrasp_sim.results import RATE_LABELS, ResultFolder, over_seeds, percent, planner_title
+from edgegrasp_sim.results import RATE_LABELS, ResultFolder, planner_title, rate_text, seed_spread
 from edgegrasp_sim.trial import Attempt, PlannedGrasp, Round, RoundDriver
 
 PICTURES = 6
@@ -60,9 +60,9 @@ def repeat(
     with config.simulation(run["objects"]["digest"]) as simulation:
         driver = RoundDriver(simulation, config.scene, config.protocol, seed=seed, index=index)
         for recorded in done.attempts[: number + 1]:
-            seen = driver.look()
+            seen = driver.observe()
             while driver.view < recorded.view:  # views in which no grasp was found
-                seen = driver.look()
+                seen = driver.observe()
             grasp = PlannedGrasp(recorded.T_world_hand, recorded.score, recorded.width)
             repeated = driver.execute(grasp)
     return done, repeated, seen
@@ -91,15 +91,15 @@ def key_figures(summary: dict[str, Any]) -> Iterator[Row]:
     """The figures of a benchmark, each with its name."""
     rates = [summary[name] for name in RATE_LABELS]
     for name, label in RATE_LABELS.items():
-        yield f"{label} % [95 % interval]", percent(summary[name])
+        yield f"{label} % [95 % interval]", rate_text(summary[name])
     for seed in rates[0]["by_seed"]:
         yield f"seed {seed}: GSR, DR", ", ".join(_share(rate["by_seed"][seed]) for rate in rates)
-    yield "mean ± standard deviation over seeds: GSR, DR", ", ".join(map(over_seeds, rates))
+    yield "mean ± standard deviation over seeds: GSR, DR", ", ".join(map(seed_spread, rates))
     yield "grasps held", f"{summary['successes']} of {summary['attempts']}"
     yield "of those another object than the one aimed at", summary["wrong_object_successes"]
     yield "objects", summary["objects"]
     if number := (wide := summary["too_wide"])["objects"]:
-        of_others = ", ".join(percent(wide[f"{name}_of_others"]) for name in RATE_LABELS)
+        of_others = ", ".join(rate_text(wide[f"{name}_of_others"]) for name in RATE_LABELS)
         yield f"without {number} objects wider than the hand opens: GSR, DR", of_others
     yield "failures", _counted(summary["failures"])
     yield "ends of rounds", _counted(summary["round_ends"])
@@ -131,7 +131,7 @@ def attempt_title(done: Round, number: int) -> str:
 
 def draw_attempt(path: Path, done: Round, number: int, seen: Observation) -> None:
     """Write a picture of an attempt in the cloud that was seen before it."""
-    view = View.of(seen.cloud, seen.camera_position)
+    view = Camera.facing(seen.cloud, seen.camera_position)
     picture = Picture(view, seen.cloud, title=attempt_title(done, number))
     picture.grasps([done.attempts[number]])
     picture.save(path)

@@ -105,8 +105,8 @@ def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
     attempts = [attempt for item in rounds for attempt in item.attempts]
     planning = sorted(attempt.planning_seconds for attempt in attempts)
     seeds = np.array([item.seed for item in rounds])
-    counts = dict(zip(COUNTS, count(rounds), strict=True))
-    fitting = dict(zip(COUNTS, count(map(without_too_wide, rounds)), strict=True))
+    counts = dict(zip(COUNTS, count_outcomes(rounds), strict=True))
+    fitting = dict(zip(COUNTS, count_outcomes(map(without_too_wide, rounds)), strict=True))
     return {
         "rounds": len(rounds),
         **{name: int(numbers.sum()) for name, numbers in counts.items()},
@@ -133,7 +133,7 @@ def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
         }
         if planning
         else None,
-        "objects_by_name": by_object(rounds),
+        "objects_by_name": counts_by_object(rounds),
         "attempts_digest": attempts_digest(rounds),
     }
 
@@ -153,7 +153,7 @@ def _arm_figures(rounds: Sequence[Round]) -> dict[str, Any] | None:
     }
 
 
-def count(rounds: Iterable[Round]) -> Int64:
+def count_outcomes(rounds: Iterable[Round]) -> Int64:
     """Successes, attempts and objects of each round, in the order of `COUNTS`: (3, R)."""
     rows = [(item.successes, len(item.attempts), len(item.objects)) for item in rounds]
     return np.array(rows, np.int64).reshape(-1, len(COUNTS)).T
@@ -166,7 +166,7 @@ def without_too_wide(item: Round) -> Round:
     return replace(item, objects=tuple(left.elements()), attempts=attempts)
 
 
-def by_object(rounds: Sequence[Round]) -> dict[str, dict[str, int]]:
+def counts_by_object(rounds: Sequence[Round]) -> dict[str, dict[str, int]]:
     """For each object: how often it was present, removed, aimed at, and held when aimed at."""
     attempts = [attempt for item in rounds for attempt in item.attempts]
     counts: dict[str, Counter[Any]] = {
@@ -207,7 +207,7 @@ def compare(first: ResultFolder, second: ResultFolder) -> dict[str, Any]:
     shared = sorted(rounds[0].keys() & rounds[1].keys())
     if not shared:
         raise ValueError(f"{first.path} and {second.path} share no round; use the same seeds")
-    counts = [count([run[key] for key in shared]) for run in rounds]
+    counts = [count_outcomes([run[key] for key in shared]) for run in rounds]
     successes, attempts, objects = np.stack(counts, axis=1)  # (2, S) each
     figures: dict[str, Any] = {
         "first": runs[0]["planner"],
@@ -225,7 +225,7 @@ def compare(first: ResultFolder, second: ResultFolder) -> dict[str, Any]:
     return figures
 
 
-def below_gate(summary: dict[str, Any], gate: Path) -> list[str]:
+def gate_failures(summary: dict[str, Any], gate: Path) -> list[str]:
     """Sentences about rates that fall below the interval of a committed result."""
     try:
         committed = json.loads(gate.read_text())
@@ -267,7 +267,7 @@ def paired_difference(above: Int64, below: Int64) -> dict[str, Any]:
     return {"difference": second - first, "difference_95": (low, high)}
 
 
-def percent(rate: dict[str, Any]) -> str:
+def rate_text(rate: dict[str, Any]) -> str:
     """A rate with its 95 % interval, in per cent."""
     if rate["value"] is None:
         return "none"
@@ -275,7 +275,7 @@ def percent(rate: dict[str, Any]) -> str:
     return f"{100 * rate['value']:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
-def over_seeds(rate: dict[str, Any]) -> str:
+def seed_spread(rate: dict[str, Any]) -> str:
     """Mean of the seeds' rates, and the standard deviation of several seeds, in per cent."""
     numbers = (rate["mean_over_seeds"], rate["std_over_seeds"])
     return " ± ".join(f"{100 * number:.1f}" for number in numbers if number is not None) or "none"

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float64
-from edgegrasp_sim import surroundings as fixed
+from edgegrasp_sim import fixed_parts as parts
 from edgegrasp_sim.engine import TIME_STEP, Body, Vector, World
+from edgegrasp_sim.fixed_parts import MIDDLE, SIZE, TABLE_HEIGHT, Box, FixedParts
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import about_z
-from edgegrasp_sim.surroundings import MIDDLE, SIZE, TABLE_HEIGHT, Box, Surroundings
 
 # The default range of the objects' scale, by the kind that the objects belong to.
 SCALES = {SceneKind.PACKED: (0.7, 0.8), SceneKind.PILE: (0.8, 1.0)}
@@ -70,15 +70,15 @@ def load_object(
 class Layout(NamedTuple):
     """The parts of a scene."""
 
-    world: World  # gets the objects; contains the surroundings already
-    surroundings: Surroundings  # the fixed parts
+    world: World  # gets the objects; contains the fixed parts already
+    fixed_parts: FixedParts
     objects: ObjectSet  # to draw from
     rng: np.random.Generator  # source of the draws
     num_objects: int  # how many to try to place
     scales: tuple[float, float]  # range of their scale
 
 
-MakeSurroundings: TypeAlias = Callable[[np.random.Generator], Surroundings]
+MakeSurroundings: TypeAlias = Callable[[np.random.Generator], FixedParts]
 MakeObjects: TypeAlias = Callable[[Layout], list[SceneObject]]
 
 
@@ -89,7 +89,7 @@ def make_packed(layout: Layout) -> list[SceneObject]:
 
 def make_table(layout: Layout) -> list[SceneObject]:
     """Put objects on a table or a shelf, next to its fixed parts: most upright, some dropped."""
-    rng, reach = layout.rng, np.array(layout.surroundings.reach)
+    rng, reach = layout.rng, np.array(layout.fixed_parts.reach)
     attempts = CROWD_ATTEMPTS * layout.num_objects
     return _put_down(
         layout, attempts, lambda: MIDDLE + rng.uniform(-reach, reach, size=2), LYING_SHARE
@@ -98,7 +98,7 @@ def make_table(layout: Layout) -> list[SceneObject]:
 
 def make_bin(layout: Layout) -> list[SceneObject]:
     """Drop objects into a bin one by one; objects that do not fit are removed."""
-    return settle(layout.world, _pour(layout, layout.num_objects, POUR_MARGIN), layout.surroundings)
+    return settle(layout.world, _pour(layout, layout.num_objects, POUR_MARGIN), layout.fixed_parts)
 
 
 def make_full_bin(layout: Layout) -> list[SceneObject]:
@@ -106,7 +106,7 @@ def make_full_bin(layout: Layout) -> list[SceneObject]:
     placed: list[SceneObject] = []
     while len(placed) < layout.num_objects and _covered(layout, placed) < COVERED:
         new = _pour(layout, min(AT_ONCE, layout.num_objects - len(placed)), FULL_MARGIN)
-        placed = settle(layout.world, [*placed, *new], layout.surroundings)
+        placed = settle(layout.world, [*placed, *new], layout.fixed_parts)
     return placed
 
 
@@ -122,7 +122,7 @@ def make_pile(layout: Layout) -> list[SceneObject]:
     dropped = _drop(layout, layout.num_objects, where, top, PILE_SECONDS)
     for wall in walls:
         wall.remove()
-    return settle(layout.world, dropped, layout.surroundings)
+    return settle(layout.world, dropped, layout.fixed_parts)
 
 
 def wait_for_rest(world: World, objects: Sequence[SceneObject], seconds: float) -> None:
@@ -134,13 +134,13 @@ def wait_for_rest(world: World, objects: Sequence[SceneObject], seconds: float) 
 
 
 def settle(
-    world: World, objects: Sequence[SceneObject], surroundings: Surroundings
+    world: World, objects: Sequence[SceneObject], fixed_parts: FixedParts
 ) -> list[SceneObject]:
     """Wait for rest and remove objects outside the workspace, until none leaves it."""
     remaining = list(objects)
     while True:
         wait_for_rest(world, remaining, REST_SECONDS)
-        outside = [item for item in remaining if not surroundings.contain(item.body)]
+        outside = [item for item in remaining if not fixed_parts.contains(item.body)]
         if not outside:
             return remaining
         for item in outside:
@@ -150,15 +150,15 @@ def settle(
 
 def _pour(layout: Layout, number: int, share: float) -> list[SceneObject]:
     """Drop objects into a bin, except for a share of its length and width along each side."""
-    low, high = np.asarray(layout.surroundings.bounds)[:, :2]
+    low, high = np.asarray(layout.fixed_parts.bounds)[:, :2]
     margin = share * (high - low)
-    walls = max(box.centre[2] + box.size[2] / 2 for box in layout.surroundings.boxes)
+    walls = max(box.centre[2] + box.size[2] / 2 for box in layout.fixed_parts.boxes)
     return _drop(layout, number, (low + margin, high - margin), walls + POUR_HEIGHT, POUR_SECONDS)
 
 
 def _covered(layout: Layout, placed: Sequence[SceneObject]) -> float:
     """The share of a bin's floor that objects hide from above."""
-    low, high = np.asarray(layout.surroundings.bounds)[:, :2]
+    low, high = np.asarray(layout.fixed_parts.bounds)[:, :2]
     steps = (np.arange(RAYS) + 0.5) / RAYS
     place = low + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * (high - low)
     starts, ends = (np.insert(place, 2, z, axis=1) for z in (1.0, TABLE_HEIGHT - 0.01))
@@ -209,17 +209,20 @@ def _put_down(
             new.body.remove()
             world.restore_state(state)
         else:
-            placed = settle(world, [*placed, new], layout.surroundings)
+            placed = settle(world, [*placed, new], layout.fixed_parts)
     return placed
 
 
-# The surroundings of the objects (None: an open table), and how objects are placed.
-STANDING_IN: dict[SceneKind, tuple[MakeSurroundings | None, MakeObjects]] = {
+# The fixed parts (None: an open table), and how objects are placed.
+SCENE_MAKERS: dict[SceneKind, tuple[MakeSurroundings | None, MakeObjects]] = {
     SceneKind.PACKED: (None, make_packed),
     SceneKind.PILE: (None, make_pile),
-    SceneKind.BIN: (fixed.random_bin, make_bin),
-    SceneKind.FULL_BIN: (partial(fixed.random_bin, extents=fixed.SMALL_BIN_INSIDE), make_full_bin),
-    SceneKind.DEEP_BIN: (partial(fixed.random_bin, extents=fixed.DEEP_BIN_INSIDE), make_bin),
-    SceneKind.TABLE: (fixed.random_table, make_table),
-    SceneKind.SHELF: (fixed.random_shelf, make_table),
+    SceneKind.BIN: (parts.random_bin, make_bin),
+    SceneKind.FULL_BIN: (
+        partial(parts.random_bin, extents=parts.SMALL_BIN_INSIDE),
+        make_full_bin,
+    ),
+    SceneKind.DEEP_BIN: (partial(parts.random_bin, extents=parts.DEEP_BIN_INSIDE), make_bin),
+    SceneKind.TABLE: (parts.random_table, make_table),
+    SceneKind.SHELF: (parts.random_shelf, make_table),
 }

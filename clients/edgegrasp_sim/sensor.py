@@ -15,7 +15,7 @@ from pydantic import Field, NonNegativeFloat, PositiveInt
 from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter, zoom
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64
-from edgegrasp_sim.engine import Intrinsics
+from edgegrasp_sim.engine import SimCamera
 
 EDGE = 0.015  # metres; a larger depth step between neighbouring pixels is an edge
 SAME_SURFACE = 0.004  # metres; a pixel this little behind another is not hidden by it
@@ -34,7 +34,7 @@ class DepthNoise:
     correlated_pixels: PositiveInt = 4  # pixels between its independent values, interpolated
     correlated_share: Share = 0.0  # share of the images that have it
 
-    def apply(self, depth: Float64, camera: Intrinsics, rng: np.random.Generator) -> Float64:
+    def apply(self, depth: Float64, camera: SimCamera, rng: np.random.Generator) -> Float64:
         """A noisy copy of a depth image of any camera: (height, width) metres."""
         noisy: Float64 = depth
         if self.gamma_shape > 0:
@@ -64,7 +64,7 @@ class DepthSensor:
     grazing: float  # degrees from the surface normal at which half of the readings are missing
     missing: float  # share of the image that is missing in patches
 
-    def apply(self, depth: Float64, camera: Intrinsics, rng: np.random.Generator) -> Float64:
+    def apply(self, depth: Float64, camera: SimCamera, rng: np.random.Generator) -> Float64:
         """The image that this camera gives: (height, width) metres, NaN without a reading."""
         true = depth.astype(np.float32)
         seen = self._at_edges(true, rng)
@@ -103,7 +103,7 @@ class DepthSensor:
         seen[rows, columns] = np.where(share < self.fattening, near, here)
         return seen
 
-    def _grazing(self, depth: Float32, camera: Intrinsics, rng: np.random.Generator) -> Bools:
+    def _grazing(self, depth: Float32, camera: SimCamera, rng: np.random.Generator) -> Bools:
         """Pixels that see a surface at a grazing angle."""
         slope = np.zeros_like(depth)
         for axis in (0, 1):

@@ -13,15 +13,15 @@ from edgegrasp_camera.arrays import Float64
 from edgegrasp_camera.picture import shaded
 from edgegrasp_results import ArmTrajectory
 from edgegrasp_sim import hand
-from edgegrasp_sim.camera import CAMERA, FARTHEST, Observation, TableView, crop, points_of
+from edgegrasp_sim.camera import CAMERA, FAR_SHARE, Observation, TableView, crop, unproject_to_world
 from edgegrasp_sim.engine import ArmModel, Vector, make_world
 from edgegrasp_sim.engine.urdf import least_width
-from edgegrasp_sim.hand import MIN_OPENING, ArmGripper, GraspResult, Gripper, run_grasp
+from edgegrasp_sim.fixed_parts import OPEN_TABLE, TABLE_HEIGHT, FixedParts
+from edgegrasp_sim.hand import MIN_OPENING, ArmDriver, GraspResult, HandDriver, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import require_pose
-from edgegrasp_sim.scene import SCALES, STANDING_IN, Layout, SceneObject, load_object, settle
+from edgegrasp_sim.scene import SCALES, SCENE_MAKERS, Layout, SceneObject, load_object, settle
 from edgegrasp_sim.sensor import DepthNoise, DepthSensor
-from edgegrasp_sim.surroundings import OPEN_TABLE, TABLE_HEIGHT, Surroundings
 
 NOISE_STD = 0.001  # metres
 WOOD = np.array([168.0, 140.0, 110.0])  # colour of the fixed parts
@@ -56,12 +56,12 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         min_opening: float = MIN_OPENING,  # metres; a hand that is open by less holds nothing
     ) -> None:
         self.gripper, self.arm, self.min_opening = gripper, arm, min_opening
-        self.hand = hand.panda() if gripper is None else hand.hand_of(gripper)
-        self.object_set, self.surroundings = objects, OPEN_TABLE
+        self.hand = hand.panda() if gripper is None else hand.hand_model(gripper)
+        self.object_set, self.fixed_parts = objects, OPEN_TABLE
         self.world = make_world(engine)
         self._objects: list[SceneObject] = []
         self._obstacles: frozenset[int] = frozenset()
-        self._gripper: Gripper | None = None
+        self._gripper: HandDriver | None = None
         self._rest_state: Any = None
 
     def __exit__(self, *_: object) -> None:
@@ -103,12 +103,12 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         rng: np.random.Generator,  # the scene's own stream
         num_objects: int = 5,  # how many to try to place
         scales: tuple[float, float] | None = None,  # range of the objects' scale; None: default
-        table: Surroundings = OPEN_TABLE,  # of packed and pile scenes
+        table: FixedParts = OPEN_TABLE,  # of packed and pile scenes
     ) -> int:
         """Make a new scene at rest; returns its number of objects."""
         kind = SceneKind(scene)
         objects = self.object_set or ObjectSet.builtin(kind)
-        surround, make = STANDING_IN[kind]
+        surround, make = SCENE_MAKERS[kind]
         around = self._clear(table if surround is None else surround(rng))
         scales = scales or SCALES[kind.objects]
         self._objects = make(Layout(self.world, around, objects, rng, num_objects, scales))
@@ -116,10 +116,10 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         return self.num_objects
 
     def reset_from_poses(
-        self, placements: Sequence[ObjectPlacement], surroundings: Surroundings = OPEN_TABLE
+        self, placements: Sequence[ObjectPlacement], fixed_parts: FixedParts = OPEN_TABLE
     ) -> None:
         """Place objects exactly at the given poses, at rest, without simulating."""
-        self._clear(surroundings)
+        self._clear(fixed_parts)
         for placement in placements:
             model = ObjectModel(placement.urdf.stem, placement.urdf)
             item = load_object(
@@ -144,7 +144,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         table: TableView = "known",  # how the cloud contains the table, see `PlanningRules`
     ) -> Observation:
         """Observe the scene from each of the given poses, (4, 4) each."""
-        workspace = np.asarray(self.surroundings.workspace)
+        workspace = np.asarray(self.fixed_parts.workspace)
         boxes = {"known": workspace, "seen": workspace - _ALOFT + _AROUND}
         box = boxes.get(table, _EVERYWHERE)
         clouds = []
@@ -152,7 +152,7 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
             depth = self.world.render_depth(T_world_camera, CAMERA)
             for fault in faults:
                 depth = fault.apply(depth, CAMERA, rng_noise)
-            points = crop(points_of(depth, T_world_camera, CAMERA), box, _CROP_MARGIN)
+            points = crop(unproject_to_world(depth, T_world_camera, CAMERA), box, _CROP_MARGIN)
             points = points + rng_noise.normal(0.0, noise_std, size=points.shape)
             clouds.append(crop(points, box).astype(np.float32, order="C"))
         whole = table not in boxes and len(clouds) == 1
@@ -163,14 +163,14 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
             camera_positions=np.stack([T[:3, 3] for T in T_world_cameras]).astype(np.float32),
             view_ids=np.repeat(np.arange(len(clouds), dtype=np.int32), [len(c) for c in clouds]),
             table=table,
-            pixels=np.flatnonzero(depth < FARTHEST * CAMERA.far) if whole else None,
+            pixels=np.flatnonzero(depth < FAR_SHARE * CAMERA.far) if whole else None,
         )
 
     def color_image(self, T_world_camera: Float64) -> NDArray[np.uint8]:
         """The scene in colour from a pose (4, 4): (H, W, 3), each object in a different colour."""
         depth = self.world.render_depth(T_world_camera, CAMERA)
-        seen = depth < FARTHEST * CAMERA.far
-        points, eye = points_of(depth, T_world_camera, CAMERA), T_world_camera[:3, 3]
+        seen = depth < FAR_SHARE * CAMERA.far
+        points, eye = unproject_to_world(depth, T_world_camera, CAMERA), T_world_camera[:3, 3]
         around = np.add(self.object_bounds, [[-0.003], [0.003]])
         inside = [((points > low) & (points < high)).all(axis=1) for low, high in around]
         row = np.flatnonzero(np.any(inside, axis=0))
@@ -208,16 +208,16 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         if result.held is not None:
             result.held.body.remove()
             self._objects.remove(result.held)
-        self._objects = settle(self.world, self._objects, self.surroundings)
+        self._objects = settle(self.world, self._objects, self.fixed_parts)
         return result
 
-    def _add_gripper(self) -> Gripper:
+    def _add_gripper(self) -> HandDriver:
         if self.arm is None:
-            return Gripper(self.world, self.hand, self.min_opening)
-        return ArmGripper(self.world, self.hand, self.arm, self.min_opening)
+            return HandDriver(self.world, self.hand, self.min_opening)
+        return ArmDriver(self.world, self.hand, self.arm, self.min_opening)
 
     @property
-    def _hand(self) -> Gripper:
+    def _hand(self) -> HandDriver:
         if self._gripper is None:
             raise RuntimeError("there is no scene yet; call reset or reset_from_poses first")
         return self._gripper
@@ -241,11 +241,11 @@ class ClutterSimulation(AbstractContextManager["ClutterSimulation"]):
         self.world.detect_collisions()
         self.world.restore_state(self._rest_state)
 
-    def _clear(self, surroundings: Surroundings) -> Surroundings:
+    def _clear(self, fixed_parts: FixedParts) -> FixedParts:
         self.world.reset()
         self._objects = []
         self._gripper = None
         self._rest_state = None
-        self.surroundings = surroundings
-        self._obstacles = surroundings.add_to(self.world)
-        return surroundings
+        self.fixed_parts = fixed_parts
+        self._obstacles = fixed_parts.add_to(self.world)
+        return fixed_parts

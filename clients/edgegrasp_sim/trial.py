@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_results import ArmTrajectory
 from edgegrasp_sim.camera import Observation, crop
-from edgegrasp_sim.hand import FailureCause, seconds_of
+from edgegrasp_sim.fixed_parts import open_table
+from edgegrasp_sim.hand import FailureCause, motion_seconds
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import Protocol
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.surroundings import open_table
 
 MIN_SEEN = 100  # points above the table; with fewer the planner is not called
 SEEN_DISTANCE = 0.01  # metres; a touched surface this near to a seen point counts as seen
@@ -144,7 +144,7 @@ class RoundDriver:
     def run(self, planner: Planner) -> Round:
         """Run the round to its end."""
         while (end := self.end) is None:
-            seen, seed = self.look(), int(self._policy.integers(2**31))
+            seen, seed = self.observe(), int(self._policy.integers(2**31))
             # An obstacle in front may hide all of the objects.
             height = crop(seen.cloud, seen.workspace)[:, 2] - seen.table_height
             shown = np.count_nonzero(height > 0.005) >= MIN_SEEN
@@ -160,7 +160,7 @@ class RoundDriver:
         self._round.end = end
         return self._round
 
-    def look(self) -> Observation:
+    def observe(self) -> Observation:
         """Take the next view."""
         rules = self.protocol
         seen = self.simulation.observe_from(
@@ -191,7 +191,7 @@ class RoundDriver:
             points=len(self._cloud),
             planning_seconds=planning_seconds,
             T_world_hand=np.asarray(grasp.T_world_hand, dtype=np.float64).tolist(),
-            motion_seconds=0.0 if grasp.motion is None else seconds_of(grasp.motion),
+            motion_seconds=0.0 if grasp.motion is None else motion_seconds(grasp.motion),
             touched_on_the_way=bool(result.touched_on_the_way),
             touched_seen=any(map(self._is_seen, result.touched_on_the_way)),
         )

@@ -27,7 +27,7 @@ from edgegrasp_model.networks.checkpoint import check_reference_logits, load_che
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import Collision, DetectOptions
-from edgegrasp_model.results import NoGrasp, Pace
+from edgegrasp_model.results import NoGraspReason, UnitCosts
 from edgegrasp_model.scene.cloud import assumed_viewpoint, check_cloud
 from edgegrasp_model.scene.scene import (
     MAX_VOXELS,
@@ -264,7 +264,7 @@ class GraspDetector:
         prepared = self.prepare(cloud, options, max_voxels, thin=edges is None)
         rows = len(prepared.selected.labels)
         asked: Array = check_hand_poses(hand_poses) if edges is None else check_edges(edges, rows)
-        evaluations = [Evaluation(None, NoGrasp.NO_POINT)] * len(asked)
+        evaluations = [Evaluation(None, NoGraspReason.NO_POINT)] * len(asked)
         if prepared.scene is not None:
             scene, gripper = prepared.scene, prepared.gripper
             if edges is None:
@@ -285,7 +285,7 @@ class GraspDetector:
     ) -> list[Evaluation]:
         """An evaluation of each hand pose (M, 4, 4)."""
         with prepared.timed("candidates"):
-            poses = scene.frame.poses(T_cloud_hand)
+            poses = scene.frame.poses_from_cloud(T_cloud_hand)
             given = from_hand_poses(scene, poses, prepared.gripper, prepared.crop_radius)
         return self._score_given(prepared, scene, given, request)
 
@@ -333,9 +333,9 @@ class GraspDetector:
                 batch: HandBatch | BallBatch
                 if self.sees_hands:
                     sizes = network.hand_points, network.description_size
-                    batch = HandBatch.of_hands(scene, some, prepared.gripper, *sizes)
+                    batch = HandBatch.from_hands(scene, some, prepared.gripper, *sizes)
                 else:
-                    batch = BallBatch.of_candidates(
+                    batch = BallBatch.from_candidates(
                         scene.cloud, some, prepared.crop_radius, network.k
                     )
             exact = torch.autocast(self.device.type, enabled=False)  # even if the caller uses it
@@ -347,7 +347,7 @@ class GraspDetector:
 class ModelCatalogue:
     """Named detectors, one of them the default."""
 
-    pace = Pace()  # the default detector's, on this machine, once warm
+    unit_costs = UnitCosts()  # the default detector's, on this machine, once warm
 
     def __init__(self, detectors: Mapping[str, GraspDetector], default: str = "") -> None:
         """Collect detectors by name, at least one; `default` as for `load`."""
@@ -422,9 +422,9 @@ class ModelCatalogue:
             check_reference_logits(detector.network, detector.metadata)
         cloud = np.concatenate([box, table])
         self.get().detect(cloud, options)  # also warms what the others share with it
-        self.pace = self._measure_pace(rng)
+        self.unit_costs = self._measure_unit_costs(rng)
 
-    def _measure_pace(self, rng: np.random.Generator) -> Pace:
+    def _measure_unit_costs(self, rng: np.random.Generator) -> UnitCosts:
         """Detect in a small, a dense and a wide cloud; takes 0.2 s."""
         options = DetectOptions(
             viewpoint=(0.0, 0.0, 1.0), num_candidates=1, objects="off", support=None
@@ -438,7 +438,7 @@ class ModelCatalogue:
             voxels.append(counts["voxels"])
         small, dense, wide = seconds
         point = max(dense - small, 0.0) / (sizes[1] - sizes[0])
-        return Pace(point, voxel=max(wide - small, 0.0) / (voxels[2] - voxels[0]))
+        return UnitCosts(point, voxel=max(wide - small, 0.0) / (voxels[2] - voxels[0]))
 
 
 def choose_device(name: str) -> torch.device:

@@ -10,7 +10,7 @@ from edgegrasp_model.candidates.edge_grasps import MIN_EDGE_LENGTH, Candidates, 
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import HALF_TURN, Gripper
 from edgegrasp_model.options import MAX_CANDIDATES, are_rigid
-from edgegrasp_model.results import NoGrasp
+from edgegrasp_model.results import NoGraspReason
 from edgegrasp_model.scene.cloud import wrong_array
 from edgegrasp_model.scene.scene import Scene
 
@@ -22,7 +22,7 @@ class Given:
     """M edges or hand poses, of which E define an edge grasp."""
 
     candidates: Candidates  # E candidates; `pair`, ascending, is the row of each among the M
-    reason: list[NoGrasp | None]  # M: why each defines no edge grasp; None: it defines one
+    reason: list[NoGraspReason | None]  # M: why each defines no edge grasp; None: it defines one
     T_cloud_hand: Float32 | None = None  # (E, 4, 4) as given, canonical frame
 
 
@@ -71,7 +71,7 @@ def from_edges(
 ) -> Given:
     """Candidates for given edges, between the voxels that contain their rows."""
     point = scene.point_of_row[edges]
-    reason: list[NoGrasp | None] = [NoGrasp.NO_POINT] * len(edges)
+    reason: list[NoGraspReason | None] = [NoGraspReason.NO_POINT] * len(edges)
     there = np.flatnonzero((point >= 0).all(axis=1))
     approach, contact = point[there].T
     candidates, faults = edge_grasps(scene.cloud, approach, contact, gripper, crop_radius)
@@ -120,7 +120,7 @@ def from_hand_poses(
     hands, best = _least(view.candidate[near], (view.position[:2, near] ** 2).sum(axis=0))
     approach[hands] = view.row[near[best]]
     found = np.flatnonzero(np.isfinite(facing.max(axis=0)) & (approach >= 0))
-    reason: list[NoGrasp | None] = [NoGrasp.NOTHING_BETWEEN] * len(T_cloud_hand)
+    reason: list[NoGraspReason | None] = [NoGraspReason.NOTHING_BETWEEN] * len(T_cloud_hand)
     for row in found.tolist():
         reason[row] = None
     given = T_cloud_hand[found]

@@ -32,44 +32,44 @@ def compiled(*freedom: str) -> Callable[[Loop], Loop]:
     return decorate
 
 
-class InHands(NamedTuple):
+class Inputs(NamedTuple):
     """N points, and the transforms from their frame to those of E hands."""
 
     columns: Float32  # (3, N) x, y and z, metres
-    turn: Float32  # (E, 3, 3)
-    shift: Float32  # (E, 3) metres
+    R_hand_cloud: Float32  # (E, 3, 3)
+    t_hand_cloud: Float32  # (E, 3) metres
 
 
-def in_hands(points: Float32, T_cloud_hand: Float32) -> InHands:
+def loop_input(points: Float32, T_cloud_hand: Float32) -> Inputs:
     """Points (N, 3) and hands (E, 4, 4), arranged for the loops below."""
     columns = np.ascontiguousarray(points.T, dtype=np.float32)
-    turn = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
-    return InHands(columns, turn, -(turn @ T_cloud_hand[:, :3, 3:])[:, :, 0])
+    R = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
+    return Inputs(columns, R, -(R @ T_cloud_hand[:, :3, 3:])[:, :, 0])
 
 
 @compiled("contract")
 def points_in_hand_boxes(
-    hands: InHands, low: Float32, high: Float32
+    hands: Inputs, low: Float32, high: Float32
 ) -> tuple[Int64, Int64, Float32]:
     """The points between two corners (3,) of each hand's frame.
 
     Returns hand (P,), ascending; row (P,), ascending for each hand; position (3, P) in its frame.
     """
-    columns, turn, shift = hands
+    columns, R, t = hands
     sphere = _blocks(columns)
     xs, ys, zs = columns[0], columns[1], columns[2]
     count = 0
-    for e in range(len(turn)):
+    for e in range(len(R)):
         for k in range(len(sphere)):
-            if _may_reach(sphere[k], turn[e], shift[e], low, high):
-                count += _count_between(columns, k, turn[e], shift[e], low, high)
+            if _may_reach(sphere[k], R[e], t[e], low, high):
+                count += _count_between(columns, k, R[e], t[e], low, high)
     hand, row = np.empty(count, np.int64), np.empty(count, np.int64)
     position, place = np.empty((3, count), np.float32), 0
-    for e in range(len(turn)):
+    for e in range(len(R)):
         for k in range(len(sphere)):
-            if _may_reach(sphere[k], turn[e], shift[e], low, high):
+            if _may_reach(sphere[k], R[e], t[e], low, high):
                 for i in range(k * BLOCK_SIZE, min((k + 1) * BLOCK_SIZE, len(xs))):
-                    x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
+                    x, y, z = _position(xs[i], ys[i], zs[i], R[e], t[e])
                     if _between(x, y, z, low, high):
                         hand[place], row[place] = e, i
                         position[0, place], position[1, place], position[2, place] = x, y, z
@@ -78,22 +78,22 @@ def points_in_hand_boxes(
 
 
 @compiled("contract")
-def any_point_in_boxes(hands: InHands, boxes: Float64) -> Bools:
+def any_point_in_boxes(hands: Inputs, boxes: Float64) -> Bools:
     """Which hands (E,) have a point in one of their boxes (B, 2, 3), hand frame."""
-    columns, turn, shift = hands
-    sphere, hit, solid = _blocks(columns), np.zeros(len(turn), np.bool_), boxes.astype(np.float32)
+    columns, R, t = hands
+    sphere, hit, solid = _blocks(columns), np.zeros(len(R), np.bool_), boxes.astype(np.float32)
     least, most = solid[0]
     for low, high in solid:
         least, most = np.minimum(least, low), np.maximum(most, high)
-    for e in range(len(turn)):
+    for e in range(len(R)):
         for k in range(len(sphere)):
-            if not _may_reach(sphere[k], turn[e], shift[e], least, most):
+            if not _may_reach(sphere[k], R[e], t[e], least, most):
                 continue
             inside = 0
             for b in range(len(solid)):
                 low, high = solid[b, 0], solid[b, 1]
-                if _may_reach(sphere[k], turn[e], shift[e], low, high):
-                    inside += _count_between(columns, k, turn[e], shift[e], low, high)
+                if _may_reach(sphere[k], R[e], t[e], low, high):
+                    inside += _count_between(columns, k, R[e], t[e], low, high)
             if inside:
                 hit[e] = True
                 break
@@ -101,19 +101,19 @@ def any_point_in_boxes(hands: InHands, boxes: Float64) -> Bools:
 
 
 @compiled("contract")
-def any_point_on_way(hands: InHands, boxes: Float64, lift: Float32) -> Bools:
+def any_point_swept(hands: Inputs, boxes: Float64, lift: Float32) -> Bools:
     """Like `any_point_in_boxes`, for hands that move along `lift` (E, 3), in their own frames."""
-    columns, turn, shift = hands
-    sphere, hit, solid = _blocks(columns), np.zeros(len(turn), np.bool_), boxes.astype(np.float32)
+    columns, R, t = hands
+    sphere, hit, solid = _blocks(columns), np.zeros(len(R), np.bool_), boxes.astype(np.float32)
     none = np.float32(0.0)
-    for e in range(len(turn)):
+    for e in range(len(R)):
         below, above = np.minimum(lift[e], none), np.maximum(lift[e], none)
         per_way = np.float32(1.0) / np.where(np.abs(lift[e]) < SLACK, np.float32(SLACK), lift[e])
         for b in range(len(solid)):
             low, high = solid[b]
             for k in range(len(sphere)):
-                near = _may_reach(sphere[k], turn[e], shift[e], low + below, high + above)
-                if near and _count_on_way(columns, k, turn[e], shift[e], solid[b], per_way):
+                near = _may_reach(sphere[k], R[e], t[e], low + below, high + above)
+                if near and _count_on_way(columns, k, R[e], t[e], solid[b], per_way):
                     hit[e] = True
                     break
             if hit[e]:
@@ -122,36 +122,36 @@ def any_point_on_way(hands: InHands, boxes: Float64, lift: Float32) -> Bools:
 
 
 @compiled("contract", "nnan", "nsz", "reassoc")
-def signed_distance_to_boxes(hands: InHands, boxes: Float64) -> Float32:
+def signed_distance_to_boxes(hands: Inputs, boxes: Float64) -> Float32:
     """Least signed distance (E,) of the points to the boxes (B, 2, 3) of each hand."""
-    columns, turn, shift = hands
+    columns, R, t = hands
     extents = np.empty(boxes.shape, np.float32)  # middles and halves
     extents[:, 0], extents[:, 1] = (boxes[:, 0] + boxes[:, 1]) / 2, (boxes[:, 1] - boxes[:, 0]) / 2
-    sphere, nearest = _blocks(columns), np.full(len(turn), np.inf, np.float32)
-    for e in range(len(turn)):
+    sphere, nearest = _blocks(columns), np.full(len(R), np.inf, np.float32)
+    for e in range(len(R)):
         for k in range(len(sphere)):
             block = columns[:, k * BLOCK_SIZE : (k + 1) * BLOCK_SIZE]
             for b in range(len(extents)):
                 middle = sphere[k : k + 1, :3].T
-                least = _nearest_to_box(middle, turn[e], shift[e], extents[b]) - sphere[k, 3]
+                least = _nearest_to_box(middle, R[e], t[e], extents[b]) - sphere[k, 3]
                 if least < nearest[e]:
-                    here = _nearest_to_box(block, turn[e], shift[e], extents[b])
+                    here = _nearest_to_box(block, R[e], t[e], extents[b])
                     nearest[e] = min(nearest[e], here)
     return nearest
 
 
 @compiled("contract")
-def free_way(hands: InHands, boxes: Float64, behind: float, least: float, most: float) -> Float32:
+def free_reach(hands: Inputs, boxes: Float64, behind: float, least: float, most: float) -> Float32:
     """How far (E,) hands can move along their z until a box has a point right ahead, metres.
 
     The hand's boxes are (B, 2, 3); points up to `behind` metres behind a box are in its way too.
     Negative where a hand would have to move back; at most `most`, where nothing nearer is ahead.
     A value below `least` is only an upper bound.
     """
-    columns, turn, shift = hands
-    sphere, way, solid = _blocks(columns), np.empty(len(turn), np.float32), boxes.astype(np.float32)
+    columns, R, t = hands
+    sphere, way, solid = _blocks(columns), np.empty(len(R), np.float32), boxes.astype(np.float32)
     ahead = np.empty(BLOCK_SIZE, np.float32)
-    for e in range(len(turn)):
+    for e in range(len(R)):
         nearest = np.float32(most)
         for b in range(len(solid)):
             if nearest < least:
@@ -162,8 +162,8 @@ def free_way(hands: InHands, boxes: Float64, behind: float, least: float, most: 
             low[2] -= np.float32(behind)
             for k in range(len(sphere)):
                 high[2] = front + nearest  # farther boxes change nothing
-                if _may_reach(sphere[k], turn[e], shift[e], low, high):
-                    found = _least_between(columns, k, turn[e], shift[e], box, ahead)
+                if _may_reach(sphere[k], R[e], t[e], low, high):
+                    found = _least_between(columns, k, R[e], t[e], box, ahead)
                     nearest = min(nearest, found - front)
                     if nearest < least:
                         break
@@ -172,18 +172,18 @@ def free_way(hands: InHands, boxes: Float64, behind: float, least: float, most: 
 
 
 @compiled("contract")
-def extents_between(hands: InHands, first: Int64, last: Int64, pads: Float32) -> Float32:
+def extents_between(hands: Inputs, first: Int64, last: Int64, pads: Float32) -> Float32:
     """Least and greatest y (E, 2) of the points between the pads of hands; (inf, -inf) without one.
 
     Hand e has points first[e] to last[e]; `pads` are least and greatest x and z, hand frame.
     """
-    columns, turn, shift = hands
-    (low, high), extent = pads, np.empty((len(turn), 2), np.float32)
-    for e in range(len(turn)):
+    columns, R, t = hands
+    (low, high), extent = pads, np.empty((len(R), 2), np.float32)
+    for e in range(len(R)):
         xs, ys, zs = columns[:, first[e] : last[e]]
         least, most = np.float32(np.inf), np.float32(-np.inf)
         for i in range(len(xs)):
-            x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
+            x, y, z = _position(xs[i], ys[i], zs[i], R[e], t[e])
             between = (x > low[0]) & (x < high[0]) & (z > low[1]) & (z < high[1])
             least = min(least, y if between else np.float32(np.inf))
             most = max(most, y if between else np.float32(-np.inf))
@@ -253,16 +253,16 @@ def distance_behind(
     # (2 H + 1, 2 H + 1) metres from the camera in each cell, the middle cell straight ahead; inf
     # where nothing was seen.
     surface: Float32,
-    turn: Float32,  # (E, 3, 3) from each hand's frame to the camera's: across, down, ahead
-    shift: Float32,  # (E, 3) of each hand in the camera's frame
+    R: Float32,  # (E, 3, 3) from each hand's frame to the camera's: across, down, ahead
+    t: Float32,  # (E, 3) of each hand in the camera's frame
     places: Float32,  # (S, 3) hand frame
     cells: np.float32,  # per unit of the tangent
 ) -> Float32:
     """Metres (E, S) that places of hands lie behind the first surface a camera saw, or 0."""
-    behind, half = np.zeros((len(turn), len(places)), np.float32), len(surface) // 2
-    for e in range(len(turn)):
+    behind, half = np.zeros((len(R), len(places)), np.float32), len(surface) // 2
+    for e in range(len(R)):
         for s in range(len(places)):
-            x, y, z = _position(places[s, 0], places[s, 1], places[s, 2], turn[e], shift[e])
+            x, y, z = _position(places[s, 0], places[s, 1], places[s, 2], R[e], t[e])
             ahead = max(z, np.float32(1e-6))
             i, j = np.floor(x / ahead * cells), np.floor(y / ahead * cells)
             if (abs(i) <= half) & (abs(j) <= half):
@@ -290,9 +290,9 @@ def _blocks(columns: Float32) -> Float32:
 
 
 @compiled("contract")
-def _may_reach(sphere: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32) -> bool:
+def _may_reach(sphere: Float32, R: Float32, t: Float32, low: Float32, high: Float32) -> bool:
     """Whether a point of a block may lie in a box of the hand frame, given by two corners."""
-    x, y, z = _position(sphere[0], sphere[1], sphere[2], turn, shift)
+    x, y, z = _position(sphere[0], sphere[1], sphere[2], R, t)
     r = sphere[3]
     inside: bool = (
         (x + r > low[0])
@@ -307,12 +307,12 @@ def _may_reach(sphere: Float32, turn: Float32, shift: Float32, low: Float32, hig
 
 @compiled("contract")
 def _position(
-    px: np.float32, py: np.float32, pz: np.float32, turn: Float32, shift: Float32
+    px: np.float32, py: np.float32, pz: np.float32, R: Float32, t: Float32
 ) -> tuple[np.float32, np.float32, np.float32]:
     return (
-        turn[0, 0] * px + turn[0, 1] * py + turn[0, 2] * pz + shift[0],
-        turn[1, 0] * px + turn[1, 1] * py + turn[1, 2] * pz + shift[1],
-        turn[2, 0] * px + turn[2, 1] * py + turn[2, 2] * pz + shift[2],
+        R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + t[0],
+        R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + t[1],
+        R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + t[2],
     )
 
 
@@ -326,7 +326,7 @@ def _between(x: np.float32, y: np.float32, z: np.float32, low: Float32, high: Fl
 
 @compiled("contract")
 def _count_between(
-    columns: Float32, k: int, turn: Float32, shift: Float32, low: Float32, high: Float32
+    columns: Float32, k: int, R: Float32, t: Float32, low: Float32, high: Float32
 ) -> int:
     """How many points of block k lie between two corners of a hand's frame."""
     # Loops in separate functions on contiguous arrays are vectorised to 16 points at a time.
@@ -334,14 +334,14 @@ def _count_between(
     xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
     found = 0
     for i in range(len(xs)):
-        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        x, y, z = _position(xs[i], ys[i], zs[i], R, t)
         found += _between(x, y, z, low, high)
     return found
 
 
 @compiled("contract")
 def _count_on_way(
-    columns: Float32, k: int, turn: Float32, shift: Float32, box: Float32, per_way: Floats
+    columns: Float32, k: int, R: Float32, t: Float32, box: Float32, per_way: Floats
 ) -> int:
     """How many points of block k a box passes over; `per_way` (3,): 1 / its motion, hand frame."""
     low, high = box[0], box[1]
@@ -349,7 +349,7 @@ def _count_on_way(
     xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
     found = 0
     for i in range(len(xs)):
-        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        x, y, z = _position(xs[i], ys[i], zs[i], R, t)
         # Shares of the way at which the point enters and leaves the box along each axis.
         x0, x1 = (x - high[0]) * per_way[0], (x - low[0]) * per_way[0]
         y0, y1 = (y - high[1]) * per_way[1], (y - low[1]) * per_way[1]
@@ -361,13 +361,13 @@ def _count_on_way(
 
 
 @compiled("contract", "nnan", "nsz", "reassoc")
-def _nearest_to_box(columns: Float32, turn: Float32, shift: Float32, extent: Float32) -> np.float32:
+def _nearest_to_box(columns: Float32, R: Float32, t: Float32, extent: Float32) -> np.float32:
     xs, ys, zs = columns[0], columns[1], columns[2]
     zero = np.float32(0.0)
     middle, half = extent[0], extent[1]
     apart, deepest = np.float32(np.inf), zero  # squared distance outside, depth inside
     for i in range(len(xs)):
-        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        x, y, z = _position(xs[i], ys[i], zs[i], R, t)
         x = abs(x - middle[0]) - half[0]
         y = abs(y - middle[1]) - half[1]
         z = abs(z - middle[2]) - half[2]
@@ -379,14 +379,14 @@ def _nearest_to_box(columns: Float32, turn: Float32, shift: Float32, extent: Flo
 
 @compiled("contract")
 def _least_between(
-    columns: Float32, k: int, turn: Float32, shift: Float32, box: Float32, ahead: Float32
+    columns: Float32, k: int, R: Float32, t: Float32, box: Float32, ahead: Float32
 ) -> np.float32:
     """Least z of the points of block k in a box (2, 3); `ahead` (BLOCK_SIZE,) is overwritten."""
     low, high = box[0], box[1]
     start, stop = k * BLOCK_SIZE, (k + 1) * BLOCK_SIZE
     xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
     for i in range(len(xs)):
-        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        x, y, z = _position(xs[i], ys[i], zs[i], R, t)
         ahead[i] = z if _between(x, y, z, low, high) else np.float32(np.inf)
     least = np.float32(np.inf)
     for i in range(len(xs)):

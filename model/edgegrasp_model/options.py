@@ -60,8 +60,8 @@ Corner = Annotated[
 ]
 MAX_APPROACH_POINTS = 256
 MAX_CANDIDATES = 16_000
-ApproachPoints = Annotated[int, Field(ge=1, le=MAX_APPROACH_POINTS), numeric]
-Candidates = Annotated[int, Field(ge=1, le=MAX_CANDIDATES), numeric]
+ApproachPointCount = Annotated[int, Field(ge=1, le=MAX_APPROACH_POINTS), numeric]
+CandidateCount = Annotated[int, Field(ge=1, le=MAX_CANDIDATES), numeric]
 MAX_VIEWS = 64
 MAX_PREVIOUS, MAX_SURFACE = 64, 128  # grasps or objects of an answer; points of an object
 APPROACH_STREAM, CANDIDATE_STREAM, SUPPORT_STREAM = range(3)  # streams of random numbers of a seed
@@ -88,7 +88,7 @@ Pixel = Annotated[
     Field(description="column, row; the centre of the top left pixel is (0, 0)"),
 ]
 Matrix = Annotated[tuple[Finite, ...], Field(min_length=16, max_length=16)]  # row by row
-Places = Annotated[tuple[Finite, ...], Field(max_length=3 * MAX_SURFACE)]  # x, y, z of each
+FlatPoints = Annotated[tuple[Finite, ...], Field(max_length=3 * MAX_SURFACE)]  # x, y, z of each
 Quaternion = Annotated[tuple[Finite, Finite, Finite, Finite], AfterValidator(_of_length_one)]
 
 
@@ -500,9 +500,9 @@ class PreviousObject(Strict):
 
     number: Row = Field(description="as in that answer")
     surface: Annotated[
-        Places,
+        FlatPoints,
         AfterValidator(_in_threes),
-        BeforeValidator(_row_by_row, json_schema_input_type=Places),
+        BeforeValidator(_row_by_row, json_schema_input_type=FlatPoints),
     ] = Field(description="as in that answer: x, y, z of points on it, one after another, metres")
     confidence: Share | None = Field(default=None, description="as in that answer")
 
@@ -596,9 +596,9 @@ class DetectOptions(Strict):
     """weights to use; empty: the server's default"""
     gripper: GripperChoice | None = None
     """gripper, by name or geometry; null: the one the weights were trained for"""
-    num_approach_points: ApproachPoints | None = None
+    num_approach_points: ApproachPointCount | None = None
     """approach points sampled, spread over the objects; null: as many as they need"""
-    num_candidates: Candidates = 2000
+    num_candidates: CandidateCount = 2000
     """candidates scored at most"""
     sampling: Literal["farthest", "uniform"] = "farthest"
     """how approach points are sampled"""
@@ -638,7 +638,7 @@ class DetectOptions(Strict):
     """arm that executes the grasp; grasps within its reach come first; null: no arm"""
     min_score: Share = 0.3
     """lowest score returned; 0: all"""
-    top_k: Candidates = 50
+    top_k: CandidateCount = 50
     """grasps returned at most"""
     suppression: Suppression | None = Suppression()
     """non-maximum suppression; null: none"""

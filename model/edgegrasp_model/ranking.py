@@ -17,7 +17,7 @@ from edgegrasp_model.candidates.sample import OUTCOME_CODE, Sample
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import mean_over_similar, non_max_suppression
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.results import Outcome, Ungraspable
+from edgegrasp_model.results import Outcome, UngraspableReason
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.unseen import leaves_image, unseen_space
 from edgegrasp_results import DebugInfo, DetectedObject, Grasp
@@ -174,7 +174,7 @@ def grasps_in_cloud(
     scene: Scene, candidates: Candidates, gripper: Gripper, score: Floats, collision_free: Bools
 ) -> list[Grasp]:
     """Grasps in the cloud's frame, of E candidates; all arrays are (E,)."""
-    T_cloud_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
+    T_cloud_hand = scene.frame.poses_to_cloud(candidates.T_cloud_hand)
     T_cloud_tcp = T_cloud_hand @ gripper.T_hand_tcp
     met, hidden = _touched_first(scene, candidates.T_cloud_hand, gripper)
     width = 2 * (np.abs(met).max(axis=1) + np.float32(FINGER_CLEARANCE))
@@ -250,7 +250,7 @@ def detected_objects(
 
 def _reason(
     scene: Scene, number: int, size: Float32, sample: Sample | None, score: Floats, gripper: Gripper
-) -> Ungraspable | None:
+) -> UngraspableReason | None:
     """Why an object with a box of this size (3,), the last upward, has no good grasp."""
     if sample is None:
         return None
@@ -259,18 +259,18 @@ def _reason(
     if score[scored].max(initial=0.0) >= GOOD_SCORE:
         return None
     if size[:2].min() > gripper.max_opening:
-        return Ungraspable.TOO_WIDE
+        return UngraspableReason.TOO_WIDE
     outcome = sample.outcome[drawn]
     codes = OUTCOME_CODE[Outcome.SUPPORT], OUTCOME_CODE[Outcome.DIRECTION]
     out_of_reach = np.isin(outcome, codes)
     if size[2] < FLAT_HEIGHT and out_of_reach.sum() >= len(outcome) / 2:
-        return Ungraspable.TOO_FLAT
+        return UngraspableReason.TOO_FLAT
     if not sample.collision_free[scored].any():
         allowed = outcome != OUTCOME_CODE[Outcome.DIRECTION]
-        return Ungraspable.BLOCKED if allowed.any() else None
+        return UngraspableReason.BLOCKED if allowed.any() else None
     hands = sample.candidates.T_cloud_hand[scored]
     _, hidden = _touched_first(scene, hands, gripper)
-    return Ungraspable.HIDDEN if hidden.mean() > 0.5 else None
+    return UngraspableReason.HIDDEN if hidden.mean() > 0.5 else None
 
 
 def _upright_box(scene: Scene, held: Bools) -> tuple[Float32, Float32]:
@@ -294,7 +294,7 @@ def _upright_box(scene: Scene, held: Bools) -> tuple[Float32, Float32]:
     middle = axes[best].T @ (turned[best].min(axis=0) + size[best] / 2)
     T_canonical_box[:3, 3] = [*middle, (bottom + top) / 2]
     half: Float32 = np.array([*size[best], top - bottom], dtype=np.float32) / np.float32(2)
-    return scene.frame.poses_in_cloud(T_canonical_box), half
+    return scene.frame.poses_to_cloud(T_canonical_box), half
 
 
 def debug_info(
@@ -312,15 +312,15 @@ def debug_info(
         scores[sample.row], codes[sample.row] = score, outcome
     plane = None
     if scene.support is not None:
-        normal = scene.frame.directions_in_cloud(scene.support.normal)
-        foot = scene.frame.points_in_cloud(np.multiply(scene.support.normal, scene.support.offset))
+        normal = scene.frame.directions_to_cloud(scene.support.normal)
+        foot = scene.frame.points_to_cloud(np.multiply(scene.support.normal, scene.support.offset))
         plane = np.append(normal, normal @ foot).astype(np.float32)
     return DebugInfo(
         points=scene.points_in_cloud,
-        normals=scene.frame.directions_in_cloud(scene.cloud.normals),
+        normals=scene.frame.directions_to_cloud(scene.cloud.normals),
         approach_index=candidates.approach_index,
         contact_index=candidates.contact_index,
-        T_cloud_hand=scene.frame.poses_in_cloud(candidates.T_cloud_hand),
+        T_cloud_hand=scene.frame.poses_to_cloud(candidates.T_cloud_hand),
         score=scores,
         outcome=[OUTCOMES[code] for code in codes.tolist()],
         support_plane=plane,

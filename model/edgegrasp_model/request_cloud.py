@@ -18,7 +18,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, SkipValidation, Str
 
 from edgegrasp_camera.arrays import Array
 from edgegrasp_camera.clouds import CloudInput, read_point_cloud2, too_many
-from edgegrasp_camera.depth import ENCODINGS, fuse_depth_images, intrinsics_of
+from edgegrasp_camera.depth import ENCODINGS, fuse_depth_images, to_intrinsics
 from edgegrasp_camera.files import read_file, read_npy, read_png
 from edgegrasp_model.errors import InvalidRequest, brief, parse
 from edgegrasp_model.options import (
@@ -213,7 +213,7 @@ class DepthImage(Strict):
     intrinsics: Annotated[
         Intrinsics,
         BeforeValidator(
-            lambda sent: sent if isinstance(sent, Mapping) else intrinsics_of(sent)._asdict(),
+            lambda sent: sent if isinstance(sent, Mapping) else to_intrinsics(sent)._asdict(),
             json_schema_input_type=Intrinsics | list[float] | list[list[float]],
         ),
     ]

@@ -20,7 +20,7 @@ class Outcome(StrEnum):
     BEYOND_TOP_K = "beyond-top-k"
 
 
-class NoGrasp(StrEnum):
+class NoGraspReason(StrEnum):
     """Why a given edge or hand pose defines no edge grasp."""
 
     NO_POINT = "no-point"  # one of its points was removed: workspace, support plane or outlier
@@ -31,7 +31,7 @@ class NoGrasp(StrEnum):
     NOTHING_BETWEEN = "nothing-between"  # the hand pose has no point between its fingers
 
 
-class Ungraspable(StrEnum):
+class UngraspableReason(StrEnum):
     """Why an object has no good grasp."""
 
     TOO_WIDE = "too-wide"  # its visible part is wider than the hand opens, on all sides
@@ -49,7 +49,7 @@ class Following(StrEnum):
     LOST = "lost"  # its object is not found again, or the hand no longer fits
 
 
-class Pace(NamedTuple):
+class UnitCosts(NamedTuple):
     """Minimum processor time of a detection, seconds; 0 if it is not measured."""
 
     point: float = 0.0  # for each point of the cloud

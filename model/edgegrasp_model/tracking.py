@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
-from edgegrasp_model.candidates.edge_grasps import spread_out
+from edgegrasp_model.candidates.edge_grasps import coarse_to_fine_sample
 from edgegrasp_model.candidates.sample import allowed_directions
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
@@ -30,7 +30,7 @@ from edgegrasp_model.options import (
 from edgegrasp_model.ranking import COLLISION_FACTOR, objects_first, ranked
 from edgegrasp_model.results import OBSTACLE, Following
 from edgegrasp_model.scene.cloud import pose_matrix, subsample, unit
-from edgegrasp_model.scene.scene import Scene, numbers_chosen
+from edgegrasp_model.scene.scene import Scene, resolve_object_choice
 from edgegrasp_model.scene.segment import BACKGROUND, UNDECIDED
 from edgegrasp_results import Evaluation, Grasp, Tracking
 
@@ -115,7 +115,7 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
     """
     points, number = scene.points_in_cloud, scene.object_of_point
     seen = np.flatnonzero((number >= 0) | (chosen & (number == BACKGROUND)))
-    normals = scene.frame.directions_in_cloud(scene.cloud.normals[seen])
+    normals = scene.frame.directions_to_cloud(scene.cloud.normals[seen])
     cloud = Surface(points[seen], normals, cKDTree(points[seen]))
     moved: dict[int | None, tuple[Float64, int | None]] = {None: (np.eye(4), None)}
     surface: dict[int, Float32] = {}
@@ -124,7 +124,7 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
     renamed = number.copy() if given or previous.search else np.full_like(number, UNDECIDED)
     taken = np.zeros(len(number), dtype=bool)
     places = [np.reshape(one.surface, (-1, 3)).astype(np.float64) for one in previous.objects]
-    matches = [(*registered(before, cloud), row) for row, before in enumerate(places)]
+    matches = [(*register_icp(before, cloud), row) for row, before in enumerate(places)]
     matches = [match for match in matches if match[1] >= FOUND_SHARE]
     placed = {row: places[row] @ T[:3, :3].T + T[:3, 3] for T, _, row in matches}
     nearest = np.zeros(len(number), dtype=np.int64)  # row of the object nearest to each point
@@ -173,7 +173,7 @@ def only_chosen(
 ) -> tuple[Scene, Followed]:
     """Leave out the objects that a choice does not name, by their numbers in the answer."""
     number = scene.object_of_point
-    wanted = numbers_chosen(np.unique(number[number >= 0]), choice, warnings)
+    wanted = resolve_object_choice(np.unique(number[number >= 0]), choice, warnings)
     held = np.isin(number, wanted)
     moved = {was: now for was, now in followed.moved.items() if now[1] is None or now[1] in wanted}
     scene = replace(
@@ -206,7 +206,7 @@ def merged(
         there = zip(old, number, score((move @ before).astype(np.float32), rule), strict=True)
         kept = [replace(e.grasp, id=one.id, object=now) for one, now, e in there if e.grasp]
     if kept:
-        ways = scene.frame.directions([one.approach_direction for one in kept])
+        ways = scene.frame.directions_from_cloud([one.approach_direction for one in kept])
         fit = allowed_directions(ways, options.approach_direction, scene.frame)
         fit &= np.array([one.score >= options.min_score for one in kept])
         fit &= np.array([one.collision_free or options.collision.mode != "avoid" for one in kept])
@@ -253,7 +253,7 @@ def _order(
     score = np.array([one.score for one in some])
     free = np.array([one.collision_free for one in some])
     clearance = np.array([one.clearance for one in some])
-    hands = scene.frame.poses([one.T_cloud_hand for one in some])
+    hands = scene.frame.poses_from_cloud([one.T_cloud_hand for one in some])
     places = np.stack([one.contact_point for one in some])
     contact = np.asarray(cKDTree(scene.points_in_cloud).query(places)[1])
     order, _ = ranked(scene, contact, hands, score, free, gripper, options, clearance)
@@ -282,7 +282,7 @@ class Surface(NamedTuple):
         return np.unique(np.concatenate([np.asarray(one, dtype=np.int64) for one in rows]))
 
 
-def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
+def register_icp(before: Float64, cloud: Surface) -> tuple[Float64, float]:
     """An object's motion (4, 4) T_now_before, and the share of its points (K, 3) found there.
 
     This is the iterative closest point algorithm (ICP), mostly point-to-plane, from the old pose;
@@ -330,7 +330,7 @@ def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
 
 def sampled(points: Float32) -> Float32:
     """Up to MAX_SURFACE of points (N, 3), spread over them."""
-    return points[spread_out(points, MAX_SURFACE)]
+    return points[coarse_to_fine_sample(points, MAX_SURFACE)]
 
 
 def relabelled(labels: Int64, named: Mapping[int, int]) -> Int64:

@@ -41,11 +41,11 @@ class UnseenSpace(NamedTuple):
 
 
 def unseen_space(
-    depths: Sequence["DepthMap"], T_cloud_hand: Float32, first_met: Float32, gripper: Gripper
+    depths: Sequence["DepthMap"], T_cloud_hand: Float32, first_touch: Float32, gripper: Gripper
 ) -> UnseenSpace:
     """Evaluate the cameras' depth maps at the hands of candidates, (E, 4, 4) in the maps' frame.
 
-    Without maps, where the cameras are unknown, everything counts as seen. `first_met` is (E, 2)
+    Without maps, where the cameras are unknown, everything counts as seen. `first_touch` is (E, 2)
     greatest and least y of the points between the fingers of the open gripper, hand frame.
     """
     if not depths:
@@ -60,7 +60,7 @@ def unseen_space(
     shares = [unseen(part).mean(axis=1) for part in behind[:-1]]
     tips = [np.minimum(part, MAX_UNSEEN_DEPTH).mean(axis=1) for part in behind[:2]]
     along = behind[-1].reshape(len(T_cloud_hand), PLACES, len(line) // PLACES)  # (E, Y, P)
-    step, high, low = y[1] - y[0], first_met[:, :1], first_met[:, 1:]
+    step, high, low = y[1] - y[0], first_touch[:, :1], first_touch[:, 1:]
     hidden = unseen(along).mean(axis=2)  # (E, Y)
     seen = (along < THICKNESS).all(axis=2)
     return UnseenSpace(

@@ -21,9 +21,9 @@ from edgegrasp_model.scene.cloud import CanonicalFrame, unit
 from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_results import ArmPlan, ArmTrajectory, DetectedObject, Detection, Grasp
-from edgegrasp_robot.held import Held, can_leave, held_by, load_of, places_for
+from edgegrasp_robot.held_object import HeldPoints, build_load, can_leave, held_points, places_for
+from edgegrasp_robot.obstacles import HELD_NAME, ArmObstacles, Load, arm_obstacles, scene_with_load
 from edgegrasp_robot.robot import GROUP, Robot
-from edgegrasp_robot.surroundings import HELD_NAME, Load, Surroundings, carrying, surrounded
 
 MAX_TRIED = 200  # most grasps that are tried with the arm, in their order
 MAX_PLACES = 6  # in a region, that are tried with the arm for one grasp
@@ -44,15 +44,15 @@ FAILURES = ["out_of_reach", "arm_collision", "no_place"]  # the last that applie
 NO_REACH = "no grasp is within the arm's reach; see counts."
 
 
-def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
+def options_for_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
     """The options for the detection that `plan_picks` chooses from; raises InvalidRequest."""
-    asked = options.robot
-    assert asked is not None
+    robot_option = options.robot
+    assert robot_option is not None
     count = len(robot.joint_names)
-    if len(asked.joints) != count:
+    if len(robot_option.joints) != count:
         fix = f"Send {count}: {', '.join(robot.joint_names)}."
-        raise InvalidRequest("options.robot.joints", f"{len(asked.joints)} numbers", fix)
-    joints = np.array(asked.joints)
+        raise InvalidRequest("options.robot.joints", f"{len(robot_option.joints)} numbers", fix)
+    joints = np.array(robot_option.joints)
     beyond = (joints < robot.lower - LIMIT_SLACK) | (joints > robot.upper + LIMIT_SLACK)
     for row in np.flatnonzero(beyond):
         low, high = robot.lower[row], robot.upper[row]
@@ -64,16 +64,16 @@ def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
     if options.gripper not in (None, robot.gripper.name):
         fix = f"Leave it out: the robot {robot.name!r} has a {robot.gripper.name!r}."
         raise InvalidRequest("options.gripper", "another gripper than the robot's", fix)
-    changes = {"top_k": max(options.top_k, MAX_TRIED), "gripper": robot.hand}
+    changes = {"top_k": max(options.top_k, MAX_TRIED), "gripper": robot.gripper_geometry}
     return options.model_copy(update=changes)
 
 
 def plan_picks(
-    detection: Detection,  # made with the options of `with_robot`
+    detection: Detection,  # made with the options of `options_for_robot`
     scene: Scene | None,  # the detection's; None: too little is left of the cloud
     options: DetectOptions,  # as they were sent
     robot: Robot,
-    until: float = float("inf"),  # when to stop, on `time.monotonic()`
+    deadline: float = float("inf"),  # when to stop, on `time.monotonic()`
 ) -> Detection:
     """Plan the arm's motion to grasps, and put reachable grasps first.
 
@@ -81,37 +81,37 @@ def plan_picks(
     then those not tried in time, then those out of reach; better ones first, and nearer ones first
     at similar scores. InvalidRequest: the arm collides at the joints in the options.
     """
-    asked = options.robot
-    assert asked is not None
+    robot_option = options.robot
+    assert robot_option is not None
     if scene is None:
         return detection
-    start_joints = np.clip(asked.joints, robot.lower, robot.upper).tolist()
-    asked = asked.model_copy(update={"joints": start_joints})
+    start_joints = np.clip(robot_option.joints, robot.lower, robot.upper).tolist()
+    robot_option = robot_option.model_copy(update={"joints": start_joints})
     start = time.perf_counter()
     picks: list[_Pick] = []
     failures: Counter[str] = Counter()
     kept = _kept(detection)
-    with surrounded(robot, scene, asked, options.collision.obstacles) as around:
-        grasps = [grasp for grasp in detection.grasps if grasp.object not in around.own]
+    with arm_obstacles(robot, scene, robot_option, options.collision.obstacles) as obstacles:
+        grasps = [grasp for grasp in detection.grasps if grasp.object not in obstacles.own]
         failures["on_arm"] = len(detection.grasps) - len(grasps)
-        arm = _Arm(robot, asked, scene, options, around, detection.objects, until)
-        moves, waiting = asked.plan == "motion", iter(grasps)
+        arm = _Arm(robot, robot_option, scene, options, obstacles, detection.objects, deadline)
+        moves, waiting = robot_option.plan == "motion", iter(grasps)
         missing = options.top_k
-        while missing > 0 and time.monotonic() < until:
-            half = (time.monotonic() + until) / 2 if moves else until  # the rest for motions
+        while missing > 0 and time.monotonic() < deadline:
+            half = (time.monotonic() + deadline) / 2 if moves else deadline  # the rest for motions
             tried = arm.reach_some(waiting, missing + (EXTRA_GRASPS if moves else 0), half)
             if not tried:
                 break
             failures.update(pick.outcome for pick in tried)
-            tried.sort(key=lambda pick: _rank(pick, np.array(asked.joints), options, kept))
+            tried.sort(key=lambda pick: _rank(pick, np.array(robot_option.joints), options, kept))
             for pick in tried:
-                if moves and missing > 0 and pick.line and time.monotonic() <= until:
+                if moves and missing > 0 and pick.line and time.monotonic() <= deadline:
                     pick = arm.motion(pick)
                 picks.append(pick)
                 missing -= pick.tier <= (0 if moves else 1)
         untried = [_Pick(grasp, ArmPlan(False), "untried") for grasp in waiting]
     picks = sorted([*picks, *untried], key=lambda pick: pick.tier)[: options.top_k]
-    return _reported(detection, picks, failures, asked, time.perf_counter() - start)
+    return _reported(detection, picks, failures, robot_option, time.perf_counter() - start)
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class _PutDown(NamedTuple):
     back: Sequence[Float64]  # away from the grasp
     down: Sequence[Float64]  # to the place
     away: Sequence[Float64]  # from the place, the hand empty
-    around: Surroundings  # without the load
+    obstacles: ArmObstacles  # without the load
     load: Load
 
 
@@ -148,35 +148,35 @@ class _Arm:
     def __init__(
         self,
         robot: Robot,
-        asked: RobotArm,
+        robot_option: RobotArm,
         scene: Scene,
         options: DetectOptions,
-        around: Surroundings,
+        obstacles: ArmObstacles,
         objects: Sequence[DetectedObject],
-        until: float,
+        deadline: float,
     ) -> None:
-        self._robot, self._scene, self._options, self._around = robot, scene, options, around
-        self._place, self._objects = asked.place, {one.number: one for one in objects}
-        self._until, self._path_seconds = until, PATH_SECONDS
+        self._robot, self._scene, self._options, self._obstacles = robot, scene, options, obstacles
+        self._place, self._objects = robot_option.place, {one.number: one for one in objects}
+        self._deadline, self._path_seconds = deadline, PATH_SECONDS
         self._without_place: set[int] = set()  # numbers of objects
-        self._start = np.array(asked.joints)
-        self._start_x = robot.hand_pose(self._start)[:3, 0]
+        self._start = np.array(robot_option.joints)
+        self._start_x = robot.forward_kinematics(self._start)[:3, 0]
         near = np.maximum(robot.lower, self._start - np.pi)
         far = np.minimum(robot.upper, self._start + np.pi)
         drawn = np.random.default_rng(options.seed).uniform(near, far, (IK_RESTARTS, len(near)))
         self._drawn = list(drawn)  # joints to start from if the given ones find no solution
-        self._T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
-        up = scene.frame.directions_in_cloud((0.0, 0.0, 1.0))
+        self._T_base_cloud = np.reshape(robot_option.T_base_cloud, (4, 4))
+        up = scene.frame.directions_to_cloud((0.0, 0.0, 1.0))
         self._up = self._T_base_cloud[:3, :3] @ up
         if self._place is not None and self._place.region is not None and self._up[2] < MIN_LEVEL:
             fix = "Send T_base_object, or the poses of a base frame whose z is up."
             value = f"a region where up is {self._up.round(2).tolist()} in the base frame"
             raise InvalidRequest("options.robot.place.region", value, fix)
 
-    def reach_some(self, grasps: Iterator[Grasp], wanted: int, until: float) -> list[_Pick]:
+    def reach_some(self, grasps: Iterator[Grasp], wanted: int, deadline: float) -> list[_Pick]:
         """The next picks, until `wanted` of them are within reach or time is up."""
         picks: list[_Pick] = []
-        while wanted > 0 and time.monotonic() < until and (grasp := next(grasps, None)):
+        while wanted > 0 and time.monotonic() < deadline and (grasp := next(grasps, None)):
             picks.append(self._reach_either_way(grasp))
             wanted -= picks[-1].outcome == "reachable"
         return picks
@@ -196,7 +196,7 @@ class _Arm:
         robot, failures = self._robot, {"out_of_reach"}
         for turn in turns:
             starts = [self._start, robot.home, *self._drawn]
-            line, outcome = self._reach(poses * turn, starts, robot.scene, robot.straight)
+            line, outcome = self._reach(poses * turn, starts, robot.scene, robot.straight_scene)
             if line:
                 hand, tcp = grasp.T_cloud_hand * turn, grasp.T_cloud_tcp * turn
                 way = replace(grasp, T_cloud_hand=hand, T_cloud_tcp=tcp)
@@ -232,7 +232,7 @@ class _Arm:
 
     def motion(self, pick: _Pick) -> _Pick:
         """Add a collision-checked trajectory, if one is found."""
-        free, straight = self._robot.scene, self._robot.straight
+        free, straight = self._robot.scene, self._robot.straight_scene
         back = self._retreat(pick) if pick.put is None else pick.put.back
         first = self._free_motion(free, self._start, pick.line[0]) if back else None
         if first is None:
@@ -241,7 +241,7 @@ class _Arm:
         if (put := pick.put) is not None:
             # From the end of the retreat to above the place, down, and back with an empty hand.
             T_base_hand = self._T_base_cloud @ pick.grasp.T_cloud_hand
-            with carrying(self._robot, put.around, put.load, T_base_hand) as scene:
+            with scene_with_load(self._robot, put.obstacles, put.load, T_base_hand) as scene:
                 over = self._free_motion(scene, put.back[-1], put.down[0])
                 timed += [over, self._timed(scene, put.down, True)]
                 scene.removeGeometry(HELD_NAME)
@@ -266,15 +266,16 @@ class _Arm:
         grasp, rules = pick.grasp, self._options.collision
         if grasp.object in self._without_place:
             return None
-        held = held_by(grasp, self._scene, self._robot.gripper)
+        held = held_points(grasp, self._scene, self._robot.gripper)
         seen = None if grasp.object is None else self._objects.get(grasp.object)
-        load = load_of(held, seen, self._scene, self._T_base_cloud)
+        load = build_load(held, seen, self._scene, self._T_base_cloud)
         back = self._retreat(pick, held)
         if load is None or not back:
             return None
-        around, over = self._around.without(load), max(rules.approach_length, rules.retreat_length)
-        obstacles = SolidBoxes.from_shapes(rules.obstacles, CanonicalFrame(self._T_base_cloud))
-        free = around.voxels, obstacles
+        obstacles = self._obstacles.without(load)
+        over = max(rules.approach_length, rules.retreat_length)
+        boxes = SolidBoxes.from_shapes(rules.obstacles, CanonicalFrame(self._T_base_cloud))
+        free = obstacles.voxels, boxes
         places = places_for(place, load, *free, self._scene, self._T_base_cloud)
         if (first := next(places, None)) is None:
             if grasp.object is not None:
@@ -282,7 +283,7 @@ class _Arm:
             return None
         T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand
         T_box_hand = np.linalg.inv(load.T_base_box) @ T_base_hand
-        with carrying(self._robot, around, load, T_base_hand) as scene:
+        with scene_with_load(self._robot, obstacles, load, T_base_hand) as scene:
             for T_base_box in islice(chain([first], places), MAX_PLACES):
                 T_base_place = T_base_box @ T_box_hand
                 poses = _straight(T_base_place, self._up, over, 0.0)
@@ -291,13 +292,13 @@ class _Arm:
                     scene.removeGeometry(HELD_NAME)
                     out = _straight(T_base_place, -T_base_place[:3, 2], 0.0, rules.approach_length)
                     away, _ = self._reach(out, down[-1:], scene, scene)
-                    hand = self._robot.hand_pose(down[-1])
+                    hand = self._robot.forward_kinematics(down[-1])
                     plan = replace(pick.plan, place_joints=down[-1], T_base_place=hand)
-                    put = _PutDown(back, down, away, around, load)
+                    put = _PutDown(back, down, away, obstacles, load)
                     return replace(pick, plan=plan, put=put) if away else None
         return None
 
-    def _retreat(self, pick: _Pick, held: Held | None = None) -> list[Float64]:
+    def _retreat(self, pick: _Pick, held: HeldPoints | None = None) -> list[Float64]:
         """Joints along the retreat if the held points touch nothing on it, else an empty list."""
         rules = self._options.collision
         T_base_hand = self._T_base_cloud @ pick.grasp.T_cloud_hand
@@ -306,9 +307,9 @@ class _Arm:
         # The detector has already checked the hand's approach and retreat.
         length = rules.retreat_length or rules.approach_length
         way = self._T_base_cloud[:3, :3].T @ direction * length
-        poses, straight = _straight(T_base_hand, direction, 0.0, length), self._robot.straight
+        poses, straight = _straight(T_base_hand, direction, 0.0, length), self._robot.straight_scene
         line, _ = self._reach(poses, pick.line[-1:], straight, straight)
-        held = held or held_by(pick.grasp, self._scene, self._robot.gripper)
+        held = held or held_points(pick.grasp, self._scene, self._robot.gripper)
         return line if line and can_leave(held, self._scene, way, rules) else []
 
     def _free_motion(
@@ -330,7 +331,7 @@ class _Arm:
         options = RRTOptions(GROUP, 3000, rrt_connect=True, collision_check_step_size=step)
         begin = time.monotonic()
         # A limit of nodes is not enough: a blocked search adds none. A time of zero means no limit.
-        options.max_planning_time = max(1e-3, min(self._path_seconds / 3, self._until - begin))
+        options.max_planning_time = max(1e-3, min(self._path_seconds / 3, self._deadline - begin))
         planner = RRT(scene, options)
         planner.setRngSeed(seed)
         first, last = (core.JointConfiguration(names, joints) for joints in (start, end))
@@ -360,7 +361,8 @@ class _Arm:
         if not all(map(scene.isValidConfiguration, rows)):
             return None
         if straight:
-            hand = np.array([self._robot.hand_pose(row)[:3, 3] for row in (*rows, joints[-1])])
+            poses = map(self._robot.forward_kinematics, (*rows, joints[-1]))
+            hand = np.array([T_base_hand[:3, 3] for T_base_hand in poses])
             along = unit(hand[-1] - hand[0])
             if np.linalg.norm(np.cross(hand - hand[0], along), axis=1).max() > MAX_OFF_LINE:
                 return None

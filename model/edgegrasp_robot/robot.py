@@ -43,7 +43,7 @@ class InvalidRobot(EdgeGraspError):  # noqa: N818
     """A robot file cannot be used; its cause names the field, if one is wrong."""
 
 
-class HandPose(Strict):
+class FlangeHandPose(Strict):
     """Pose of the gripper's hand frame in the flange frame."""
 
     position: Vector
@@ -59,7 +59,7 @@ class RobotFile(Strict):
     base_frame: str  # link that is the base in a request's T_base_cloud
     flange_frame: str  # link that carries the gripper; everything beyond it is left out
     gripper: str  # name of a gripper that ships, or its file
-    T_flange_hand: HandPose
+    T_flange_hand: FlangeHandPose
     home: Joints = ()  # joints at which the arm does not touch itself; empty: near zero
     max_velocity: Joints = ()  # of each joint; empty: the URDF's
     max_acceleration: Joints = ()  # of each joint; empty: DEFAULT_ACCELERATION each
@@ -71,7 +71,7 @@ class Robot:
 
     name: str
     gripper: Gripper
-    hand: GripperGeometry  # the same, in the form of options
+    gripper_geometry: GripperGeometry  # the same, in the form of options
     base_frame: str
     flange_frame: str
     T_flange_hand: Float64  # (4, 4)
@@ -82,10 +82,10 @@ class Robot:
     max_velocity: Float64  # (J,)
     max_acceleration: Float64  # (J,)
     kinematics: Kinematics  # the arm in numbers, as in `edgegrasp.v1.Robot`
-    model: "Model"
+    model: "RobotModel"
     scene: core.Scene  # for the free motion
-    straight: core.Scene  # for straight motions, in which the hand may touch what it grasps
-    carrying: core.Scene  # for the motion that carries an object to its place
+    straight_scene: core.Scene  # for straight motions, in which the hand may touch what it grasps
+    carrying_scene: core.Scene  # for the motion that carries an object to its place
     ik: SimpleIk  # in a scene without shapes, where it takes a third of the time
 
     def joints_at(self, T_base_hand: Floats, start: Float64) -> Float64 | None:
@@ -98,7 +98,7 @@ class Robot:
         joints = np.array(found.positions)
         return joints if self.scene.isValidConfiguration(joints) else None
 
-    def hand_pose(self, joints: ArrayLike) -> Float64:
+    def forward_kinematics(self, joints: ArrayLike) -> Float64:
         """T_base_hand (4, 4) at joints (J,)."""
         given = np.asarray(joints, np.float64)
         return np.asarray(self.scene.forwardKinematics(given, HAND, self.base_frame))
@@ -117,7 +117,7 @@ class Robot:
 
 
 @dataclass(frozen=True)
-class Model:
+class RobotModel:
     """What the planner's scenes are built from."""
 
     arm: str  # URDF without what is beyond the flange, with absolute paths of meshes
@@ -196,7 +196,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     standing = [
         link for link in links if not any(one.get("type") in MOVING for one in _above(root, link))
     ]
-    model = Model(arm, ElementTree.tostring(root, "unicode"), links, standing, allowed)
+    model = RobotModel(arm, ElementTree.tostring(root, "unicode"), links, standing, allowed)
     scene, straight, carrying = (model.scene(file) for _ in range(3))
     for name, link in zip(links, shaped, strict=True):
         shapes = link.findall("collision")
@@ -247,7 +247,7 @@ def _kinematics(joints: Sequence[Element], scene: core.Scene, base_frame: str) -
 
 def touching(
     scene: core.Scene,  # the robot and its surroundings
-    model: Model,
+    model: RobotModel,
     joints: Float64,  # a configuration in collision
     around: Sequence[str] = (),  # names of the obstacles
 ) -> str:

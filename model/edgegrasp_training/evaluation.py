@@ -31,7 +31,7 @@ from edgegrasp_training.examples import pack_hands, tried_grasps
 from edgegrasp_training.views import find_views, load_view, scene_of, table
 
 TENTHS = tuple(round(0.1 * number, 1) for number in range(11))
-EDGES = (0.0, 0.1, 0.3, 0.5, 0.8, 0.9, 0.95, 1.0)  # edges of the score ranges in a comparison
+BIN_EDGES = (0.0, 0.1, 0.3, 0.5, 0.8, 0.9, 0.95, 1.0)  # edges of the score ranges in a comparison
 SCORES = (1e-4, 1.0 - 1e-4)  # scores are clipped to this range
 # Standard deviations of the prior of log(scale) and of shift: few outcomes change little.
 PRIOR_SCALE, PRIOR_SHIFT = 0.5, 1.5
@@ -39,7 +39,7 @@ FEW = 25
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class ScoreMetrics:
     """A network on the validation views."""
 
     loss: float  # cross entropy, nats
@@ -50,11 +50,11 @@ class Evaluation:
     label: Float32  # (E,)
 
 
-def evaluate_scores(logit: Float32, label: Float32) -> Evaluation:
+def evaluate_scores(logit: Float32, label: Float32) -> ScoreMetrics:
     """All figures for scores (E,) and outcomes (E,)."""
     accuracy = float(np.mean((logit > 0) == (label > 0.5)))
     loss, rank = cross_entropy(logit, label), auroc(logit, label)
-    return Evaluation(loss, accuracy, rank, fit_temperature(logit, label), logit, label)
+    return ScoreMetrics(loss, accuracy, rank, fit_temperature(logit, label), logit, label)
 
 
 def cross_entropy(logit: Floats, label: Floats) -> float:
@@ -82,7 +82,7 @@ def fit_temperature(logit: Floats, label: Floats) -> float:
     return float(np.exp(minimize_scalar(cost, bounds=(-2.0, 2.0)).x))
 
 
-class Range(NamedTuple):
+class ReliabilityBin(NamedTuple):
     """Grasps whose scores lie between two edges."""
 
     score: float  # mean
@@ -92,12 +92,12 @@ class Range(NamedTuple):
 
 def reliability(
     score: Floats, held: NDArray[np.generic], edges: tuple[float, ...] = TENTHS
-) -> dict[float, Range]:
+) -> dict[float, ReliabilityBin]:
     """Outcomes (E,) in each non-empty range of scores (E,), by its lower edge."""
     place = np.digitize(score, edges[1:-1])
     ranges = {edges[k]: place == k for k in np.unique(place)}
     return {
-        low: Range(float(score[mine].mean()), float(held[mine].mean()), int(mine.sum()))
+        low: ReliabilityBin(float(score[mine].mean()), float(held[mine].mean()), int(mine.sum()))
         for low, mine in ranges.items()
     }
 
@@ -109,7 +109,7 @@ def calibration_error(score: Floats, held: NDArray[np.generic]) -> float:
 
 
 def write_model_card(
-    path: Path, metadata: CheckpointMetadata, evaluation: Evaluation, command: str
+    path: Path, metadata: CheckpointMetadata, evaluation: ScoreMetrics, command: str
 ) -> None:
     """Write a card in Markdown, with the evaluation before calibration."""
     network = {name: value for name, value in asdict(metadata.network).items() if value != ()}
@@ -163,7 +163,7 @@ def read_outcomes(path: Path, digest: str) -> tuple[Float64, Float64]:
     return logit_of(np.clip(scores, *SCORES)), np.array(held)
 
 
-def fit(logit: Float64, held: Float64) -> tuple[float, float]:
+def fit_scale_and_shift(logit: Float64, held: Float64) -> tuple[float, float]:
     """The most probable scale and shift of the logits, given the outcomes."""
 
     def cost(parameters: Float64) -> float:
@@ -180,7 +180,7 @@ def recalibrate(weights: Path, outcomes_file: Path, folder: Path) -> str:
     """Write NAME-robot.safetensors, calibrated on outcomes; returns a sentence about the result."""
     network, metadata = load_checkpoint(weights)
     logit, held = read_outcomes(outcomes_file, metadata.digest)
-    scale, shift = fit(logit, held)
+    scale, shift = fit_scale_and_shift(logit, held)
     share = float(held.mean())
     old_scale, old_shift = metadata.training.get("rescaled_by_outcomes", (1.0, 0.0))
     training = metadata.training | {
@@ -268,12 +268,12 @@ def reliability_tables(scored: Scored, names: list[str]) -> str:
             figures = (f"{v:.3f}" for v in (loss, brier, calibration_error(score, held)))
             rows.append((group, name, len(held), *shares, *figures))
     head = ("grasps", "weights", "number", "mean score", "held", "loss", "Brier", "ECE")
-    found = [reliability(expit(logit), scored.held, EDGES) for logit in scored.logit]
+    found = [reliability(expit(logit), scored.held, BIN_EDGES) for logit in scored.logit]
     cells = [
         {low: f"{100 * each.held:.1f} % of {each.number}" for low, each in one.items()}
         for one in found
     ]
-    ranges = [(f"from {low:g}", *(one.get(low, "-") for one in cells)) for low in EDGES[:-1]]
+    ranges = [(f"from {low:g}", *(one.get(low, "-") for one in cells)) for low in BIN_EDGES[:-1]]
     by_range = table(("score", *(f"{name}: held" for name in names)), ranges)
     return "\n".join([*table(head, rows), "", *by_range])
 

@@ -49,17 +49,17 @@ class TriedGrasps:
     cloud: Cloud
     candidates: Candidates  # E of them
     # Input of a hand network, float16 to keep many views in memory; None for ball networks.
-    seen: HandBatch | None
+    hand_batch: HandBatch | None
     label: Float32  # (E,) 0: not held; 1: held, less if it did not survive shaking
-    turn: Float32  # (3, 3) rotation of the cloud's axes to the detector's frame
+    R_canonical_world: Float32  # (3, 3) rotation of the cloud's axes to the detector's frame
 
     def without_support(self) -> "TriedGrasps":
         """The same grasps, described as for a request without a support plane."""
-        if self.seen is None:
+        if self.hand_batch is None:
             return self
-        unknown = self.seen.description.clone()
+        unknown = self.hand_batch.description.clone()
         unknown[:, HEIGHT_NUMBERS] = UNKNOWN_HEIGHT
-        return replace(self, seen=replace(self.seen, description=unknown))
+        return replace(self, hand_batch=replace(self.hand_batch, description=unknown))
 
     def balls(self) -> Int64:
         """Approach points of the labelled candidates: ascending rows of the cloud."""
@@ -73,7 +73,7 @@ class SoftLabels(NamedTuple):
     chance: NDArray[np.float16]  # (E,) probability that it holds, by the teacher
 
 
-class Packed(NamedTuple):
+class Batch(NamedTuple):
     """One step's input of a network, and its targets."""
 
     batch: BallBatch | HandBatch
@@ -97,8 +97,8 @@ def tried_grasps(
         viewpoints = view.camera_position[None] if viewpoint_known else np.empty((0, 3), np.float32)
         batch = hand_batch(view, candidates, viewpoints, SPARE_POINTS * config.hand_points)
         seen = replace(batch, description=batch.description.half(), points=batch.points.half())
-    frame = CanonicalFrame.of_scene(view.points, view.up, view.camera_position)
-    turn = frame.directions(np.eye(3)).T.astype(np.float32)
+    frame = CanonicalFrame.from_scene(view.points, view.up, view.camera_position)
+    turn = frame.directions_from_cloud(np.eye(3)).T.astype(np.float32)
     return TriedGrasps(cloud, candidates, seen, labels[rows[candidates.pair]], turn)
 
 
@@ -111,7 +111,7 @@ def hand_batch(
     """The hand network's inputs for candidates in a simulated scene."""
     known = view.support_plane, viewpoints, view.cut_off(), view.numbered_objects()
     around = Surroundings(Cloud(view.points, view.normals), view.up, *known)
-    return HandBatch.of_hands(around, candidates, view.hand, max_points)
+    return HandBatch.from_hands(around, candidates, view.hand, max_points)
 
 
 class Teacher:
@@ -166,7 +166,7 @@ class Teacher:
 
 def pack_balls(
     grasps: TriedGrasps, balls: Int64, config: NetworkConfig, soft_labels: SoftLabels | None = None
-) -> Packed:
+) -> Batch:
     """Pack candidates in balls, rows (A,) of a view, in the detector's axes and LENGTH_UNITs."""
     candidates, label = grasps.candidates, grasps.label
     weight = np.ones(len(label), dtype=np.float32)
@@ -179,10 +179,10 @@ def pack_balls(
     inside = np.square(edge).sum(axis=1) <= config.crop_radius**2
     kept = inside & np.isin(candidates.approach_index, balls)
     some = candidates.take(kept)
-    batch = BallBatch.of_candidates(grasps.cloud, some, config.crop_radius, config.k)
+    batch = BallBatch.from_candidates(grasps.cloud, some, config.crop_radius, config.k)
     batch = replace(batch, points=batch.points / LENGTH_UNIT, depth=batch.depth / LENGTH_UNIT)
     targets = torch.from_numpy(label[kept]), torch.from_numpy(weight[kept])
-    return Packed(turned(batch, grasps.turn), *targets)
+    return Batch(turned(batch, grasps.R_canonical_world), *targets)
 
 
 def joined(batches: Sequence[BallBatch | HandBatch]) -> BallBatch | HandBatch:
@@ -198,9 +198,9 @@ def joined(batches: Sequence[BallBatch | HandBatch]) -> BallBatch | HandBatch:
 
 def pack_hands(
     grasps: TriedGrasps, balls: Int64, config: NetworkConfig, rng: np.random.Generator | None = None
-) -> Packed:
+) -> Batch:
     """Pack the hand network's inputs in balls, rows (A,) of the cloud."""
-    seen = grasps.seen
+    seen = grasps.hand_batch
     assert seen is not None
     rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, balls))
     points, count = seen.points.numpy()[rows], seen.point_count.numpy()[rows]
@@ -216,7 +216,7 @@ def pack_hands(
         torch.from_numpy(chosen.astype(np.float32)),
         torch.from_numpy(np.minimum(count, limit)),
     )
-    return Packed(batch, torch.from_numpy(grasps.label[rows]), torch.ones(len(rows)))
+    return Batch(batch, torch.from_numpy(grasps.label[rows]), torch.ones(len(rows)))
 
 
 def turned(batch: BallBatch, turn: Float32) -> BallBatch:

@@ -21,13 +21,13 @@ from edgegrasp_model.ranking import average_similar_hands
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_sim.camera import Observation, TableView, ViewRange
 from edgegrasp_sim.engine import choose_engine
+from edgegrasp_sim.fixed_parts import MIDDLE, TABLE_HEIGHT
 from edgegrasp_sim.hand import FINGERTIP
 from edgegrasp_sim.objects import CLUTTER, ObjectSet, SceneKind
 from edgegrasp_sim.poses import about_z
 from edgegrasp_sim.scene import SCALES
 from edgegrasp_sim.sensor import random_sensor
 from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
-from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
 from edgegrasp_sim.workers import run_tasks
 from edgegrasp_training.options import GenerationOptions
 from edgegrasp_training.shapes import household_objects, varied_objects
@@ -76,8 +76,8 @@ FREE_SHARE = 0.75  # collision-free share of the grasps chosen at random
 LIKELY, LIKELY_SHARE = 1 / 3, 0.7  # best part of an object's grasps, and its share of the tries
 
 Query = tuple[Observation, DetectOptions]  # a view of a scene, and a request for grasps in it
-detector = lru_cache(maxsize=2)(GraspDetector.load)  # loads weights once in a process
-USUAL = WEIGHTS_FOLDER / "edgegrasp-plus.safetensors"  # weights that prepare views without a guide
+load_detector = lru_cache(maxsize=2)(GraspDetector.load)  # loads weights once in a process
+DEFAULT_WEIGHTS = WEIGHTS_FOLDER / "edgegrasp-plus.safetensors"  # for views without a guide
 
 
 def generate(
@@ -92,7 +92,7 @@ def generate(
     # Other machines need absolute paths.
     weights, objects = (path and path.resolve() for path in (options.weights, objects))
     if weights is not None:
-        detector(weights)  # refuses wrong weights now, not when the first scene is cleared
+        load_detector(weights)  # refuses wrong weights now, not when the first scene is cleared
     changes = {"engine": choose_engine(options.engine), "weights": weights}
     options = options.model_copy(update=changes)
     # One view of each kind and seed: all scenes of a seed are made by the same engine.
@@ -199,15 +199,15 @@ def _views(
     (camera, noise, choice), hand = of_views, simulation.gripper
     guide, failures = None, FAILURES
     if options.weights is not None and rng.random() < CLEARED_SHARE:
-        guide = detector(options.weights)
+        guide = load_detector(options.weights)
     for _ in range(options.views_per_scene):
         if simulation.num_objects == 0 or failures == FAILURES:
             simulation.reset(kind, rng, 1 + int(rng.poisson(FURTHER_OBJECTS[kind])), sizes)
             failures = 0
-        models = [model.origin or model for model in simulation.object_models]
+        models = [model.unstretched or model for model in simulation.object_models]
         cameras, guided = seen_from.sample(camera), guide is not None
-        query, sensor = ask(simulation, kind, cameras, noise, choice, guided=guided)
-        view, best = label(simulation, query, options, choice, guide)
+        query, sensor = observe_and_request(simulation, kind, cameras, noise, choice, guided=guided)
+        view, best = label_view(simulation, query, options, choice, guide)
         yield replace(
             view,
             gripper="" if hand is None else json.dumps(hand),
@@ -221,7 +221,7 @@ def _views(
             failures = 0 if success else failures + 1
 
 
-def ask(
+def observe_and_request(
     simulation: ClutterSimulation,
     kind: SceneKind,
     cameras: Sequence[Float64],  # (4, 4) T_world_camera of each
@@ -280,14 +280,14 @@ def _objects_of(simulation: ClutterSimulation) -> dict[str, Any]:
             "half_extents": [size / 2 + AROUND_MARGIN for size in box.size],
             "quaternion": about_z(box.yaw),
         }
-        for box in simulation.surroundings.boxes
+        for box in simulation.fixed_parts.boxes
         if box.obstacle
     ]
     include = [{"kind": "box", "min": low, "max": high} for low, high in boxes]
     return {"include": include, "exclude": around}
 
 
-def label(
+def label_view(
     simulation: ClutterSimulation,  # contains the scene
     query: Query,  # a view of it and the request
     options: GenerationOptions,  # how many to try
@@ -302,7 +302,7 @@ def label(
         camera, success = observation.camera_position, rows.astype(np.int8)
         return LabelledView(nothing, nothing, camera, rows, rows, success), None
     prepared, scene, candidates, best = found
-    T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
+    T_world_hand = scene.frame.poses_to_cloud(candidates.T_cloud_hand)
     results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
     targets = [result.target.model.name if result.target else "" for result in results]
     # Points far from every grasp carry no information.
@@ -315,7 +315,7 @@ def label(
     kept = np.flatnonzero(cKDTree(places).query(scene.points_in_cloud)[0] <= KEPT_DISTANCE)
     view = LabelledView(
         points=scene.points_in_cloud[kept],
-        normals=scene.frame.directions_in_cloud(scene.cloud.normals)[kept],
+        normals=scene.frame.directions_to_cloud(scene.cloud.normals)[kept],
         camera_position=observation.camera_position,
         approach_index=np.searchsorted(kept, candidates.approach_index),
         contact_index=np.searchsorted(kept, candidates.contact_index),
@@ -340,7 +340,7 @@ def choose_grasps(
     observation, request = query
     if len(observation.cloud) < (request.num_approach_points or 1):
         return None
-    prepared = (guide or detector(USUAL)).prepare(observation.cloud, request)
+    prepared = (guide or load_detector(DEFAULT_WEIGHTS)).prepare(observation.cloud, request)
     scene = prepared.scene
     if scene is None or not scene.approach_allowed.any():
         return None

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float64
 from edgegrasp_model.scene.cloud import unit
-from edgegrasp_sim.engine.urdf import Surface, convex_hull
+from edgegrasp_sim.engine.urdf import TriangleMesh, convex_hull
 
 Numbers = Float64 | list[float]
 Part = Float64  # (..., 3) metres: points; the part is their convex hull
@@ -21,7 +21,7 @@ LIE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # turns z t
 RAISE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # turns y to z
 
 
-def household_mesh(rng: Random) -> tuple[str, list[Surface]]:
+def household_mesh(rng: Random) -> tuple[str, list[TriangleMesh]]:
     """Draw an object of any family: its family's name, and closed convex parts that may overlap.
 
     The object stands on z = 0, centred on the z axis.

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_camera.arrays import Bools, Float32, Float64
 from edgegrasp_model.scene.network import smoothly_enlarged
 from edgegrasp_sim.camera import look_at
-from edgegrasp_sim.engine import Intrinsics
+from edgegrasp_sim.engine import SimCamera
 from edgegrasp_sim.engine.urdf import parse_obj
 from edgegrasp_sim.objects import Mesh
 from edgegrasp_sim.sensor import DepthSensor, random_sensor
@@ -63,7 +63,7 @@ COARSE = 0.15  # share of the images with few pixels, like a small camera or a d
 
 # From a camera and its pose T_world_camera: depth (H, W) in metres, `far` where nothing is hit,
 # labels (H, W), and whether the surface is steep (H, W).
-Render = Callable[[Intrinsics, Float64], tuple[Float64, NDArray[np.uint8], Bools]]
+Render = Callable[[SimCamera, Float64], tuple[Float64, NDArray[np.uint8], Bools]]
 
 
 class SceneImage(NamedTuple):
@@ -110,7 +110,7 @@ def make_images(scene: SceneMeshes) -> list[SceneImage]:
 def _make_image(scene: SceneMeshes, render: Render) -> SceneImage | None:
     rng, pose = scene.rng, _draw_pose(scene)
     focal = WIDTH / 2 / np.tan(np.radians(rng.uniform(35, 80)) / 2)
-    camera = Intrinsics(WIDTH, HEIGHT, focal, WIDTH / 2, HEIGHT / 2, 0.1, 13.0)
+    camera = SimCamera(WIDTH, HEIGHT, focal, WIDTH / 2, HEIGHT / 2, 0.1, 13.0)
     depth, label, steep = render(camera, pose)
     close = (depth < 0.22).mean()
     seen = np.bincount(label.ravel(), minlength=OBJECT + MAX_OBJECTS)[OBJECT:]
@@ -160,7 +160,7 @@ def _renderer(parts: Sequence[tuple[Mesh, int]]) -> Render:
         casting.add_triangles(*map(o3d.core.Tensor.from_numpy, arrays))
     labels = np.array([label for _, label in parts] + [OTHER])
 
-    def render(camera: Intrinsics, pose: Float64) -> tuple[Float64, NDArray[np.uint8], Bools]:
+    def render(camera: SimCamera, pose: Float64) -> tuple[Float64, NDArray[np.uint8], Bools]:
         y, x = np.indices((camera.height, camera.width)) + 0.5
         ahead = np.full(x.shape, camera.focal_length)
         rays = np.stack([x - camera.centre_x, y - camera.centre_y, ahead], axis=-1)
@@ -177,7 +177,11 @@ def _renderer(parts: Sequence[tuple[Mesh, int]]) -> Render:
 
 
 def _faults(
-    scene: SceneMeshes, depth: Float64, label: NDArray[np.uint8], camera: Intrinsics, pose: Float64
+    scene: SceneMeshes,
+    depth: Float64,
+    label: NDArray[np.uint8],
+    camera: SimCamera,
+    pose: Float64,
 ) -> tuple[Float64, NDArray[np.uint8]]:
     """The image with a real camera's faults, NaN where there is no reading, and its labels."""
     rng = scene.rng

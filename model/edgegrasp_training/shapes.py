@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from edgegrasp_camera.arrays import Float64
-from edgegrasp_sim.engine.urdf import Surface
+from edgegrasp_sim.engine.urdf import TriangleMesh
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, as_obj, blob, write_object, write_parts
 from edgegrasp_training.household import household_mesh, lofted, oval, swept
 
@@ -85,7 +85,7 @@ def stretched(model: ObjectModel, factors: Float64, folder: Path) -> ObjectModel
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{model.name}.urdf"
     tree.write(path)
-    return replace(model, urdf=path, origin=model)
+    return replace(model, urdf=path, unstretched=model)
 
 
 def drawn_shape(index: int) -> str:
@@ -102,17 +102,17 @@ def free_shape(rng: np.random.Generator, index: int) -> str:
     return as_obj(_surface(part * np.maximum(scale, THINNEST / extents)) for part in parts)
 
 
-def joined(rings: Rings, *, closed: bool = True) -> Surface:
+def joined(rings: Rings, *, closed: bool = True) -> TriangleMesh:
     """The surface between neighbouring rings or open rows of corners, two triangles per side."""
     number = np.arange(rings.size // 3).reshape(rings.shape[:2])
     if closed:
         number = np.hstack([number, number[:, :1]])
     a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
     triangles = np.array([[a, b, c], [a, c, d]]).transpose(2, 0, 3, 1)
-    return Surface(rings.reshape(-1, 3), triangles.reshape(-1, 3))
+    return TriangleMesh(rings.reshape(-1, 3), triangles.reshape(-1, 3))
 
 
-def _surface(rings: Rings) -> Surface:
+def _surface(rings: Rings) -> TriangleMesh:
     """Join neighbouring rings, and close the ends with triangle fans."""
     (points, sides), (count, corners, _) = joined(rings), rings.shape
     points = np.concatenate([points, rings[[0, -1]].mean(axis=1)])
@@ -122,7 +122,7 @@ def _surface(rings: Rings) -> Surface:
     triangles = np.concatenate([sides, bottom, top])
     a, b, c = points[triangles].transpose(1, 0, 2)
     outwards = (np.cross(a, b) * c).sum() > 0.0
-    return Surface(points, triangles if outwards else triangles[:, ::-1])
+    return TriangleMesh(points, triangles if outwards else triangles[:, ::-1])
 
 
 def _plain(rng: np.random.Generator) -> Rings:

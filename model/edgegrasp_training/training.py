@@ -23,7 +23,7 @@ from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
 from edgegrasp_model.networks.hand import HandNet
 from edgegrasp_training import examples, recipes
-from edgegrasp_training.evaluation import Evaluation, evaluate_scores, write_model_card
+from edgegrasp_training.evaluation import ScoreMetrics, evaluate_scores, write_model_card
 from edgegrasp_training.options import TrainingOptions
 from edgegrasp_training.views import load_view
 
@@ -110,7 +110,7 @@ class Trainer:
                 self._save_state()
         self._save_state()
 
-    def evaluate(self, balls_per_view: int | None = None) -> Evaluation:
+    def evaluate(self, balls_per_view: int | None = None) -> ScoreMetrics:
         """Score the validation views, or at most `balls_per_view` balls of each.
 
         Targets are the outcomes of tried grasps, and with a teacher also its scores.
@@ -127,7 +127,7 @@ class Trainer:
                 labels.append((label > 0.5).float() if self.teacher is None else label)
         return evaluate_scores(torch.cat(logits).numpy(), torch.cat(labels).numpy())
 
-    def finish(self, provenance: dict[str, Any], command: str) -> Evaluation:
+    def finish(self, provenance: dict[str, Any], command: str) -> ScoreMetrics:
         """Calibrate the best network on all validation views; write it and its card."""
         path = self.folder / f"{self.metadata.name}.safetensors"
         best, saved = load_checkpoint(path)
@@ -189,10 +189,10 @@ class Trainer:
             mean.lerp_(value.detach(), 1.0 - kept)
         return float(loss.detach())
 
-    def _training_batch(self, rng: np.random.Generator) -> examples.Packed:
+    def _training_batch(self, rng: np.random.Generator) -> examples.Batch:
         """Random balls of random views, determined only by the seed and the step number."""
         count = min(self.options.views_per_step, len(self.train_paths))
-        parts: list[examples.Packed] = []
+        parts: list[examples.Batch] = []
         for index in rng.choice(len(self.train_paths), count, replace=False):
             camera_known, support_known = (rng.random(2) >= UNKNOWN).tolist()
             camera_matters = self.metadata.network.architecture == "hand"
@@ -214,7 +214,7 @@ class Trainer:
         if not parts:
             raise ValueError("data: no grasp was tried in the views of this step. Make others")
         batches, labels, weights = zip(*parts, strict=True)
-        return examples.Packed(examples.joined(batches), torch.cat(labels), torch.cat(weights))
+        return examples.Batch(examples.joined(batches), torch.cat(labels), torch.cat(weights))
 
     def _packed(
         self,
@@ -224,7 +224,7 @@ class Trainer:
         rng: np.random.Generator,  # chooses balls
         *,
         vary: bool = False,  # also choose the points of hands at random
-    ) -> examples.Packed | None:
+    ) -> examples.Batch | None:
         """Balls of a view with tried grasps or the teacher's scores; None if there are none."""
         network, balls, taught = self.metadata.network, grasps.balls(), None
         if self.teacher is not None:
@@ -239,7 +239,7 @@ class Trainer:
 
     def _standardise(self, network: HandNet) -> None:
         """Fit mean and standard deviation of hand descriptions to the training views."""
-        seen = [self._tried(path, True).seen for path in self.train_paths]
+        seen = [self._tried(path, True).hand_batch for path in self.train_paths]
         values = np.concatenate([hands.description.numpy() for hands in seen if hands is not None])
         mean, std = values.mean(axis=0, dtype=np.float64), values.std(axis=0, dtype=np.float64)
         recipes.set_statistics(network, torch.from_numpy(mean), torch.from_numpy(std))
@@ -250,7 +250,7 @@ class Trainer:
         path = self.folder / f"{metadata.name}.safetensors"
         save_checkpoint(path, recipes.rescaled(self.average, 1.0 / recipes.LENGTH_UNIT), metadata)
 
-    def _log(self, evaluation: Evaluation, train_loss: float) -> None:
+    def _log(self, evaluation: ScoreMetrics, train_loss: float) -> None:
         row = {
             "step": self.step,
             "learning_rate": float(f"{self.optimizer.param_groups[0]['lr']:.4g}"),

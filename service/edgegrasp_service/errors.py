@@ -126,7 +126,7 @@ class Problem:
     retry_after: float | None = None  # seconds
 
 
-def report(error: Exception) -> Problem:
+def to_problem(error: Exception) -> Problem:
     """Describe an error for the caller; an unknown error reveals nothing about itself."""
     if type(error) not in STATUS:
         error = DetectorFailed("The server failed; its log says why.")
@@ -139,7 +139,7 @@ def report(error: Exception) -> Problem:
     return Problem(kind_of(type(error)), detail, field, value, fix, code, status, retry_after)
 
 
-def no_message(data: bytes) -> InvalidRequest:
+def unreadable_message(data: bytes) -> InvalidRequest:
     """The error for bytes that protobuf cannot read."""
     value = f"{len(data)} bytes that are not a message of this method"
     return InvalidRequest("request", value, "Send a message as the .proto file defines it.")

@@ -206,9 +206,9 @@ def start_logging(settings: Settings, stream: TextIO | None) -> LogQueue:
 # Metrics: every label has few values, whatever callers send
 
 SECONDS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
-FEW = (0, 1, 2, 4, 8, 16, 32, 64, 128, 256)
+GRASPS = (0, 1, 2, 4, 8, 16, 32, 64, 128, 256)
 MODEL_LABELS = ("name", "digest", "architecture", "default", "device")
-MANY = (0, 10, 100, 300, 1000, 2000, 4000, 8000, 16000)
+CANDIDATES = (0, 10, 100, 300, 1000, 2000, 4000, 8000, 16000)
 
 
 class Metrics:
@@ -226,8 +226,8 @@ class Metrics:
         seconds = partial(histogram, buckets=SECONDS)
         self._seconds = seconds("request_seconds", "from headers to answer", calls)
         self._stages = seconds("stage_seconds", "stages of a request", ("stage",))
-        self._candidates = histogram("candidates", "candidates of a detection", buckets=MANY)
-        self._grasps = histogram("grasps_returned", "grasps of a detection", buckets=FEW)
+        self._candidates = histogram("candidates", "candidates of a detection", buckets=CANDIDATES)
+        self._grasps = histogram("grasps_returned", "grasps of a detection", buckets=GRASPS)
         self._results = counter("stream_results", "results sent on streams", ("code",))
         self.workers_replaced = counter("workers_replaced", "worker processes that died")
         self._model_info = self._gauge("model_info", "loaded weights", MODEL_LABELS)
@@ -249,7 +249,7 @@ class Metrics:
             self._candidates.observe(call.facts.counts.get("candidates", 0))
             self._grasps.observe(call.facts.grasps)
 
-    def watch(self, name: str, meaning: str, value: Callable[[], float]) -> None:
+    def add_gauge(self, name: str, meaning: str, value: Callable[[], float]) -> None:
         """Add a gauge whose value is computed when metrics are read."""
         self._gauge(name, meaning).set_function(value)
 

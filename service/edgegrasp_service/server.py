@@ -22,10 +22,10 @@ from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import AddressInUse, InvalidSettings
 from edgegrasp_service.front.grpc import GrpcServer
 from edgegrasp_service.front.http import HttpMiddleware, HttpProtocol, create_router
-from edgegrasp_service.front.service import GraspService, Places
+from edgegrasp_service.front.service import EvictingLimiter, GraspService
 from edgegrasp_service.observability import LogQueue, Metrics, start_logging, write_line
 from edgegrasp_service.settings import UNIX_PREFIX, Settings
-from edgegrasp_service.worker.process import PIECE_BYTES, Nursery, WorkerPool
+from edgegrasp_service.worker.process import PIECE_BYTES, ForkServer, WorkerPool
 from edgegrasp_service.worker.recording import check_outcomes
 
 logger = logging.getLogger(__name__)
@@ -44,20 +44,20 @@ REPEAT_SECONDS = 10.0  # seconds between log lines about the same socket error
 class Server:
     """Both transports; create it in the running event loop. Raises InvalidSettings."""
 
-    def __init__(self, settings: Settings, nursery: Nursery | None = None) -> None:
+    def __init__(self, settings: Settings, fork_server: ForkServer | None = None) -> None:
         self._settings = settings
         self.metrics = Metrics(lambda: self.pool.models)
-        self.pool = WorkerPool(settings, self.metrics.workers_replaced.inc, nursery)
+        self.pool = WorkerPool(settings, self.metrics.workers_replaced.inc, fork_server)
         self.service = GraspService(settings, self.pool, self.metrics)
         if settings.outcomes_file is not None:
             check_outcomes(settings.outcomes_file)
         service, admission = self.service, self.service.admission
-        watch = self.metrics.watch
+        watch = self.metrics.add_gauge
         watch("ready", "1: requests are answered", lambda: service.ready)
         watch("requests_in_flight", "requests not yet answered", lambda: len(admission.calls))
-        watch("requests_active", "requests that workers have", lambda: admission.at_work)
+        watch("requests_active", "requests that workers have", lambda: admission.num_at_work)
         waiting = "admitted requests that no worker has yet"
-        watch("queue_depth", waiting, lambda: len(admission.calls) - admission.at_work)
+        watch("queue_depth", waiting, lambda: len(admission.calls) - admission.num_at_work)
         watch("held_bytes", "bytes of bodies in the server", lambda: admission.held_bytes)
         watch("workers", "worker processes", lambda: len(self.pool.pids))
         self.http_url = self.grpc_address = ""  # once ports are open: http://host:port, host:port
@@ -75,7 +75,7 @@ class Server:
         settings = self._settings
         asyncio.get_running_loop().set_exception_handler(_LoopErrors())
         with _listen(settings.host, settings.http_port) as http_socket:
-            http_connections = Places(settings.max_connections, spare=HEALTH_PLACES)
+            http_connections = EvictingLimiter(settings.max_connections, spare=HEALTH_PLACES)
             grpc_server = GrpcServer(self.service)
             http_server = self._http_server(http_connections)
             await grpc_server.server.start()
@@ -111,14 +111,14 @@ class Server:
         if not self.service.stopping.is_set():
             ready()
 
-    def _http_server(self, places: Places) -> "_HttpServer":
+    def _http_server(self, limiter: EvictingLimiter) -> "_HttpServer":
         tls = self.service.tls
         config = uvicorn.Config(
             HttpMiddleware(create_router(self.service, self.metrics), self.service),
             log_config=None,
             access_log=False,
             lifespan="off",
-            http=partial(HttpProtocol, self.service, places),  # type: ignore[arg-type]
+            http=partial(HttpProtocol, self.service, limiter),  # type: ignore[arg-type]
             ws="none",
             backlog=MAX_ACCEPTED_AT_ONCE,
             server_header=False,
@@ -161,10 +161,10 @@ class _LoopErrors:
             logger.error("%s (%s)", context["message"], error)
 
 
-def run(settings: Settings, nursery: Nursery | None = None) -> None:
+def run(settings: Settings, fork_server: ForkServer | None = None) -> None:
     """Serve until SIGTERM or SIGINT; prints one line with both addresses when ready.
 
-    `nursery`, if given, is already loading the weights.
+    `fork_server`, if given, is already loading the weights.
 
     Raises:
         AddressInUse: A port cannot be bound.
@@ -173,19 +173,19 @@ def run(settings: Settings, nursery: Nursery | None = None) -> None:
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     with contextlib.suppress(ValueError):  # the usual 1024 are too few for all connections
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    # A connection takes no place before its TLS handshake, so the handshake's time is limited.
+    # A connection takes no permit before its TLS handshake, so the handshake's time is limited.
     constants.SSL_HANDSHAKE_TIMEOUT = settings.read_seconds
     with contextlib.closing(start_logging(settings, sys.stderr)) as log:
         warn(settings)
-        asyncio.run(_serve_until_signalled(settings, log, nursery))
+        asyncio.run(_serve_until_signalled(settings, log, fork_server))
 
 
 async def _serve_until_signalled(
-    settings: Settings, log: LogQueue, nursery: Nursery | None
+    settings: Settings, log: LogQueue, fork_server: ForkServer | None
 ) -> None:
     stop = asyncio.Event()
-    server = Server(settings, nursery)
-    server.metrics.watch("log_lines_dropped", "log lines not written", lambda: log.dropped)
+    server = Server(settings, fork_server)
+    server.metrics.add_gauge("log_lines_dropped", "log lines not written", lambda: log.dropped)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from edgegrasp_camera.clouds import CloudInput
-from edgegrasp_camera.picture import Picture, View, draw_detection, fork
+from edgegrasp_camera.picture import Camera, Picture, draw_detection, fork
 
 
 def pixels(written: io.BytesIO) -> np.ndarray:
@@ -15,7 +15,7 @@ def pixels(written: io.BytesIO) -> np.ndarray:
 
 
 def test_the_nearest_point_is_seen_at_a_pixel() -> None:
-    view = View((3, 3), 1.0, 1.0, 1.0, 1.0)
+    view = Camera((3, 3), 1.0, 1.0, 1.0, 1.0)
     points = [(0.0, 0.0, 2.0), (0.0, 0.0, 1.0), (np.nan, 0.0, 1.0), (0.0, 0.0, -1.0)]
     assert view.rows_of_pixels(points)[1, 1] == 1
 
@@ -23,11 +23,11 @@ def test_the_nearest_point_is_seen_at_a_pixel() -> None:
 def test_an_image_whose_points_lie_in_a_line_has_no_camera() -> None:
     line = np.ones((24, 32, 3)) * (0.0, 1.0, 1.0)
     line[..., 1] *= np.arange(24)[:, None] / 30
-    assert View.of_image(line) is None
+    assert Camera.from_image(line) is None
 
 
 def test_a_camera_straight_above_a_cloud_sees_it() -> None:
-    view = View.of(np.zeros((9, 3)), (0.0, 0.0, 1.0))
+    view = Camera.facing(np.zeros((9, 3)), (0.0, 0.0, 1.0))
     np.testing.assert_allclose(view.project((0.0, 0.0, 0.0))[0], (view.cx, view.cy))
 
 
@@ -44,7 +44,7 @@ def test_what_the_cloud_hides_of_a_hand_is_faint(behind: bool) -> None:
     y = 0.2 if behind else -0.2
     T = np.array([[0, 1, 0, 0], [1, 0, 0, y], [0, 0, -1, 0.1], [0, 0, 0, 1]])
     stream, grasp = io.BytesIO(), SimpleNamespace(T_cloud_hand=T, score=1.0, width=0.08)
-    picture = Picture(View.of(wall, (0.0, -1.0, 0.0)), wall, title="$_$")  # no formula
+    picture = Picture(Camera.facing(wall, (0.0, -1.0, 0.0)), wall, title="$_$")  # no formula
     picture.grasps([grasp])
     picture.save(stream)
     red, green, blue = np.moveaxis(pixels(stream), 2, 0)
@@ -53,7 +53,7 @@ def test_what_the_cloud_hides_of_a_hand_is_faint(behind: bool) -> None:
 
 def test_regions_are_drawn_where_they_are() -> None:
     points = np.random.default_rng(0).uniform(-0.2, 0.2, (2000, 3))
-    view, stream = View.of(points, (0.0, -1.0, 0.3)), io.BytesIO()
+    view, stream = Camera.facing(points, (0.0, -1.0, 0.3)), io.BytesIO()
     picture = Picture(view, points)
     ball = {"kind": "sphere", "center": (0.1, 0.0, 0.0), "radius": 0.03}
     picture.regions({"contact_region": {"include": [ball]}})
@@ -69,7 +69,9 @@ def test_regions_are_drawn_where_they_are() -> None:
 def test_a_cloud_is_seen_from_its_camera_or_from_above_its_support(up: float, monkeypatch) -> None:
     """Never from under the table, where the origin of an arm's base is."""
     points, eyes = np.random.default_rng(0).uniform((-0.2, -0.2, 0.5), (0.2, 0.2, 0.6), (90, 3)), []
-    monkeypatch.setattr(View, "of", lambda _, eye, up: eyes.append(eye) or View((4, 4), 1, 1, 2, 2))
+    monkeypatch.setattr(
+        Camera, "facing", lambda _, eye, up: eyes.append(eye) or Camera((4, 4), 1, 1, 2, 2)
+    )
     gripper = SimpleNamespace(palm_z=0.05, tip_z=0.1)
     found = SimpleNamespace(up=(0.0, 0.0, up), grasps=[], gripper=gripper, model="")
     for sent in (CloudInput(points), CloudInput(points, viewpoint=(0.0, 0.0, 0.2))):

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_cli import main
-from edgegrasp_service.errors import InvalidRequest, report
+from edgegrasp_service.errors import InvalidRequest, to_problem
 from edgegrasp_service.worker.process import Answer, Facts, Job
 
 HEAVY = {"torch", "open3d", "grpc", "pybullet", "mujoco", "fastapi", "uvicorn", "httpx"}
@@ -136,7 +136,7 @@ def test_a_recorded_request_is_answered_again(transport, monkeypatch) -> None:
     def replay(path: Path, settings: object) -> tuple[Job, Answer, Answer]:
         job, facts = Job("DetectGrasps", transport, b"", 60.0), Facts(grasps=7)
         if path.stem == "errors":
-            first, second = (report(InvalidRequest("cloud", value, "")) for value in "ab")
+            first, second = (to_problem(InvalidRequest("cloud", value, "")) for value in "ab")
             return job, Answer(b"", facts, first), Answer(b"", facts, second)
         return job, Answer(body("plus", 1.0), facts), Answer(body(path.stem, 2.0), facts)
 

@@ -157,5 +157,5 @@ def test_a_server_that_is_away() -> None:
         models = Models(client, "grasps", 0.2)
         assert not models.ready()
         with pytest.raises(GraspClientError) as caught:
-            models.check("grasps")
+            models.require("grasps")
         assert refusal(caught.value)[:2] in (("UNAVAILABLE", 503), ("DEADLINE_EXCEEDED", 504))

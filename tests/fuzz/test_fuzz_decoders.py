@@ -31,7 +31,7 @@ from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.request_cloud import GIVEN, PER_POINT, File, decode_cloud
 from edgegrasp_model.scene.cloud import check_cloud
-from edgegrasp_service.errors import report
+from edgegrasp_service.errors import to_problem
 from edgegrasp_service.settings import Settings
 
 from .conftest import NUMBERS, POINTS, VALUES, changed, mutated
@@ -65,7 +65,7 @@ def decoding(size: int) -> Iterator[None]:
         try:
             yield
         except EdgeGraspError as error:
-            check_problem(report(error))
+            check_problem(to_problem(error))
 
 
 def decode(size: int, **fields: Any) -> None:

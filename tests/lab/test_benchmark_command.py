@@ -166,7 +166,7 @@ PAPER = load_protocol("edgegrasp").planning
 def seen_under(name: str) -> Observation:
     with ClutterSimulation() as simulation:
         driver = RoundDriver(simulation, SceneKind.PACKED, load_protocol(name), seed=0, index=0)
-        return driver.look()
+        return driver.observe()
 
 
 def test_requests_follow_the_protocol() -> None:

@@ -9,7 +9,7 @@ import pytest
 from tests.cli.commands import refused, run
 from tests.model.rendered import FOCAL_LENGTH, HEIGHT, WIDTH, box, camera, render, seen_box, table
 
-from edgegrasp_cli.detect import OwnDetector
+from edgegrasp_cli.detect import InProcessDetector
 from edgegrasp_lab.benchmark_tracking import MOTIONS, follow, simulated
 from edgegrasp_lab.real_scenes import SceneFigures, compare_labels, judge, load_scene, renumbered
 from edgegrasp_model.gripper import load_gripper
@@ -216,15 +216,15 @@ def test_the_grasp_of_a_recorded_scene_stays_where_it_is(scene, tmp_path) -> Non
 
 
 def test_the_grasp_of_an_object_on_a_belt_moves_with_it() -> None:
-    client = OwnDetector()
+    client = InProcessDetector()
     scenes = simulated(None, MOTIONS["belt-10"], 1)
     scene = next(scenes)
     start = np.array([one.position for one in scene.simulation.placements])
     done = follow(client, scene, 0.2, clock=lambda: 0.0)
-    scene.look(0.2)
+    scene.image_at(0.2)
     gone = [one.position for one in scene.simulation.placements] - start
-    assert np.allclose(gone, scene.moved(0.2)[:3, 3], atol=1e-6)  # all objects
-    assert np.linalg.norm(scene.moved(0.2)[:3, 3]) == pytest.approx(0.02)
+    assert np.allclose(gone, scene.object_motion(0.2)[:3, 3], atol=1e-6)  # all objects
+    assert np.linalg.norm(scene.object_motion(0.2)[:3, 3]) == pytest.approx(0.02)
     assert len(done.off) >= 3
     # The last image was taken one thirtieth of a second before, 3 mm back.
     assert max(millimetres for _, millimetres, _ in done.off) < 8.0

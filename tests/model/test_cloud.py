@@ -126,7 +126,7 @@ def rows(seed: int = 0, **fields: object) -> CheckedCloud:
 def inside(region: Region, cloud: CheckedCloud) -> tuple[np.ndarray, np.ndarray]:
     """Which voxels a region holds, and the voxel of each point."""
     voxels = voxelise(cloud.points, 0.01)  # metres
-    return inside_region(region, voxels.mean(cloud.points), voxels, cloud), voxels.voxel
+    return inside_region(region, voxels.mean(cloud.points), voxels, cloud), voxels.of_point
 
 
 @given(seed=st.integers(0, SEED))

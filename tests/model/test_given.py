@@ -6,7 +6,7 @@ from tests.many_options import OWN_GRIPPER
 
 from edgegrasp_model.gripper import HALF_TURN, gripper_fields
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.results import NoGrasp
+from edgegrasp_model.results import NoGraspReason
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_results import Grasp
 
@@ -78,7 +78,7 @@ def test_answers_keep_the_order_of_the_edges_and_say_why_there_is_no_grasp() -> 
     asked = [[origin, origin], [origin, far], [origin, near], [origin, 4001], [near, origin]]
     outside = {"min": (-1, -1, -0.1), "max": (1, 1, 1)}
     answer = detector().score(cloud, ask(support=None, workspace=outside), edges=np.array(asked))
-    reasons = [NoGrasp.TOO_SHORT, NoGrasp.TOO_LONG, None, NoGrasp.NO_POINT, None]
+    reasons = [NoGraspReason.TOO_SHORT, NoGraspReason.TOO_LONG, None, NoGraspReason.NO_POINT, None]
     assert [each.reason for each in answer.evaluations] == reasons
     assert [each.grasp is None for each in answer.evaluations] == [True, True, False, True, False]
     one, other = answer.evaluations[2].grasp, answer.evaluations[4].grasp
@@ -93,7 +93,7 @@ def test_answers_keep_the_order_of_the_edges_and_say_why_there_is_no_grasp() -> 
             detector().score(cloud, ask(), edges=np.array(wrong))
     nowhere = ask(workspace={"min": (5, 5, 5), "max": (6, 6, 6)})  # all of it is cropped away
     answer = detector().score(cloud, nowhere, edges=np.array([[0, 1], [2, 3]]))
-    assert [each.reason for each in answer.evaluations] == [NoGrasp.NO_POINT] * 2
+    assert [each.reason for each in answer.evaluations] == [NoGraspReason.NO_POINT] * 2
 
 
 def test_edges_along_the_normal_or_deeper_than_the_fingers_define_no_grasp() -> None:
@@ -106,12 +106,12 @@ def test_edges_along_the_normal_or_deeper_than_the_fingers_define_no_grasp() -> 
     sent = CloudInput(cloud, normals=normals)
     # The voxels of both sheets are the same ones but for their height: the edge is vertical.
     both = detector().score(sent, ask(support=None), edges=np.array([[a, c], [c, a]]))
-    assert both.evaluations[0].reason == NoGrasp.NO_DIRECTION
+    assert both.evaluations[0].reason == NoGraspReason.NO_DIRECTION
     assert both.evaluations[1].grasp is not None
     finger = {"boxes": [[[-0.01, 0, 0.05], [0.01, 0.02, 0.07]]]}
     short = OWN_GRIPPER | {"tip_z": 0.07, "contact_z": 0.065, "finger": finger}
     deep = detector().score(sent, ask(support=None, gripper=short), edges=np.array([[c, a]]))
-    assert deep.evaluations[0].reason == NoGrasp.TOO_DEEP
+    assert deep.evaluations[0].reason == NoGraspReason.TOO_DEEP
 
 
 def test_hand_poses_of_detected_grasps_find_their_own_contacts() -> None:
@@ -162,7 +162,7 @@ def test_poses_in_the_air_hold_nothing_and_colliding_ones_are_marked() -> None:
     poses[0, :3, 3] = 1.0
     poses[1, 2, 3] = 0.1  # the tips below the table, the palm in the box
     air, box = detector().score(box_on_table(500), ask(), hand_poses=poses).evaluations
-    assert air.reason == NoGrasp.NOTHING_BETWEEN
+    assert air.reason == NoGraspReason.NOTHING_BETWEEN
     whole = detector().score(box_on_table(500), ask(), hand_poses=np.eye(4, dtype=int)[None])
     assert len(whole.evaluations) == 1
     assert not box.grasp.collision_free

@@ -19,7 +19,7 @@ from edgegrasp_model.errors import InvalidRequest, UnknownModel
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.ranking import SIMILAR_DISTANCE, densest_first
 from edgegrasp_model.scene.cloud import check_cloud
-from edgegrasp_model.scene.segment import one_thread, shipped
+from edgegrasp_model.scene.segment import load_scene_network, one_thread
 
 from .rendered import boxes_on_table, camera, render, table
 
@@ -43,7 +43,7 @@ def test_defaults_of_the_host_program_change_no_answer(catalogue, model: str) ->
     assert expected
     autocast = torch.autocast("cpu", torch.bfloat16)
     for host in (torch.device("meta"), float64(), autocast, np.errstate(all="raise")):
-        shipped.cache_clear()
+        load_scene_network.cache_clear()
         with host:
             assert [grasp.score for grasp in detect().grasps] == expected
     catalogue.warm_up()

@@ -70,7 +70,7 @@ class RandomScene:
             each.astype(dtype) for each in (self.points, self.normals, depth, hands)
         )
         edges = Candidates(contact_index, approach_index, contact_index, depth, depth, hands)
-        return BallBatch.of_candidates(Cloud(points, normals), edges, 0.05)
+        return BallBatch.from_candidates(Cloud(points, normals), edges, 0.05)
 
 
 def scores(network: torch.nn.Module, batch: BallBatch | HandBatch) -> torch.Tensor:
@@ -144,7 +144,7 @@ def look(seed: int) -> HandBatch:
     candidates, _ = edge_grasps(cloud, *rng.integers(150, size=(2, 60)), PANDA)
     support = SupportPlane(normal=(0.0, 0.0, 1.0), offset=-0.05)
     scene = scene_of(points, cloud=cloud, support=support, viewpoints=np.float32([VIEW]))
-    return HandBatch.of_hands(scene, candidates, PANDA, 400)
+    return HandBatch.from_hands(scene, candidates, PANDA, 400)
 
 
 def hand_scores(batch: HandBatch, config: NetworkConfig = TINY["hand"]) -> torch.Tensor:

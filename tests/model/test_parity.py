@@ -32,7 +32,7 @@ def golden_batch(shared_dir: Path, scene: str) -> tuple[BallBatch, np.ndarray]:
     hands[:, :3, 2] = -golden["approach"]
     edges = Candidates(contact, approach, contact, depth, depth, hands)
     cloud = Cloud(golden["points"], golden["normals"])
-    batch = BallBatch.of_candidates(cloud, edges, RADIUS)
+    batch = BallBatch.from_candidates(cloud, edges, RADIUS)
     return batch, golden["logit"]
 
 

@@ -406,12 +406,12 @@ def test_hands_have_a_plane_to_stay_above_where_all_objects_are_outliers() -> No
     points = seen_in_world([table()], ABOVE)
     request, seen = parse_options({"support": "ransac"}), ViewedPoints(points, ABOVE[:3, 3])
     support = find_support(seen, np.ones(len(points), bool), None, request, [])
-    plane = support.under(np.empty((0, 3)), 0.001)
+    plane = support.plane_under(np.empty((0, 3)), 0.001)
     assert plane.offset == pytest.approx(support.plane.offset + 0.001)
     bowed = replace(support, bow=np.array([0.0, 0.05, -0.08, 0.0, 0.0, 0.0]))  # 50 mm a metre
     x, y = np.random.default_rng(0).uniform((0.2, -0.2), (0.3, 0.0), (99, 2)).T
-    on_it = support.frame.points_in_cloud(np.stack([x, y, 0.05 * x - 0.08 * y], axis=1))
-    np.testing.assert_allclose(heights_over(bowed.under(on_it, 0.0), on_it), 0.0, atol=0.005)
+    on_it = support.frame.points_to_cloud(np.stack([x, y, 0.05 * x - 0.08 * y], axis=1))
+    np.testing.assert_allclose(heights_over(bowed.plane_under(on_it, 0.0), on_it), 0.0, atol=0.005)
 
 
 def test_a_plane_far_from_the_sent_up_is_no_support() -> None:

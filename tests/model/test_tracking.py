@@ -43,11 +43,11 @@ def test_an_object_is_found_where_it_was_moved_to(millimetres: Any, degrees: flo
     shift = np.array(millimetres) / 1000
     points, normals = points @ turn.T + shift, normals @ turn.T
     surface = seen(points, normals)
-    T, share = following.registered(following.sampled(before), surface)
+    T, share = following.register_icp(following.sampled(before), surface)
     assert share > 0.9
     apart = np.linalg.norm(before @ T[:3, :3].T + T[:3, 3] - (before @ turn.T + shift), axis=1)
     assert apart.max() < 0.003
-    _, share = following.registered(np.repeat(points[:1], 9, axis=0), surface)  # all in one place
+    _, share = following.register_icp(np.repeat(points[:1], 9, axis=0), surface)  # all in one place
     assert share == 1.0
 
 
@@ -62,7 +62,7 @@ def test_a_can_does_not_turn_with_a_camera_that_goes_around_it() -> None:
         normals = Rotation.from_euler("z", (camera + 0.9 * angle)[:, None]).apply([1.0, 0.0, 0.0])
         surface = seen(points, normals)
         if before is not None:
-            T, _ = following.registered(before, surface)
+            T, _ = following.register_icp(before, surface)
             total += Rotation.from_matrix(T[:3, :3]).as_rotvec(degrees=True)[2]
         before = following.sampled(points.astype(np.float32)).astype(np.float64)
     assert abs(total) < 6

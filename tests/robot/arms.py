@@ -8,7 +8,7 @@ from tests.model.scenes import grid
 from edgegrasp_model.options import SupportPlane, parse_options
 from edgegrasp_model.scene.cloud import CanonicalFrame, pose_matrix
 from edgegrasp_results import DetectedObject, Detection, Grasp, GripperOutline
-from edgegrasp_robot import plan_picks, with_robot
+from edgegrasp_robot import options_for_robot, plan_picks
 
 BOXES = ((0.5, 0.0, 0.05), (0.55, 0.2, 0.03), (0.45, -0.2, 0.04))  # x, y, half height; base frame
 HALF = 0.02  # metres
@@ -41,14 +41,14 @@ def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=(), eyes=()):
     objects = in_cloud(np.concatenate(things))
     number = np.repeat(np.arange(len(things)), [len(one) for one in things])
     up = T_cloud_base[:3, 2]
-    frame = CanonicalFrame.of_scene(objects, up, T_cloud_base[:3, :3] @ (1.0, 0.0, 0.7))
-    foot = frame.points(in_cloud(np.zeros((1, 3))))[0]
+    frame = CanonicalFrame.from_scene(objects, up, T_cloud_base[:3, :3] @ (1.0, 0.0, 0.7))
+    foot = frame.points_from_cloud(in_cloud(np.zeros((1, 3))))[0]
     scene = scenes.scene_of(
         objects,
         frame=frame,
         object_of_point=number,
         support=SupportPlane(normal=(0.0, 0.0, 1.0), offset=float(foot[2])),
-        viewpoints=frame.points(in_cloud(np.reshape(eyes, (-1, 3)))),
+        viewpoints=frame.points_from_cloud(in_cloud(np.reshape(eyes, (-1, 3)))),
         readings=np.concatenate([objects, in_cloud(table), *map(in_cloud, more)]),
     )
     poses = [T_cloud_base @ hand_over(robot.gripper, *box) for box in boxes]
@@ -91,5 +91,5 @@ def picks_of(
     asked |= {"place": place, "avoid_unseen": avoid_unseen}
     asked["joints"] = (robot.home if joints is None else np.asarray(joints)).tolist()
     parsed = parse_options({"robot": asked, **(options or {})})
-    with_robot(parsed, robot)
+    options_for_robot(parsed, robot)
     return plan_picks(detection, scene, parsed, robot, until)

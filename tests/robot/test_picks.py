@@ -20,7 +20,7 @@ from edgegrasp_model.options import parse_options
 from edgegrasp_model.scene.cloud import CanonicalFrame, pose_matrix
 from edgegrasp_results import Tracking
 from edgegrasp_robot import load_robot
-from edgegrasp_robot.surroundings import _near_robot, surrounded
+from edgegrasp_robot.obstacles import _near_robot, arm_obstacles
 
 CLOSE, CLOSE_ANGLE = 1e-3, np.deg2rad(0.2)  # metres, radians
 
@@ -82,16 +82,16 @@ def test_the_hand_comes_to_the_grasp_and_limits_are_kept(robot, x, y, tilt):
     T_base_cloud = pose_matrix(Rotation.from_euler("z", tilt).as_matrix(), TURNED[:3, 3])
     for grasp, plan in plans_of(picks_of(robot, T_base_cloud, boxes=((x, y, 0.04),))):
         T_base_hand = T_base_cloud @ grasp.T_cloud_hand
-        assert_pose(robot.hand_pose(plan.grasp_joints), T_base_hand)
+        assert_pose(robot.forward_kinematics(plan.grasp_joints), T_base_hand)
         before = T_base_hand @ pose_matrix(np.eye(3), (0.0, 0.0, -0.05))
-        assert_pose(robot.hand_pose(plan.pregrasp_joints), before)
+        assert_pose(robot.forward_kinematics(plan.pregrasp_joints), before)
         motion = plan.trajectory
         assert motion is not None
         rows = motion.positions[[motion.pregrasp_row, motion.grasp_row]]
         np.testing.assert_allclose(rows, [plan.pregrasp_joints, plan.grasp_joints], atol=1e-6)
         assert_motion(robot, motion)
         for joints in motion.positions[motion.pregrasp_row : motion.grasp_row + 1]:
-            off = robot.hand_pose(joints)[:3, 3] - T_base_hand[:3, 3]
+            off = robot.forward_kinematics(joints)[:3, 3] - T_base_hand[:3, 3]
             assert np.linalg.norm(np.cross(off, T_base_hand[:3, 2])) < 0.002
 
 
@@ -144,7 +144,7 @@ def voxels_around(fr3, shift=0.0, raised=0.0, more=()):
     T_base_cloud[2, 3] += raised
     asked = {"name": "fr3", "T_base_cloud": T_base_cloud.tolist(), "joints": fr3.home.tolist()}
     robot = parse_options({"robot": asked}).robot
-    with surrounded(fr3, replace(scene, frame=CanonicalFrame(T)), robot, []) as around:
+    with arm_obstacles(fr3, replace(scene, frame=CanonicalFrame(T)), robot, []) as around:
         return around.voxels
 
 
@@ -230,7 +230,9 @@ def test_a_motion_may_have_no_straight_approach_and_obstacles_may_touch(fr3, col
 
 def test_the_arm_itself_is_no_object(fr3):
     """The camera sees the hand, and takes it for an object."""
-    hand = fr3.hand_pose(fr3.home)[:3, 3] + np.random.default_rng(0).uniform(-0.02, 0.02, (50, 3))
+    hand = fr3.forward_kinematics(fr3.home)[:3, 3] + np.random.default_rng(0).uniform(
+        -0.02, 0.02, (50, 3)
+    )
     seen = (hand - TURNED[:3, 3]) @ TURNED[:3, :3]
 
     def with_hand(scene, detection):
@@ -336,7 +338,7 @@ def test_objects_are_put_into_a_region_in_one_motion(robot):
         there = motion.positions[motion.release_row]
         assert np.abs(motion.velocities[motion.release_row]).max() < 1e-6
         np.testing.assert_allclose(there, plan.place_joints, atol=1e-6)
-        assert_pose(robot.hand_pose(there), plan.T_base_place)
+        assert_pose(robot.forward_kinematics(there), plan.T_base_place)
         points = placed(grasp, plan)
         assert (points > np.array(TRAY["min"]) - 0.002).all()
         assert (points < np.array(TRAY["max"]) + 0.002).all()
@@ -405,7 +407,7 @@ def test_an_arm_may_stand_lower_than_the_table(fr3):
     found = picks_of(fr3, raised=0.3)
     assert found.counts["with_trajectory"] > 0
     for _, plan in plans_of(found):
-        places = np.array([fr3.hand_pose(row)[:3, 3] for row in plan.trajectory.positions])
+        places = np.array([fr3.forward_kinematics(row)[:3, 3] for row in plan.trajectory.positions])
         assert places[places[:, 0] > 0.3, 2].min() > 0.3  # where the table is
 
 

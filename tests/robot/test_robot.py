@@ -8,11 +8,11 @@ from edgegrasp_robot.robot import ROBOT_FOLDER, InvalidRobot
 
 
 def test_the_hands_are_where_the_makers_have_them():
-    upright = load_robot("fr3").hand_pose([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4])
+    upright = load_robot("fr3").forward_kinematics([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4])
     # 0.333 + 0.316 up, 0.0825 ahead, then 0.0825 up, 0.384 ahead, 0.088 ahead, 0.107 down.
     np.testing.assert_allclose(upright[:3, 3], (0.5545, 0.0, 0.6245), atol=1e-4)
     np.testing.assert_allclose(upright[:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-4)
-    straight = load_robot("ur5").hand_pose(np.zeros(6))
+    straight = load_robot("ur5").forward_kinematics(np.zeros(6))
     # DH parameters of UR: a2 + a3 ahead; d4 + d6 and the coupling aside; d1 - d5 up.
     expected = (0.425 + 0.39225, 0.10915 + 0.0823 + 0.0108, 0.089159 - 0.09465)
     np.testing.assert_allclose(straight[:3, 3], expected, atol=1e-4)

@@ -19,7 +19,7 @@ from edgegrasp_client import GraspClient
 from edgegrasp_client.over_grpc import message_of
 from edgegrasp_client.requests import Request
 from edgegrasp_client.results import read_as
-from edgegrasp_model.results import Pace
+from edgegrasp_model.results import UnitCosts
 from edgegrasp_model.scene.cloud import pose_matrix
 from edgegrasp_results import Detection
 from edgegrasp_robot import load_robots
@@ -41,7 +41,7 @@ def ask(robot, transport, settings=SETTINGS, **changes):
     detector = Mock()
     detector.prepare.return_value = SimpleNamespace(scene=scene, counts={})
     detector.finish.return_value = detection
-    catalogue = Mock(pace=Pace(), get=Mock(return_value=detector))
+    catalogue = Mock(unit_costs=UnitCosts(), get=Mock(return_value=detector))
     asked = {"name": "fr3", "T_base_cloud": TURNED, "joints": robot.home} | changes
     request = Request(scene.readings, {"robot": asked})
     if transport == "grpc":
@@ -68,7 +68,9 @@ def test_the_client_reads_the_best_pick(robot, transport):
     np.testing.assert_allclose(pick.arm.trajectory.positions[0], robot.home)
     assert pick.arm.trajectory.velocities.shape == pick.arm.trajectory.positions.shape
     T_base_hand = TURNED @ pick.T_cloud_hand
-    np.testing.assert_allclose(robot.hand_pose(pick.arm.grasp_joints), T_base_hand, atol=2e-3)
+    np.testing.assert_allclose(
+        robot.forward_kinematics(pick.arm.grasp_joints), T_base_hand, atol=2e-3
+    )
     assert list(detection.counts)[-2:] == ["with_trajectory", "returned"]
     options = detector.prepare.call_args.args[1]
     assert options.gripper.name == robot.gripper.name  # for which grasps are
@@ -93,7 +95,9 @@ def test_the_client_reads_where_an_object_is_put(robot, transport):
     place = {"T_base_object": pose_matrix(np.eye(3), (0.4, -0.35, 0.1))}
     given, _ = ask(robot, transport, place=place)
     plan = read(transport, given.body).best_pick.arm
-    np.testing.assert_allclose(robot.hand_pose(plan.place_joints), plan.T_base_place, atol=1e-6)
+    np.testing.assert_allclose(
+        robot.forward_kinematics(plan.place_joints), plan.T_base_place, atol=1e-6
+    )
     assert plan.trajectory.grasp_row < plan.trajectory.release_row < len(plan.trajectory.times)
     region = {"min": (0.3, -0.5, 0.0), "max": (0.6, -0.3, 0.3)}
     assert read(transport, ask(robot, transport, place={"region": region})[0].body).best_pick
@@ -121,4 +125,4 @@ def test_a_server_lists_its_robots(start_dummy, robot):
             for axis, turn, frame in zip(listed.axes, joints, listed.frames[1:], strict=True):
                 about = Rotation.from_rotvec(turn * axis).as_matrix()
                 T_base_hand = T_base_hand @ pose_matrix(about, np.zeros(3)) @ frame
-            np.testing.assert_allclose(T_base_hand, robot.hand_pose(joints), atol=1e-6)
+            np.testing.assert_allclose(T_base_hand, robot.forward_kinematics(joints), atol=1e-6)

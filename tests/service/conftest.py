@@ -115,7 +115,7 @@ class Rest(Raw):
 
 
 class Stages:
-    """Tells the dummies of one server when to wait and fail; see nursery.py."""
+    """Tells the dummies of one server when to wait and fail; see fork_server.py."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -160,7 +160,7 @@ class Running:
     def waiting(self) -> int:
         """Admitted requests that no worker has yet."""
         admission = self.server.service.admission
-        return len(admission.calls) - admission.at_work
+        return len(admission.calls) - admission.num_at_work
 
     async def until(self, condition: Callable[[], bool]) -> None:
         """Return once something is so."""
@@ -219,7 +219,7 @@ class Running:
 
 Serve = Callable[..., Awaitable[Running]]
 
-# Asks for a nursery, and lives until that ends: see nursery.py.
+# Asks for a fork server, and lives until that ends: see fork_server.py.
 ASK = """
 import os, socket, sys
 with socket.socket(socket.AF_UNIX) as asking:
@@ -231,10 +231,10 @@ with socket.socket(socket.AF_UNIX) as asking:
 
 
 @pytest.fixture(scope="session")
-def nursery(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, ...]]:
-    """The command of a nursery, but for its folder; one process has imported for all of them."""
-    path = str(tmp_path_factory.mktemp("nursery") / "socket")
-    command = [sys.executable, "-P", str(Path(__file__).parent / "nursery.py"), path]
+def fork_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, ...]]:
+    """The command of a fork server, but for its folder; one process imports for all of them."""
+    path = str(tmp_path_factory.mktemp("fork_server") / "socket")
+    command = [sys.executable, "-P", str(Path(__file__).parent / "fork_server.py"), path]
     environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
     environment["PYTHONPATH"] = os.pathsep.join(sys.path)
     with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as process:
@@ -244,7 +244,7 @@ def nursery(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, ...
 
 
 @pytest.fixture
-async def begin(tmp_path, monkeypatch, nursery) -> AsyncIterator[Serve]:
+async def begin(tmp_path, monkeypatch, fork_server) -> AsyncIterator[Serve]:
     """Begins servers of controlled dummies in this event loop, on free ports."""
     monkeypatch.setattr("edgegrasp_service.server.NOTICE_SECONDS", 0.0)
     running: list[Running] = []
@@ -265,7 +265,7 @@ async def begin(tmp_path, monkeypatch, nursery) -> AsyncIterator[Serve]:
                 given[f"{name}_file"] = folder / name
                 (folder / name).write_text("\n".join(tokens))
         server = Server(Settings(**(ours | given)))
-        server.pool.command = (*nursery, str(folder))
+        server.pool.command = (*fork_server, str(folder))
         server.service.observers.append(note)
         ready, stop = asyncio.Event(), asyncio.Event()
         serving = asyncio.create_task(server.serve(stop, ready.set))

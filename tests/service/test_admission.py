@@ -52,7 +52,7 @@ async def test_a_client_alone_may_have_every_place_and_a_large_body_comes_in_alo
     with pytest.raises(Overloaded, match="it holds 6 requests"):
         await (await inside.enter("a"))
     await inside.leave()
-    await inside.admission.empty()
+    await inside.admission.wait_until_empty()
     inside = Inside(Admission(workers=2, max_waiting=0, max_bytes=100))
     await inside.enter("a", size=1000)
     await inside.enter("b", size=1)

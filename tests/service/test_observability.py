@@ -220,7 +220,7 @@ async def test_the_dashboard_names_metrics_that_exist(serve, cloud: np.ndarray) 
     running = await serve(admin_tokens=[ADMIN])
     await running.ours("rest").detect(cloud)
     server = running.server
-    server.metrics.watch("log_lines_dropped", "as `edgegrasp serve` adds it", lambda: 0)
+    server.metrics.add_gauge("log_lines_dropped", "as `edgegrasp serve` adds it", lambda: 0)
     page = server.metrics.page().decode()
     kinds = [line.split()[2:] for line in page.splitlines() if line.startswith("# TYPE ")]
     exist = {name: "histogram" if kind == "histogram" else "" for name, kind in kinds}

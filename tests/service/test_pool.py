@@ -1,4 +1,4 @@
-"""Workers that die, spin, eat memory or lose their nursery: one request fails, others go on."""
+"""Workers that die, spin, eat memory or lose their fork server: one request fails, others go on."""
 
 import asyncio
 import itertools
@@ -73,15 +73,15 @@ async def test_a_request_cancelled_as_it_is_answered_leaves_its_worker_to_the_ne
         await first
 
 
-async def test_a_nursery_that_is_stopped_is_replaced(running, cloud, monkeypatch) -> None:
+async def test_a_fork_server_that_is_stopped_is_replaced(running, cloud, monkeypatch) -> None:
     monkeypatch.setattr("edgegrasp_service.worker.process.START_SECONDS", 1.0)
     pool, client = running.server.pool, running.connect("rest")
-    nursery = pool._nursery.pid
-    os.kill(nursery, signal.SIGSTOP)
+    fork_server = pool._fork_server.pid
+    os.kill(fork_server, signal.SIGSTOP)
     os.kill(pool.pids[0], signal.SIGKILL)
     await running.until(lambda: not running.server.service.ready)
     await running.until(lambda: running.server.service.ready)
-    assert pool._nursery.pid != nursery
+    assert pool._fork_server.pid != fork_server
     assert (await client.detect(cloud)).fine
 
 
@@ -124,9 +124,9 @@ async def test_workers_killed_under_load(serve, cloud) -> None:
     assert outcomes["worker-lost"] <= 4
 
 
-async def test_a_nursery_that_dies_is_replaced(running, cloud) -> None:
+async def test_a_fork_server_that_dies_is_replaced(running, cloud) -> None:
     client, pool = running.connect("rest"), running.server.pool
-    pool._nursery._process.kill()
+    pool._fork_server._process.kill()
     assert (await client.detect(cloud)).fine
     await running.until(lambda: running.stages.begun["load"] == 2)
     await running.until(lambda: pool.models[0]["digest"] == "2")

@@ -15,7 +15,7 @@ from tests.model.scenes import box_on_table, random_hands
 from edgegrasp_client import GraspClient
 from edgegrasp_model.detector import ModelCatalogue
 from edgegrasp_model.options import parse_options
-from edgegrasp_model.results import Pace
+from edgegrasp_model.results import UnitCosts
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer
@@ -91,15 +91,15 @@ def test_scores_are_the_same_everywhere(catalogue, real_server) -> None:
 
 
 @pytest.mark.parametrize(
-    ("pace", "kind", "named"),
+    ("costs", "kind", "named"),
     [
-        (Pace(voxel=1e-2), "invalid-request", "voxels"),
-        (Pace(point=1e-2), "deadline-exceeded", "50000 points"),
-        (Pace(1e-6, 1e-6), "invalid-request", "20000"),
+        (UnitCosts(voxel=1e-2), "invalid-request", "voxels"),
+        (UnitCosts(point=1e-2), "deadline-exceeded", "50000 points"),
+        (UnitCosts(1e-6, 1e-6), "invalid-request", "20000"),
     ],
 )
-def test_clouds_that_take_too_long_are_refused(catalogue, monkeypatch, pace, kind, named) -> None:
-    monkeypatch.setattr(catalogue, "pace", pace)
+def test_clouds_that_take_too_long_are_refused(catalogue, monkeypatch, costs, kind, named) -> None:
+    monkeypatch.setattr(catalogue, "unit_costs", costs)
     room = np.random.default_rng(0).random((50_000, 3), np.float32) * 4
     whole = "objects=off&support=null"
     job = Job("DetectGrasps", "http", npy(room), 60.0, "application/x-npy", whole)
@@ -110,7 +110,7 @@ def test_clouds_that_take_too_long_are_refused(catalogue, monkeypatch, pace, kin
 
 def test_the_pace_is_measured(catalogue: ModelCatalogue) -> None:
     catalogue.warm_up()
-    assert min(catalogue.pace) > 0  # 0 where it is not measured
+    assert min(catalogue.unit_costs) > 0  # 0 where it is not measured
 
 
 ONE_PLACE = np.full((50, 3), 1e-3, np.float32)

@@ -11,11 +11,11 @@ from tests.robot.arms import picks_of
 from edgegrasp_lab.benchmark import benchmark_arm
 from edgegrasp_robot import load_robot
 from edgegrasp_sim.engine import make_world
-from edgegrasp_sim.hand import MIN_OPENING, ArmGripper, FailureCause, hand_of, panda, run_grasp
+from edgegrasp_sim.fixed_parts import OPEN_TABLE, TABLE_HEIGHT
+from edgegrasp_sim.hand import MIN_OPENING, ArmDriver, FailureCause, hand_model, panda, run_grasp
 from edgegrasp_sim.objects import ObjectModel
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.scene import load_object
-from edgegrasp_sim.surroundings import OPEN_TABLE, TABLE_HEIGHT
 
 CUBE = ObjectModel("cube", Path(__file__).parent / "cube.urdf")  # 0.05 m
 AHEAD = (0.5, 0.0, 0.02)  # x, y, half height of a cube of 4 cm, base frame
@@ -34,10 +34,10 @@ class Cell:
         (grasp,) = picks_of(robot, np.eye(4), boxes=(AHEAD,)).grasps
         self.T_world_hand = self.T_world_base @ grasp.T_cloud_hand
         planned = grasp.arm.trajectory
-        model = panda() if hand is None else hand_of(hand)
-        self.gripper = ArmGripper(world, model, arm, MIN_OPENING)
+        model = panda() if hand is None else hand_model(hand)
+        self.gripper = ArmDriver(world, model, arm, MIN_OPENING)
         self.gripper.motion = planned
-        half_way = robot.hand_pose(planned.positions[planned.pregrasp_row // 2])
+        half_way = robot.forward_kinematics(planned.positions[planned.pregrasp_row // 2])
         self.on_the_way = (self.T_world_base @ half_way)[:3, 3]
 
     def grasp(self):

@@ -233,7 +233,7 @@ def test_cubes_are_cleared_though_the_first_view_shows_nothing(engine: str, monk
 
 def test_a_touch_is_of_something_seen_next_to_a_point_that_was_seen(simulation, monkeypatch):
     driver = RoundDriver(simulation, PACKED, paper_with(2), seed=0, index=0)
-    point = driver.look().cloud[0]
+    point = driver.observe().cloud[0]
     for away, seen in ((0.005, True), (2.0, False)):
         touched = GraspResult(0.0, False, None, touched_on_the_way=(point + away,))
         monkeypatch.setattr(simulation, "execute_grasp", Mock(return_value=touched))
@@ -349,7 +349,7 @@ def test_results_of_two_engines_are_kept_apart(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"differ in engine"):
         results.compare(*folders)
     with pytest.raises(ValueError, match="engine 'pybullet', not 'mujoco'"):
-        results.below_gate(folders[1].finish(), gate_file(tmp_path))
+        results.gate_failures(folders[1].finish(), gate_file(tmp_path))
 
 
 def gate_file(path: Path) -> Path:
@@ -366,12 +366,12 @@ def summary_with(rate: dict[str, object]) -> dict[str, object]:
 
 def test_the_gate_lets_chance_pass_and_stops_a_fall(tmp_path: Path) -> None:
     gate = gate_file(tmp_path)
-    assert results.below_gate(summary_with({"value": 0.85}), gate) == []
-    below = results.below_gate(summary_with({"value": 0.80}), gate)
+    assert results.gate_failures(summary_with({"value": 0.85}), gate) == []
+    below = results.gate_failures(summary_with({"value": 0.80}), gate)
     assert [text.split()[0] for text in below] == ["GSR", "DR"]
-    assert results.below_gate(summary_with({"value": None}), gate)
+    assert results.gate_failures(summary_with({"value": None}), gate)
     with pytest.raises(ValueError, match="scene 'pile', not 'packed'"):
-        results.below_gate(summary_with({"value": 0.9}) | {"scene": "packed"}, gate)
+        results.gate_failures(summary_with({"value": 0.9}) | {"scene": "packed"}, gate)
     gate.write_text("{}")
     with pytest.raises(ValueError, match=r"not a summary\.json"):
-        results.below_gate(summary_with({"value": 0.9}), gate)
+        results.gate_failures(summary_with({"value": 0.9}), gate)

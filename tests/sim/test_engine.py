@@ -10,16 +10,16 @@ import pytest
 from tests.programs import run
 
 from edgegrasp_sim import objects
-from edgegrasp_sim.camera import look_at, points_of
-from edgegrasp_sim.engine import Intrinsics, World, choose_engine, make_world
+from edgegrasp_sim.camera import look_at, unproject_to_world
+from edgegrasp_sim.engine import SimCamera, World, choose_engine, make_world
 from edgegrasp_sim.engine.urdf import parse_obj, read_urdf
+from edgegrasp_sim.fixed_parts import OPEN_TABLE
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.scene import load_object
 from edgegrasp_sim.sensor import SENSORS, STRUCTURED_LIGHT
-from edgegrasp_sim.surroundings import OPEN_TABLE
 
 CUBE = ObjectModel("cube", Path(__file__).parent / "cube.urdf")  # 0.05 m
-CAMERA = Intrinsics()
+CAMERA = SimCamera()
 SHAPES = """<robot name="shapes"><link name="link">
 <inertial><origin xyz="0 0 0.01"/><mass value="1"/></inertial>
 <visual><geometry><sphere radius="0.03"/></geometry></visual>
@@ -94,7 +94,7 @@ def test_both_engines_see_the_same() -> None:
         with make_world(engine) as world:
             OPEN_TABLE.add_to(world)
             load_object(world, CUBE, (0.15, 0.15, 0.075), (0.0, 0.0, 0.38, 0.92), 1.0)
-            images.append(world.render_depth(T_world_camera, Intrinsics()))
+            images.append(world.render_depth(T_world_camera, SimCamera()))
     assert (np.abs(images[0] - images[1]) > 2e-4).mean() < 0.002  # some pixels on edges
 
 
@@ -106,7 +106,7 @@ def test_a_box_appears_where_it_is(world: World, aside: float, azimuth: float) -
     eye = target + np.array(away)
     world.add_box(2 * half, centre, friction=0.5)
     T_world_camera = look_at(eye, target)
-    points = points_of(world.render_depth(T_world_camera, CAMERA), T_world_camera, CAMERA)
+    points = unproject_to_world(world.render_depth(T_world_camera, CAMERA), T_world_camera, CAMERA)
     assert len(points) > 1000
     outside = np.abs(points - centre) - half
     apart = np.linalg.norm(np.maximum(outside, 0.0), axis=1)

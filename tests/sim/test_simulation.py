@@ -6,12 +6,12 @@ import pytest
 
 from edgegrasp_model.gripper import gripper_fields, gripper_names, load_gripper
 from edgegrasp_sim.camera import look_at
+from edgegrasp_sim.fixed_parts import MIDDLE, OPEN_TABLE, TABLE_HEIGHT, Box, FixedParts
 from edgegrasp_sim.hand import CENTRE, FINGERTIP, FailureCause
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.poses import translation
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
-from edgegrasp_sim.surroundings import MIDDLE, OPEN_TABLE, TABLE_HEIGHT, Box, Surroundings
 
 CUBE = Path(__file__).parent / "cube.urdf"  # 0.05 m
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -183,7 +183,7 @@ def seen_from_above(simulation: ClutterSimulation) -> np.ndarray:
 @pytest.mark.parametrize("kind", [SceneKind.BIN, SceneKind.TABLE, SceneKind.SHELF])
 def test_objects_rest_where_objects_are(simulation: ClutterSimulation, kind: SceneKind) -> None:
     assert simulation.reset(kind, np.random.default_rng(3), 6) >= 3
-    low, high = np.asarray(simulation.surroundings.workspace)
+    low, high = np.asarray(simulation.fixed_parts.workspace)
     middles = np.array([item.position for item in simulation.placements])
     low[2] = TABLE_HEIGHT  # the workspace begins a little higher
     assert ((middles > low) & (middles < high)).all()
@@ -195,7 +195,7 @@ def test_objects_rest_where_objects_are(simulation: ClutterSimulation, kind: Sce
 
 def test_a_hand_that_hits_a_large_thing_fails_and_does_not_move_it(engine: str) -> None:
     carton = Box((0.1, 0.2, 0.15), (MIDDLE, MIDDLE, TABLE_HEIGHT + 0.075), yaw=0.3)
-    around = Surroundings((*OPEN_TABLE.boxes, carton), OPEN_TABLE.workspace, OPEN_TABLE.bounds)
+    around = FixedParts((*OPEN_TABLE.boxes, carton), OPEN_TABLE.workspace, OPEN_TABLE.bounds)
     with ClutterSimulation(engine=engine) as simulation:
         simulation.reset_from_poses([cube_at(0.03, 0.03)], around)
         before = seen_from_above(simulation)
@@ -210,7 +210,7 @@ def test_a_deep_bin_has_walls_as_high_as_a_hand_and_a_full_one_hides_its_floor(s
     assert seen_from_above(simulation)[:, 2].max() > TABLE_HEIGHT + 0.08
     most = 40
     number = simulation.reset(SceneKind.FULL_BIN, np.random.default_rng(2), most, (1.6, 1.6))
-    low, high = np.asarray(simulation.surroundings.workspace)
+    low, high = np.asarray(simulation.fixed_parts.workspace)
     cloud = seen_from_above(simulation)
     inside = cloud[((cloud[:, :2] > low[:2]) & (cloud[:, :2] < high[:2])).all(axis=1)]
     assert (inside[:, 2] > TABLE_HEIGHT + 0.003).mean() > 0.75

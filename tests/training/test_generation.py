@@ -105,7 +105,7 @@ def test_random_hands_differ_between_scenes_and_are_what_the_network_is_told(tmp
     assert any(view.success.any() for view in views)
     for view in views:
         if len(view.tried()):
-            hand, seen = view.hand, tried_grasps(view, RECIPES["edgegrasp-plus"]).seen
+            hand, seen = view.hand, tried_grasps(view, RECIPES["edgegrasp-plus"]).hand_batch
             measures = (hand.max_opening, hand.tip_z - hand.palm_z, hand.pad_half_width)
             expected = np.tile(measures, (len(seen.points), 1))
             assert seen.description[:, 71:74] == pytest.approx(expected, rel=1e-3)

@@ -13,7 +13,7 @@ from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector
 from edgegrasp_model.networks.checkpoint import load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_training.evaluation import fit, read_outcomes, recalibrate
+from edgegrasp_training.evaluation import fit_scale_and_shift, read_outcomes, recalibrate
 from edgegrasp_training.examples import GRASPS_PER_BALL, Teacher
 from edgegrasp_training.options import TrainingOptions
 from edgegrasp_training.recipes import RECIPES, build_network
@@ -198,7 +198,7 @@ def test_the_new_weights_answer_the_fitted_probability(name, tmp_path):
     assert recalibrate(old, file, tmp_path).startswith("60 outcomes, 0.33 held")
     new = tmp_path / "old-robot.safetensors"
     assert load_checkpoint(new)[1].training["recalibrated_from_digest"] == metadata.digest
-    scale, shift = fit(*read_outcomes(file, metadata.digest))
+    scale, shift = fit_scale_and_shift(*read_outcomes(file, metadata.digest))
     assert shift < -0.5
     options = DetectOptions(viewpoint=VIEW, min_score=0.0)
     box = box_on_table(table=True)

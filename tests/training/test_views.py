@@ -90,7 +90,7 @@ def test_packed_balls_hold_each_tried_grasp_and_its_contact() -> None:
     contact = grasps.cloud.points[grasps.candidates.contact_index]
     edge = contact - grasps.cloud.points[grasps.candidates.approach_index]
     found = batch.points[batch.contact].numpy() * LENGTH_UNIT
-    np.testing.assert_allclose(found, edge @ grasps.turn.T, atol=1e-6)
+    np.testing.assert_allclose(found, edge @ grasps.R_canonical_world.T, atol=1e-6)
     depth = batch.depth.numpy() * LENGTH_UNIT
     np.testing.assert_allclose(depth, grasps.candidates.depth, atol=1e-6)
     some = pack_balls(grasps, grasps.balls()[:2], balls)
@@ -108,7 +108,7 @@ def test_packed_hands_are_what_the_detector_would_pack_and_vary() -> None:
     known = TABLE, view.camera_position[None], side, view.numbered_objects()
     around = Surroundings(grasps.cloud, UP, *known)
     candidates = grasps.candidates.take(rows)
-    exact = HandBatch.of_hands(around, candidates, load_gripper(), hands.hand_points)
+    exact = HandBatch.from_hands(around, candidates, load_gripper(), hands.hand_points)
     torch.testing.assert_close(batch.description, exact.description, atol=2e-3, rtol=2e-3)
     torch.testing.assert_close(batch.point_count, exact.point_count)
     varied = pack_hands(grasps, grasps.balls()[:2], hands, np.random.default_rng(0)).batch

@@ -64,7 +64,7 @@ def world_type(engine: str) -> type[World]:
 
 
 @dataclass(frozen=True, slots=True)
-class Intrinsics:
+class SimCamera:
     """A pinhole camera; lengths in pixels, clipping distances in metres."""
 
     width: int = 640

@@ -17,35 +17,35 @@ SIDES = 32  # sides of the prism that approximates a cylinder
 BALL = 300  # points of the hull that approximates a sphere
 
 
-class Surface(NamedTuple):
+class TriangleMesh(NamedTuple):
     """Triangles: points (P, 3), metres, and rows of them, (F, 3)."""
 
     points: Float64
     faces: Int64
 
 
-class Shape(NamedTuple):
+class ObjectShape(NamedTuple):
     """An object, in the frame of its centre of mass, with the axes of its link."""
 
     centre: Float64  # the centre of mass in the link's frame, (3,) metres
-    visible: list[Surface]  # the surfaces that a camera sees
-    hulls: list[Surface]  # the convex parts that contacts use
+    visible: list[TriangleMesh]  # the surfaces that a camera sees
+    hulls: list[TriangleMesh]  # the convex parts that contacts use
 
 
-def read_urdf(path: Path, scale: float) -> Shape:
+def read_urdf(path: Path, scale: float) -> ObjectShape:
     """The shape of the first link of a URDF file, `scale` times as large.
 
     Raises ValueError if it cannot be read or has no solid collision shape.
     """
     centre, *surfaces = _read_urdf(path, path.stat().st_mtime_ns)
     visible, hulls = (
-        [Surface(scale * points, faces) for points, faces in parts] for parts in surfaces
+        [TriangleMesh(scale * points, faces) for points, faces in parts] for parts in surfaces
     )
-    return Shape(scale * centre, visible, hulls)
+    return ObjectShape(scale * centre, visible, hulls)
 
 
 @lru_cache(maxsize=128)
-def _read_urdf(path: Path, _changed: int) -> Shape:
+def _read_urdf(path: Path, _changed: int) -> ObjectShape:
     try:
         link = ElementTree.parse(path).getroot().find("link")
         if link is None:
@@ -59,13 +59,13 @@ def _read_urdf(path: Path, _changed: int) -> Shape:
     hulls = [hull for part in solid if (hull := convex_hull(part.points - centre)) is not None]
     if not hulls:
         raise ValueError(f"{path} has no solid collision shape")
-    return Shape(
-        centre, [Surface(part.points - centre, part.faces) for part in visible or solid], hulls
+    return ObjectShape(
+        centre, [TriangleMesh(part.points - centre, part.faces) for part in visible or solid], hulls
     )
 
 
 @lru_cache(maxsize=256)
-def parse_obj(text: str) -> list[tuple[str, Surface]]:
+def parse_obj(text: str) -> list[tuple[str, TriangleMesh]]:
     """The named objects of an OBJ file's text, with the points that their faces use."""
     points: list[list[float]] = []
     parts: list[tuple[str, list[list[int]]]] = [("", [])]  # names and triangles
@@ -83,7 +83,7 @@ def parse_obj(text: str) -> list[tuple[str, Surface]]:
     for name, triangles in parts:
         if triangles:
             used, rows = np.unique(triangles, return_inverse=True)
-            found.append((name, Surface(whole[used], rows.reshape(-1, 3))))
+            found.append((name, TriangleMesh(whole[used], rows.reshape(-1, 3))))
     return found
 
 
@@ -95,7 +95,7 @@ def least_width(path: Path) -> float:
     return float(np.ptp(heights, axis=0).min())
 
 
-def convex_hull(points: Float64) -> Surface | None:
+def convex_hull(points: Float64) -> TriangleMesh | None:
     """The convex hull of points (P, 3), faces outwards; None if it has no volume."""
     try:
         hull = ConvexHull(points)
@@ -104,10 +104,10 @@ def convex_hull(points: Float64) -> Surface | None:
     a, b, c = points[hull.simplices].transpose(1, 0, 2)
     inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0.0
     faces = np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices)
-    return Surface(points[hull.vertices], np.searchsorted(hull.vertices, faces))
+    return TriangleMesh(points[hull.vertices], np.searchsorted(hull.vertices, faces))
 
 
-def _parts(element: ElementTree.Element, urdf: Path) -> list[Surface]:
+def _parts(element: ElementTree.Element, urdf: Path) -> list[TriangleMesh]:
     """The surfaces of a visual or collision element, in the link's frame."""
     move, turn = _origin(element)
     shape = element.find("geometry/*")
@@ -136,7 +136,7 @@ def _parts(element: ElementTree.Element, urdf: Path) -> list[Surface]:
         raise ValueError(f"its shape {shape.tag} is unknown; use box, cylinder, sphere or mesh")
     if shape.tag != "mesh":
         parts = [hull for hull in [convex_hull(points)] if hull is not None]
-    return [Surface(turn.apply(size * p) + move, faces) for p, faces in parts]
+    return [TriangleMesh(turn.apply(size * p) + move, faces) for p, faces in parts]
 
 
 def _origin(element: ElementTree.Element) -> tuple[Float64, Rotation]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from edgegrasp_camera.arrays import Float64
 from edgegrasp_sim import engine
-from edgegrasp_sim.engine import Contact, HandModel, Intrinsics, Vector
+from edgegrasp_sim.engine import Contact, HandModel, SimCamera, Vector
 from edgegrasp_sim.engine.urdf import read_urdf
 from edgegrasp_sim.poses import about_z, quaternion_xyzw, translation
 
@@ -118,7 +118,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
             self._places.clear()
         return self._data
 
-    def places(self, uid: int) -> tuple[Float64, Float64]:
+    def joint_state_of(self, uid: int) -> tuple[Float64, Float64]:
         """Positions and velocities of a body's joints and its links': views of the state."""
         data = self.data
         if uid not in self._places:
@@ -142,7 +142,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
             for place in hand.way:
                 hand.goal[:] = place
                 mujoco.mj_step(model, data)
-                hand.watch()
+                hand.after_substep()
             hand.way = None
 
     def first_hits(self, starts: Float64, ends: Float64) -> list[int]:
@@ -179,7 +179,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         body = self._add(np.asarray(position), quaternion_xyzw)
         body.add_freejoint()
         corners = np.concatenate([hull.points for hull in shape.hulls])
-        _weigh(body, engine.OBJECT_MASS, corners)
+        _set_box_inertia(body, engine.OBJECT_MASS, corners)
         kind, shell = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
         for number, surface in enumerate(shape.visible):
             name = f"{body.name} visible {number}"  # visible to the camera, without collisions
@@ -255,7 +255,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         """Add palm and fingers to a body; returns the palm's corners (P, 3)."""
         body.gravcomp = 1.0
         palm = [part - model.centre for part in model.palm]
-        _weigh(body, model.mass, np.concatenate(palm))
+        _set_box_inertia(body, model.mass, np.concatenate(palm))
         for number, part in enumerate(palm):
             name = f"{body.name} palm {number}"
             self._add_hull(body, name, part, friction=(model.friction, 0, 0), contype=_HAND)
@@ -272,7 +272,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
             base = np.array([0.0, 0.0, model.finger_base]) - model.centre
             name = f"{body.name} finger {side:+.0f}"
             finger = carrier.add_body(name=name, pos=base, gravcomp=1.0)
-            _weigh(finger, model.finger_mass, np.concatenate(parts))
+            _set_box_inertia(finger, model.finger_mass, np.concatenate(parts))
             finger.add_joint(
                 name=finger.name,
                 type=mujoco.mjtJoint.mjJNT_SLIDE,
@@ -291,7 +291,7 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
             self._couple(slide[0], one, model.advance)
         return np.concatenate(palm)
 
-    def render_depth(self, T_world_camera: Float64, camera: Intrinsics) -> Float64:
+    def render_depth(self, T_world_camera: Float64, camera: SimCamera) -> Float64:
         """Depth (height, width) at the pixels' lower left corners, metres; `far` if empty."""
         _gl_context(camera.width, camera.height)
         model, data = self.data.model, self.data
@@ -377,32 +377,32 @@ class MujocoBody:
     @property
     def position(self) -> Float64:
         """Centre of mass, world frame, metres: (3,)."""
-        return self.world.places(self.uid)[0][:3].copy()
+        return self.world.joint_state_of(self.uid)[0][:3].copy()
 
     @property
     def quaternion_xyzw(self) -> tuple[float, float, float, float]:
         """Orientation in the world frame."""
-        w, x, y, z = self.world.places(self.uid)[0][3:7].tolist()
+        w, x, y, z = self.world.joint_state_of(self.uid)[0][3:7].tolist()
         return x, y, z, w
 
     @property
     def rotation(self) -> Float64:
         """Its rotation matrix in the world frame, (3, 3)."""
         matrix = np.empty(9)
-        mujoco.mju_quat2Mat(matrix, self.world.places(self.uid)[0][3:7])
+        mujoco.mju_quat2Mat(matrix, self.world.joint_state_of(self.uid)[0][3:7])
         return matrix.reshape(3, 3)
 
     def set_pose(self, position: Vector, quaternion_xyzw: Vector) -> None:
         """Set the pose of the centre of mass, at rest."""
         x, y, z, w = quaternion_xyzw
-        qpos, qvel = self.world.places(self.uid)
+        qpos, qvel = self.world.joint_state_of(self.uid)
         qpos[:7] = (*position, w, x, y, z)
         qvel[:] = 0.0
 
     @property
     def speed(self) -> float:
         """Norm of the linear (m/s) and angular (rad/s) velocities together."""
-        return float(np.linalg.norm(self.world.places(self.uid)[1]))
+        return float(np.linalg.norm(self.world.joint_state_of(self.uid)[1]))
 
     @property
     def bounds(self) -> Float64:
@@ -433,14 +433,14 @@ class MujocoHand(MujocoBody):
     @property
     def opening(self) -> float:
         """Metres between the fingers."""
-        one, other = self.world.places(self.uid)[0][-2:].tolist()
+        one, other = self.world.joint_state_of(self.uid)[0][-2:].tolist()
         return float(one + other)
 
     def set_pose(self, position: Vector, quaternion_xyzw: Vector) -> None:
         """Set the hand's pose at once, open and at rest, and hold it there."""
         super().set_pose(position, quaternion_xyzw)
         data = self.world.data
-        joints = self.world.places(self.uid)[0][7:]
+        joints = self.world.joint_state_of(self.uid)[0][7:]
         joints[:-2], joints[-2:] = 0.0, 0.5 * self.hand.max_opening
         data.ctrl[:2] = FINGER_SPEED
         data.mocap_pos[0] = position
@@ -459,7 +459,7 @@ class MujocoHand(MujocoBody):
         """Drive the fingers together with full force from now on."""
         self.world.data.ctrl[:2] = -FINGER_SPEED
 
-    def watch(self) -> None:
+    def after_substep(self) -> None:
         """Called after each substep; a floating hand records nothing."""
 
 
@@ -480,7 +480,7 @@ class MujocoArm(MujocoHand):
 
     def rest(self) -> None:
         """Set the arm to its home position at once, at rest, with an open hand."""
-        joints, velocities = self.world.places(self.uid)
+        joints, velocities = self.world.joint_state_of(self.uid)
         data, count = self.world.data, len(self.home)
         joints[:count], joints[count:-2], joints[-2:] = self.home, 0.0, self.hand.max_opening / 2
         velocities[:] = 0.0
@@ -493,7 +493,7 @@ class MujocoArm(MujocoHand):
         self.way = positions + JOINT_DAMPING / JOINT_STIFFNESS * velocities
         self._found = ()
 
-    def watch(self) -> None:
+    def after_substep(self) -> None:
         """Keep the contacts of the last substep."""
         self._found += tuple(super().contacts())
 
@@ -523,7 +523,7 @@ def _gl_context(width: int, height: int) -> Any:
     return context
 
 
-def _weigh(body: Any, mass: float, corners: Float64) -> None:
+def _set_box_inertia(body: Any, mass: float, corners: Float64) -> None:
     """Give a body the inertia of the bounding box of its points (P, 3), as PyBullet does."""
     x, y, z = np.square(np.ptp(corners, axis=0))
     body.explicitinertial = True

@@ -11,7 +11,7 @@ from pybullet_utils.bullet_client import BulletClient
 
 from edgegrasp_camera.arrays import Float64, Int64
 from edgegrasp_sim import engine
-from edgegrasp_sim.engine import ArmModel, Contact, HandModel, Intrinsics, Parts, Vector
+from edgegrasp_sim.engine import ArmModel, Contact, HandModel, Parts, SimCamera, Vector
 from edgegrasp_sim.engine.urdf import read_urdf
 from edgegrasp_sim.poses import about_z
 
@@ -112,10 +112,10 @@ class PybulletWorld(AbstractContextManager["PybulletWorld"]):
     def add_arm(self, arm: ArmModel, model: HandModel) -> NoReturn:
         raise ValueError(f"engine is {self.name}; an arm takes mujoco")
 
-    def render_depth(self, T_world_camera: Float64, camera: Intrinsics) -> Float64:
+    def render_depth(self, T_world_camera: Float64, camera: SimCamera) -> Float64:
         return self.render(T_world_camera, camera)[0]
 
-    def render(self, T_world_camera: Float64, camera: Intrinsics) -> tuple[Float64, Int64]:
+    def render(self, T_world_camera: Float64, camera: SimCamera) -> tuple[Float64, Int64]:
         """Depth, and the body at each pixel, -1 for none."""
         view = np.linalg.inv(T_world_camera)
         view[1:3] *= -1.0  # OpenGL's camera looks along -z with y up

@@ -15,7 +15,7 @@ import numpy as np
 
 from edgegrasp_camera.arrays import Array, Float64
 from edgegrasp_camera.clouds import read_point_cloud2
-from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
+from edgegrasp_camera.depth import DepthView, fuse_depth_images, to_intrinsics
 from edgegrasp_camera.picture import fork
 from edgegrasp_client import GraspClient, GraspClientError, GraspTracker, Robot, conversions
 from edgegrasp_client.conversions import Message, pose_fields, xyz_fields
@@ -371,7 +371,7 @@ def camera_matrix(camera: Any) -> Float64:
     return np.asarray(cut / [[max(camera.binning_x, 1)], [max(camera.binning_y, 1)], [1]])
 
 
-def matrix_of(transform: Any) -> Float64:
+def matrix_from_transform(transform: Any) -> Float64:
     """The (4, 4) matrix of a geometry_msgs/Transform."""
     turn, shift = transform.rotation, transform.translation
     T = np.eye(4)
@@ -440,5 +440,5 @@ def _points(scene: Scene, settings: Settings, lookup: Lookup) -> Any:
     if scene.cloud is not None:
         return read_point_cloud2(scene.cloud).points
     images = _depth_images(scene, settings, lookup)
-    views = [DepthView(intrinsics_of(one["intrinsics"]), one["T_cloud_camera"]) for one in images]
+    views = [DepthView(to_intrinsics(one["intrinsics"]), one["T_cloud_camera"]) for one in images]
     return fuse_depth_images([one["depth"] for one in images], views).points

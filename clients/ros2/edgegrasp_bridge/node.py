@@ -144,7 +144,7 @@ class EdgeGraspNode(Node):
             return np.eye(4)
         when = Time() if stamp is None else Time.from_msg(stamp)
         found = self._buffer.lookup_transform(target, source, when, Duration(seconds=1.0))
-        return bridge.matrix_of(found.transform)
+        return bridge.matrix_from_transform(found.transform)
 
 
 def main() -> None:

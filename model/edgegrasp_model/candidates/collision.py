@@ -10,8 +10,8 @@ from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
 from edgegrasp_model.kernels import (
     SLACK,
     any_point_in_boxes,
-    any_point_on_way,
-    in_hands,
+    any_point_swept,
+    loop_input,
     points_in_hand_boxes,
     signed_distance_to_boxes,
 )
@@ -46,11 +46,11 @@ def collides(
     lift = request.retreat_length if request.retreat_direction == "up" else 0.0  # metres
     swept = boxes.copy()
     swept[:, 0, 2] -= request.behind
-    hit = any_point_in_boxes(in_hands(scene.cloud.points, T_cloud_hand), swept)
+    hit = any_point_in_boxes(loop_input(scene.cloud.points, T_cloud_hand), swept)
     if lift > 0:
         free = np.flatnonzero(~hit)
-        hands = in_hands(scene.cloud.points, T_cloud_hand[free])
-        hit[free] = any_point_on_way(hands, boxes, hands.turn @ (lift * UP))
+        hands = loop_input(scene.cloud.points, T_cloud_hand[free])
+        hit[free] = any_point_swept(hands, boxes, hands.R_hand_cloud @ (lift * UP))
     if scene.support is not None:
         normal = np.asarray(scene.support.normal)
         height = support_clearance(T_cloud_hand, opening, scene.support, gripper)
@@ -63,14 +63,14 @@ def collides(
     if scene.obstacles is not None:
         closing = np.concatenate([swept, [[low, high]]])  # and the space between the fingers
         for shapes, way in [(closing, 0.0), (boxes, lift)][: 1 + (lift > 0.0)]:
-            solid = SolidBoxes.of_hands(T_cloud_hand, shapes)
+            solid = SolidBoxes.from_hands(T_cloud_hand, shapes)
             for near, theirs in near_pairs(solid, scene.obstacles, way):
                 overlap = separation(solid.take(near), theirs, way * UP.astype(np.float64)) < 0
                 hit[near[overlap] // len(shapes)] = True
     if request.margin >= 0.0:
         free = np.flatnonzero(~hit)
         background = scene.cloud.points[scene.object_of_point == BACKGROUND]
-        hands = in_hands(background, T_cloud_hand[free])
+        hands = loop_input(background, T_cloud_hand[free])
         between, *_ = points_in_hand_boxes(hands, *np.array([low, high], np.float32))
         hit[free] = np.bincount(between, minlength=len(free)) >= MIN_BACKGROUND_VOXELS
         hit[free] |= enters_unseen(scene.depths, T_cloud_hand[free], gripper)
@@ -83,12 +83,12 @@ def clearances(scene: Scene, T_cloud_hand: Float32, opening: Float32, gripper: G
     Canonical frame. Negative: the greatest depth at which something lies inside a box of the hand.
     """
     boxes = gripper.open_boxes
-    nearest = signed_distance_to_boxes(in_hands(scene.cloud.points, T_cloud_hand), boxes)
+    nearest = signed_distance_to_boxes(loop_input(scene.cloud.points, T_cloud_hand), boxes)
     if scene.support is not None:
         above = support_clearance(T_cloud_hand, opening, scene.support, gripper)
         nearest = np.minimum(nearest, above)
     if scene.obstacles is not None:
-        nearest, solid = nearest.astype(np.float64), SolidBoxes.of_hands(T_cloud_hand, boxes)
+        nearest, solid = nearest.astype(np.float64), SolidBoxes.from_hands(T_cloud_hand, boxes)
         for near, theirs in near_pairs(solid, scene.obstacles, np.repeat(nearest, len(boxes))):
             np.minimum.at(nearest, near // len(boxes), signed_distance(solid.take(near), theirs))
     nearest[np.abs(nearest) < SLACK] = 0.0  # touching is not penetration
@@ -111,7 +111,7 @@ def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandVie
     low = boxes[:, 0].min(axis=0) - np.array([near, near, APPROACH_LENGTH])
     high = boxes[:, 1].max(axis=0) + np.array([near, near, 2 * near])
     high[2] += gripper.max_tip_z - gripper.tip_z
-    hands = in_hands(cloud.points, T_cloud_hand)
+    hands = loop_input(cloud.points, T_cloud_hand)
     hand, row, position = points_in_hand_boxes(hands, *np.array([low, high], np.float32))
     bounds = np.searchsorted(hand, np.arange(len(T_cloud_hand) + 1))
     return HandView(hand, row, position, bounds)

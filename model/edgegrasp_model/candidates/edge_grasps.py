@@ -15,9 +15,9 @@ from scipy.spatial import cKDTree
 
 from edgegrasp_camera.arrays import Bools, Float32, Int64
 from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
-from edgegrasp_model.kernels import compiled, extents_between, free_way, in_hands
+from edgegrasp_model.kernels import compiled, extents_between, free_reach, loop_input
 from edgegrasp_model.options import SupportPlane
-from edgegrasp_model.results import NoGrasp
+from edgegrasp_model.results import NoGraspReason
 from edgegrasp_model.scene.cloud import UP, Cloud, pose_matrix, unit
 
 MIN_EDGE_LENGTH = 0.003  # metres between approach and contact point
@@ -29,7 +29,7 @@ WIDE_SHARE = 0.75  # of the opening, from which an object counts as wide
 PAD_ALLOWANCE = 0.004  # metres beside the finger pads in which points count
 
 
-def spread_out(
+def coarse_to_fine_sample(
     points: Float32,  # (N, 3)
     count: int,
     before: Sequence[int] | Int64 = (),  # (B,) rows chosen earlier, which are excluded
@@ -122,7 +122,7 @@ def edge_grasps(
     contact_index: Int64,  # (M,) rows of the cloud
     gripper: Gripper,
     reach: float = np.inf,  # metres from the approach point to the contact, at most
-) -> tuple[Candidates, dict[NoGrasp, Bools]]:
+) -> tuple[Candidates, dict[NoGraspReason, Bools]]:
     """The pairs that define an edge grasp which fits the gripper, and faults (M,) of the others.
 
     r = p_c - p_a; its part r_perp orthogonal to n_c points from the hand to the object (paper
@@ -135,10 +135,10 @@ def edge_grasps(
     ahead = edge - along[:, None] * normal  # (M, 3) r_perp
     length, depth = np.linalg.norm(edge, axis=1), np.linalg.norm(ahead, axis=1)
     faults = {
-        NoGrasp.TOO_SHORT: length <= MIN_EDGE_LENGTH,
-        NoGrasp.TOO_LONG: length >= min(gripper.max_opening / 2 - FIT_MARGIN, reach),
-        NoGrasp.NO_DIRECTION: depth <= 1e-4,  # the approach direction would be noise
-        NoGrasp.TOO_DEEP: depth >= gripper.contact_z - gripper.palm_z,
+        NoGraspReason.TOO_SHORT: length <= MIN_EDGE_LENGTH,
+        NoGraspReason.TOO_LONG: length >= min(gripper.max_opening / 2 - FIT_MARGIN, reach),
+        NoGraspReason.NO_DIRECTION: depth <= 1e-4,  # the approach direction would be noise
+        NoGraspReason.TOO_DEEP: depth >= gripper.contact_z - gripper.palm_z,
     }
     pair = np.flatnonzero(~np.any(list(faults.values()), axis=0))
     approach_index, contact_index = approach_index[pair], contact_index[pair]
@@ -217,7 +217,7 @@ def centred_grasps(
     ball = crop.ball_of_point[candidates.pair[wide]]
     half = gripper.pad_half_width + PAD_ALLOWANCE
     pads = np.array([[-half, gripper.palm_z], [half, gripper.max_tip_z]], dtype=np.float32)
-    hands = in_hands(points[crop.ball_rows], candidates.T_cloud_hand[wide])
+    hands = loop_input(points[crop.ball_rows], candidates.T_cloud_hand[wide])
     low, high = extents_between(hands, crop.start[ball], crop.start[ball + 1], pads).T
     middle, width = (low + high) / 2, high - low
     moved = (width > WIDE_SHARE * gripper.max_opening) & (width < gripper.max_opening)
@@ -347,9 +347,9 @@ def _inserted(
     enough = np.flatnonzero(room >= least)
     candidates = candidates.take(enough)
     boxes = gripper.open_boxes + margin * np.array([[-1.0], [1.0]])
-    seen = in_hands(points, candidates.T_cloud_hand)
+    seen = loop_input(points, candidates.T_cloud_hand)
     ends = least + FIT_MARGIN, MAX_INSERTION + FIT_MARGIN  # the exact way does not matter beyond
-    way = free_way(seen, boxes, APPROACH_LENGTH, *ends) - FIT_MARGIN
+    way = free_reach(seen, boxes, APPROACH_LENGTH, *ends) - FIT_MARGIN
     way = np.minimum(way, room[enough])
     row = np.flatnonzero(way >= least)
     hands = candidates.take(row)

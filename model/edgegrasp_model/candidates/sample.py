@@ -13,12 +13,12 @@ from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.candidates.edge_grasps import (
     Candidates,
     centred_grasps,
+    coarse_to_fine_sample,
     crop_balls,
     edge_grasps,
     outline_grasps,
     outlines,
     retract,
-    spread_out,
 )
 from edgegrasp_model.gripper import HALF_TURN, Gripper
 from edgegrasp_model.kernels import non_max_suppression
@@ -209,7 +209,7 @@ class Sampler:
                 chosen.append(self._rng_approach.choice(left, count, replace=False))
             else:
                 points = self.scene.cloud.points[mine]
-                chosen.append(mine[spread_out(points, count, np.flatnonzero(used))])
+                chosen.append(mine[coarse_to_fine_sample(points, count, np.flatnonzero(used))])
         return np.concatenate(chosen)
 
 
@@ -245,7 +245,7 @@ def allowed_directions(
         return np.asarray(rise < 0.1)  # not from far below the horizontal
     allowed, preset = np.zeros(len(direction), dtype=bool), math.radians(30)
     for cone in constraint.cones:
-        axis = frame.directions(cone.direction)
+        axis = frame.directions_from_cloud(cone.direction)
         allowed |= direction @ (axis / np.linalg.norm(axis)) >= math.cos(cone.max_angle)
     if constraint.preset == "top-down":
         allowed |= -rise >= math.cos(preset)

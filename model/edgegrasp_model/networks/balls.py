@@ -27,7 +27,7 @@ class BallBatch:
     depth: Tensor  # (E,) float32, |r_perp|: contact below approach point along u
 
     @classmethod
-    def of_candidates(
+    def from_candidates(
         cls,
         cloud: Cloud,
         candidates: Candidates,
@@ -53,7 +53,7 @@ class BallBatch:
         return cls(*map(torch.from_numpy, (centred, *rows, *edges)))
 
     @classmethod
-    def made_up(cls, config: NetworkConfig) -> Self:
+    def synthetic(cls, config: NetworkConfig) -> Self:
         """A fixed batch of 32 edge grasps, to check that a network still gives the same logits."""
         rng = np.random.default_rng(0)
         points = rng.uniform(-0.06, 0.06, (200, 3)).astype(np.float32)
@@ -65,7 +65,7 @@ class BallBatch:
         hands = np.zeros((32, 4, 4), dtype=np.float32)
         hands[:, :3, 2] = -normals[:32]
         edges = Candidates(row, crop.ball_of_point[row], crop.ball_rows[row], depth, depth, hands)
-        return cls.of_candidates(Cloud(points, normals), edges, config.crop_radius, config.k)
+        return cls.from_candidates(Cloud(points, normals), edges, config.crop_radius, config.k)
 
     @property
     def num_balls(self) -> int:

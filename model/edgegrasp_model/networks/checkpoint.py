@@ -91,7 +91,7 @@ def reference_logits(network: nn.Module) -> list[float]:
     device = next(network.parameters()).device
     kind: type[HandBatch | BallBatch] = HandBatch if config.architecture == "hand" else BallBatch
     with torch.inference_mode(), torch.autocast(device.type, enabled=False):
-        logits: list[float] = network(kind.made_up(config).to(device)).float().tolist()
+        logits: list[float] = network(kind.synthetic(config).to(device)).float().tolist()
     return logits
 
 

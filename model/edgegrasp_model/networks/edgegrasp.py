@@ -43,7 +43,7 @@ class EdgeGraspNet(nn.Module):
         grasp = torch.cat(own, dim=1)  # (E, 138)
         join = layers.shared_product(self.join.weight, self.join.bias, ball)
         classifier, logits = layers.packed(self.classifier), []
-        for rows, ball_of_edge in layers.in_chunks(layers.EDGE_ROWS, grasp, batch.ball_of_edge):
+        for rows, ball_of_edge in layers.split_chunks(layers.EDGE_ROWS, grasp, batch.ball_of_edge):
             logits.append(classifier(join(rows, ball_of_edge).relu_()))  # (e, 1)
         return torch.cat(logits).squeeze(1)[: len(grasp)]
 
@@ -61,10 +61,10 @@ class PointNetConv(nn.Module):
         # W [f_j, p_j - p_i] + b = W [f_j, p_j] + b - V p_i: the product runs per point.
         weight, output = self.hidden.weight, layers.packed_linear(self.output.weight)
         u = torch.cat((features, batch.points), dim=1)
-        u = layers.by_chunks(layers.packed_linear(weight, self.hidden.bias), u)  # (P, width)
+        u = layers.map_chunks(layers.packed_linear(weight, self.hidden.bias), u)  # (P, width)
         # The bias is the same for all neighbours, so it is added once, after the maximum.
         here, pooled = batch.points @ weight[:, -3:].t(), []  # (P, width)
-        for neighbors, own in layers.in_chunks(layers.CONVOLVED, batch.neighbors, here):
+        for neighbors, own in layers.split_chunks(layers.CONVOLVED, batch.neighbors, here):
             there = layers.gather_rows(u, neighbors)  # (p, k, width)
             hidden = there.sub_(own.unsqueeze(1)).relu_()
             pooled.append(layers.maximum(output(hidden), dim=1))  # (p, width)

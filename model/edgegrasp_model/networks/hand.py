@@ -56,9 +56,9 @@ class HandBatch:
     point_count: Tensor  # (E,) int64, how many of the P are points; zeros follow
 
     @classmethod
-    def of_hands(
+    def from_hands(
         cls,
-        around: Surroundings,
+        scene: Surroundings,
         candidates: Candidates,
         gripper: Gripper,  # open to its maximum
         num_points: int,
@@ -66,22 +66,22 @@ class HandBatch:
     ) -> Self:
         """Describe each candidate's hand and its surroundings, with at most `num_points` points."""
         hands = candidates.T_cloud_hand
-        view = hand_views(around.cloud, hands, gripper)
+        view = hand_views(scene.cloud, hands, gripper)
         side = np.ones(len(hands), dtype=np.float32)
-        if len(around.viewpoints) == 1:
+        if len(scene.viewpoints) == 1:
             # If a hand approaches straight from the camera, up decides instead of rounding errors.
-            toward = around.viewpoints[0] + ABOVE_CAMERA * UP - hands[:, :3, 3]
+            toward = scene.viewpoints[0] + ABOVE_CAMERA * UP - hands[:, :3, 3]
             along_x = np.einsum("ed,ed->e", toward, hands[:, :3, 0])
             side = np.where(along_x < 0.0, -1.0, 1.0).astype(np.float32)
-        description = describe_hands(around, candidates, gripper, view, side, description_size)
+        description = describe_hands(scene, candidates, gripper, view, side, description_size)
         x, y = gripper.pad_half_width + BESIDE_PADS, gripper.max_opening / 2 + OUTSIDE_FINGERS
         low, high = (-x, -y, gripper.seen_palm_z - BEHIND_PALM), (x, y, gripper.tip_z + BEYOND_TIPS)
         box = np.array([low, high, (0.0, 0.0, gripper.tip_z)], dtype=np.float32)
-        points = _around_fingers(view, around.cloud.normals, hands, side, box, num_points)
+        points = _around_fingers(view, scene.cloud.normals, hands, side, box, num_points)
         return cls(*map(torch.from_numpy, (description, *points)))
 
     @classmethod
-    def made_up(cls, config: NetworkConfig) -> Self:
+    def synthetic(cls, config: NetworkConfig) -> Self:
         """A fixed batch of 32 hands, for checking that a network still computes the same logits."""
         rng = np.random.default_rng(0)
         description = rng.normal(size=(32, config.description_size))
@@ -115,7 +115,7 @@ class HandNet(nn.Module):
         known = batch.description[:, : self.config.description_size]
         description = (known - self.mean) / self.std  # (E, F)
         encoder, chunks = layers.packed(self.point_encoder, FAST), []
-        for points, count in layers.in_chunks(HANDS_AT_A_TIME, batch.points, batch.point_count):
+        for points, count in layers.split_chunks(HANDS_AT_A_TIME, batch.points, batch.point_count):
             positions, normals = torch.split(points, 3, dim=2)
             encoded = encoder(torch.cat((positions / POINT_UNIT, normals), dim=2))  # (E, P, C)
             if layers.float32_inference(points):
@@ -132,7 +132,7 @@ class HandNet(nn.Module):
             draws = torch.rand(seen.shape, generator=left_out, device=left_out.device)
             seen = seen * (draws >= DROPOUT).to(seen.device) / (1.0 - DROPOUT)
         classifier = layers.packed(self.classifier, FAST)
-        logits = layers.by_chunks(classifier, seen, layers.EDGE_ROWS)
+        logits = layers.map_chunks(classifier, seen, layers.EDGE_ROWS)
         return logits.squeeze(1)  # (E,)
 
 
@@ -157,7 +157,7 @@ def _pool(features: Float32, count: Int64, pooled: Float32) -> None:
 
 
 def describe_hands(
-    around: Surroundings,  # of the hands
+    scene: Surroundings,  # of the hands
     candidates: Candidates,  # E candidates
     gripper: Gripper,  # fingers open to its maximum
     view: HandView,  # of the same candidates
@@ -165,7 +165,7 @@ def describe_hands(
     size: int,  # numbers that the network reads; the extents, which come last, may be skipped
 ) -> Float32:
     """The description (E, F) of candidates: log(1 + counts), metres and cosines."""
-    cloud, up, hands = around.cloud, around.up, candidates.T_cloud_hand
+    cloud, up, hands = scene.cloud, scene.up, candidates.T_cloud_hand
     mirrored = hands[:, :3, :3].copy()
     mirrored[:, :, 0] *= side[:, None]
     boxes = gripper.open_boxes.astype(np.float32)
@@ -173,12 +173,12 @@ def describe_hands(
     across = gripper.pad_half_width, gripper.max_opening / 2
     lengths = map(np.float32, (*across, gripper.seen_palm_z, gripper.tip_z, gripper.max_tip_z))
     hand = _Hand(boxes[:first], boxes[first:last], *lengths)
-    looked = view, cloud.normals, mirrored, side, around.at_side, hand
-    seen, first_met, runs = _look_from_each(*looked)
-    unseen = unseen_space(around.depths, hands, first_met, gripper)
+    looked = view, cloud.normals, mirrored, side, scene.at_side, hand
+    seen, first_touch, runs = _look_from_each(*looked)
+    unseen = unseen_space(scene.depths, hands, first_touch, gripper)
     toward = np.zeros((len(mirrored), 3), dtype=np.float32)
-    if len(around.viewpoints) == 1:
-        toward = unit(around.viewpoints[0] - hands[:, :3, 3])
+    if len(scene.viewpoints) == 1:
+        toward = unit(scene.viewpoints[0] - hands[:, :3, 3])
     ups = np.broadcast_to(up / np.linalg.norm(up), toward.shape)
     length, swing = gripper.tip_z - gripper.palm_z, gripper.max_tip_z - gripper.tip_z
     thick = gripper.finger_thickness
@@ -188,7 +188,7 @@ def describe_hands(
         *np.einsum("ed,edk->ke", toward, mirrored),  # 0 where the camera is unknown
         *np.einsum("ed,edk->ke", ups, mirrored),
         *unseen.parts,
-        *_stance(around, candidates, gripper),
+        *_stance(scene, candidates, gripper),
         # Older networks read only the first numbers, so new ones are appended here.
         *unseen.ways,
         *unseen.depths,
@@ -198,7 +198,7 @@ def describe_hands(
         *np.tile(measures, (len(candidates), 1)).T,
     ]
     if size > len(columns):
-        of_object = cloud.points, around.object_of_point, candidates.contact_index
+        of_object = cloud.points, scene.object_of_point, candidates.contact_index
         columns += [*visible_extents(*of_object, hands, side, gripper, up).T]
     return np.stack(columns, axis=1).astype(np.float32)
 
@@ -215,9 +215,9 @@ class _Hand(NamedTuple):
     end: np.float32  # greatest z of the fingertips while closing
 
 
-def _stance(around: Surroundings, candidates: Candidates, gripper: Gripper) -> list[Float32]:
+def _stance(scene: Surroundings, candidates: Candidates, gripper: Gripper) -> list[Float32]:
     """The edge itself, the hand's orientation to gravity, and its height over the support plane."""
-    cloud, support, up = around.cloud, around.support, around.up / np.linalg.norm(around.up)
+    cloud, support, up = scene.cloud, scene.support, scene.up / np.linalg.norm(scene.up)
     pose = candidates.T_cloud_hand
     contact = cloud.points[candidates.contact_index]  # (E, 3)
     edge = contact - cloud.points[candidates.approach_index]
@@ -246,7 +246,10 @@ def _look_from_each(
     points between the fingers lie where the workspace cuts objects off, `cut` (N,), all counts n as
     log(1 + n); then greatest and least y between the fingers (E, 2), and runs (E, 3).
     """
-    seen, first_met = np.zeros((len(side), 37), np.float32), np.zeros((len(side), 2), np.float32)
+    seen, first_touch = (
+        np.zeros((len(side), 37), np.float32),
+        np.zeros((len(side), 2), np.float32),
+    )
     runs = np.zeros((len(side), 3), np.float32)
     for e in range(len(side)):
         start, stop = view.bounds[e], view.bounds[e + 1]
@@ -265,8 +268,8 @@ def _look_from_each(
                 facing[d, i] = n[0] * axes[e, 0, d] + n[1] * axes[e, 1, d] + n[2] * axes[e, 2, d]
         _measure_between(points, facing, hand, seen[e, 7:36])
         seen[e, 36] = np.log1p(np.sum(cut[view.row[start:stop]] & pads))
-        _runs_along(points[1][np.abs(points[0]) < hand.half], first_met[e], runs[e])
-    return seen, first_met, runs
+        _runs_along(points[1][np.abs(points[0]) < hand.half], first_touch[e], runs[e])
+    return seen, first_touch, runs
 
 
 @compiled("contract")

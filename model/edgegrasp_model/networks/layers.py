@@ -130,7 +130,7 @@ def ball_chunks(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[Ball
     """Split values (P, ...) of a batch's points into chunks, but into one if not in inference."""
     rows = rows if float32_inference(values) else len(values)
     chunks = []
-    for number, (part, ball_of_row) in enumerate(in_chunks(rows, values, batch.ball_of_point)):
+    for number, (part, ball_of_row) in enumerate(split_chunks(rows, values, batch.ball_of_point)):
         there = batch.ball_of_point[number * rows : (number + 1) * rows]
         balls, sizes = torch.unique_consecutive(there, return_counts=True)
         padding = len(part) - len(there)
@@ -138,7 +138,7 @@ def ball_chunks(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[Ball
     return chunks
 
 
-def in_chunks(rows: int, *values: Tensor) -> list[tuple[Tensor, ...]]:
+def split_chunks(rows: int, *values: Tensor) -> list[tuple[Tensor, ...]]:
     """Split values (M, ...) into chunks of `rows`, padded with zeros in inference; one on a GPU."""
     if values[0].device.type != "cpu":
         return [values]
@@ -151,9 +151,9 @@ def in_chunks(rows: int, *values: Tensor) -> list[tuple[Tensor, ...]]:
     return chunks
 
 
-def by_chunks(layer: Layer, values: Tensor, rows: int = ROWS) -> Tensor:
+def map_chunks(layer: Layer, values: Tensor, rows: int = ROWS) -> Tensor:
     """Apply a layer that maps rows independently to values (M, ...), chunk by chunk."""
-    return torch.cat([layer(part) for (part,) in in_chunks(rows, values)])[: len(values)]
+    return torch.cat([layer(part) for (part,) in split_chunks(rows, values)])[: len(values)]
 
 
 def ball_maximum(chunks: list[BallChunk], layer: Callable[[BallChunk], Tensor]) -> Tensor:

@@ -58,7 +58,7 @@ class VNEdgeGraspNet(nn.Module):
         frame_2 = layers.packed_linear(self.frame_2.weights)
         frame_3 = layers.packed_linear(self.frame_3.weight)
         classifier, logits = layers.packed(self.classifier), []
-        for own, ball_of_edge in layers.in_chunks(layers.EDGE_ROWS, grasp, batch.ball_of_edge):
+        for own, ball_of_edge in layers.split_chunks(layers.EDGE_ROWS, grasp, batch.ball_of_edge):
             # Three learned vectors rotate with the grasp, so coordinates along them are invariant.
             frame = frame_3(relu(frame_2(relu(join(own, ball_of_edge)))))  # (e, 3, 3)
             vectors = torch.cat((own, ball.index_select(0, ball_of_edge)), dim=2)  # (e, 3, 512)
@@ -85,12 +85,12 @@ class VNPointNetConv(nn.Module):
         weight = torch.cat((weight, direction @ weight))
         output = layers.packed_linear(_with_reach(self.output, self.reach))
         u = torch.cat((features, batch.points.unsqueeze(2)), dim=2)
-        u = layers.by_chunks(layers.packed_linear(weight), u, VN_ROWS)  # (P, 3, 2 width)
+        u = layers.map_chunks(layers.packed_linear(weight), u, VN_ROWS)  # (P, 3, 2 width)
         if layers.float32_inference(u):
             vectors = _convolved(u, weight[:, -1].contiguous(), output, batch)
         else:
             here, pooled = batch.points.unsqueeze(2) * weight[:, -1], []  # (P, 3, 2 width)
-            for neighbors, own in layers.in_chunks(VN_CONVOLVED, batch.neighbors, here):
+            for neighbors, own in layers.split_chunks(VN_CONVOLVED, batch.neighbors, here):
                 both = layers.gather_rows(u, neighbors) - own.unsqueeze(1)  # (p, k, 3, 2 width)
                 messages = output(relu(both.flatten(0, 1))).view(both.shape)
                 pooled.append(_furthest(messages, dim=1))  # (p, 3, width)
@@ -178,7 +178,7 @@ class VNReLU(nn.Module):
     def forward(self, vectors: Tensor) -> Tensor:
         """Maps (M, 3, width) to the same shape."""
         directions = layers.packed_linear(self.direction.weight)
-        return layers.by_chunks(
+        return layers.map_chunks(
             lambda v: relu(torch.cat((v, directions(v)), dim=2)), vectors, VN_ROWS
         )
 

@@ -77,7 +77,7 @@ class CheckedCloud:
         row, (height, width) = subsample(self.row, 1000), self.image_size
         x = (2 * (row % width) + 1)[:, None] / width - 1
         y = (2 * (row // width) + 1)[:, None] / height - 1
-        sight = unit(frame.points(subsample(self.points, 1000)) - eyes)
+        sight = unit(frame.points_from_cloud(subsample(self.points, 1000)) - eyes)
         none = np.zeros_like(sight)
         equations = np.block([[sight, none, -x * sight], [none, sight, -y * sight]])
         P = np.linalg.eigh(equations.T @ equations)[1][:, 0].reshape(3, 3)
@@ -267,8 +267,8 @@ def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64 | None:
     apart = np.linalg.norm(some - np.median(some, axis=0), axis=1)
     beside = np.linalg.norm(some - some[apart.argmin()], axis=1)
     near = subsample(some[beside < USUAL_DISTANCE])
-    frame = CanonicalFrame.of_scene(near, up, None)
-    seen = frame.points(near)
+    frame = CanonicalFrame.from_scene(near, up, None)
+    seen = frame.points_from_cloud(near)
     middle = np.median(seen, axis=0)
 
     def hidden(eyes: Float64, edge: int) -> Float64:
@@ -293,7 +293,7 @@ def likely_viewpoint(points: Float32, up: ArrayLike) -> Float64 | None:
         eye, step = best(eye + step * around), 0.7 * step
     # Near edges, points behind show through sparse and noisy ones.
     several = hidden(eye[None], 1)[0] > 0.003
-    return None if several else frame.points_in_cloud(eye).astype(np.float64)
+    return None if several else frame.points_to_cloud(eye).astype(np.float64)
 
 
 @compiled("contract")
@@ -400,19 +400,19 @@ def _without_far_points(points: Floats) -> Int64:
 class Voxels(NamedTuple):
     """The occupied voxels of a cloud, sorted by position: the order of the points has no effect."""
 
-    voxel: Int64  # (N,) voxel of each point
-    size: Int64  # (V,) points in each
+    of_point: Int64  # (N,) voxel of each point
+    counts: Int64  # (V,) points in each
 
     def mean(self, values: Floats) -> Float32:
         """Mean (V, 3) of a vector of each point (N, 3)."""
-        sums = [np.bincount(self.voxel, values[:, axis], len(self.size)) for axis in range(3)]
-        return (np.stack(sums, axis=1) / self.size[:, None]).astype(np.float32)
+        sums = [np.bincount(self.of_point, values[:, axis], len(self.counts)) for axis in range(3)]
+        return (np.stack(sums, axis=1) / self.counts[:, None]).astype(np.float32)
 
     def commonest(self, labels: NDArray[np.integer]) -> Int64:
         """Most common label (V,) in each voxel, from labels (N,); the lowest one on ties."""
         low, one = labels.min(), np.ones(len(labels), dtype=np.int64)
-        tally = coo_array((one, (self.voxel, labels - low))).tocsr()  # (V, labels); few labels
-        voxel = np.repeat(np.arange(len(self.size)), np.diff(tally.indptr))
+        tally = coo_array((one, (self.of_point, labels - low))).tocsr()  # (V, labels); few labels
+        voxel = np.repeat(np.arange(len(self.counts)), np.diff(tally.indptr))
         order = np.lexsort((-tally.indices, tally.data, voxel))
         return np.asarray(tally.indices[order[tally.indptr[1:] - 1]] + low, dtype=np.int64)
 
@@ -464,7 +464,7 @@ def clean_cloud(
     away = np.einsum("nd,nd->n", normals, seen_from - points) < 0
     normals = np.where(away[:, None], -normals, normals)
     if sent.normals is not None:
-        given = frame.directions(voxels.mean(unit(sent.normals))[kept])
+        given = frame.directions_from_cloud(voxels.mean(unit(sent.normals))[kept])
         none = np.linalg.norm(given, axis=1) < 1e-3  # opposite normals in a voxel
         normals = np.where(none[:, None], normals, unit(given)).astype(np.float32)
     return Cloud(points, normals), kept
@@ -530,7 +530,7 @@ class CanonicalFrame:
     T_canonical_cloud: Float64  # (4, 4)
 
     @classmethod
-    def of_scene(
+    def from_scene(
         cls,
         points: Float32,  # (N, 3) metres; without any, the origin stays
         up: ArrayLike,  # (3,) of any length but zero
@@ -552,28 +552,28 @@ class CanonicalFrame:
         turn = np.stack([x, np.cross(z, x), z])
         return cls(pose_matrix(turn, -turn @ origin))
 
-    def points(self, points: ArrayLike) -> Float64:
+    def points_from_cloud(self, points: ArrayLike) -> Float64:
         """Transform points (..., 3) from the cloud's frame to this one."""
-        return self.directions(points) + self.T_canonical_cloud[:3, 3]
+        return self.directions_from_cloud(points) + self.T_canonical_cloud[:3, 3]
 
-    def directions(self, directions: ArrayLike) -> Float64:
+    def directions_from_cloud(self, directions: ArrayLike) -> Float64:
         """Transform directions (..., 3) from the cloud's frame to this one."""
         return np.asarray(directions, dtype=np.float64) @ self.T_canonical_cloud[:3, :3].T
 
-    def poses(self, T_cloud_hand: ArrayLike) -> Float32:
+    def poses_from_cloud(self, T_cloud_hand: ArrayLike) -> Float32:
         """Transform poses (..., 4, 4) from the cloud's frame to this one."""
         return (self.T_canonical_cloud @ np.asarray(T_cloud_hand, np.float64)).astype(np.float32)
 
-    def points_in_cloud(self, points: ArrayLike) -> Float32:
+    def points_to_cloud(self, points: ArrayLike) -> Float32:
         """Transform points (..., 3) from this frame to the cloud's."""
-        return self.directions_in_cloud(np.asarray(points) - self.T_canonical_cloud[:3, 3])
+        return self.directions_to_cloud(np.asarray(points) - self.T_canonical_cloud[:3, 3])
 
-    def directions_in_cloud(self, directions: ArrayLike) -> Float32:
+    def directions_to_cloud(self, directions: ArrayLike) -> Float32:
         """Transform directions (..., 3) from this frame to the cloud's."""
         turned = np.asarray(directions, dtype=np.float64) @ self.T_canonical_cloud[:3, :3]
         return turned.astype(np.float32)
 
-    def poses_in_cloud(self, T_canonical_hand: ArrayLike) -> Float32:
+    def poses_to_cloud(self, T_canonical_hand: ArrayLike) -> Float32:
         """Transform poses (..., 4, 4) from this frame to the cloud's."""
         T_cloud_canonical = np.linalg.inv(self.T_canonical_cloud)
         return (T_cloud_canonical @ np.asarray(T_canonical_hand, np.float64)).astype(np.float32)

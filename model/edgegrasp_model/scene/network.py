@@ -125,7 +125,7 @@ class RangeImage(NamedTuple):
 
     points: Float32  # (H, W, 3) metres; NaN where nothing was seen
     footprint: float  # metres, width of a pixel at a depth of one metre
-    turn: Float64  # (3, 3) rows: the camera's axes in the cloud's frame
+    R_camera_cloud: Float64  # (3, 3) rows: the camera's axes in the cloud's frame
     corner: Float64  # (2,) x / z and y / z of the upper left corner
 
 

@@ -29,10 +29,10 @@ class SolidBoxes:
             T_cloud_box, half = box_pose(shape)
             half = np.maximum(half, 1e-6)  # so that the axes of flat boxes have a direction
             centers[row], halves[row] = T_cloud_box[:3, 3], np.diag(half) @ T_cloud_box[:3, :3].T
-        return cls(frame.points(centers), frame.directions(halves))
+        return cls(frame.points_from_cloud(centers), frame.directions_from_cloud(halves))
 
     @classmethod
-    def of_hands(cls, T_cloud_hand: Float32, boxes: Float64) -> Self:
+    def from_hands(cls, T_cloud_hand: Float32, boxes: Float64) -> Self:
         """Boxes (B, 2, 3) of the hand frame at hands (E, 4, 4): E * B boxes, hand by hand."""
         pose = T_cloud_hand.astype(np.float64)
         turn = pose[:, :3, :3]

@@ -48,16 +48,16 @@ from edgegrasp_model.scene.segment import (
     BACKGROUND,
     UNDECIDED,
     Segmentation,
+    drop_long_objects,
     objects_above,
     segment_cloud,
-    without_long,
 )
 from edgegrasp_model.scene.support import (
     Support,
     ViewedPoints,
     correct_depth_scale,
     find_support,
-    in_camera_frame,
+    has_camera_at_origin,
     plane_in,
     up_of_cropped,
 )
@@ -111,8 +111,8 @@ class Scene(Surroundings):
 class SelectedPoints:
     """The selected points of a cloud: M points of objects and their surroundings."""
 
-    sent: CheckedCloud  # M points
-    number: Int64  # (M,) number of each point's object, or BACKGROUND or UNDECIDED
+    cloud: CheckedCloud  # M points
+    object_of_point: Int64  # (M,) number of each point's object, or BACKGROUND or UNDECIDED
     support: Support | None
     up: Float64  # (3,) unit, away from gravity, cloud frame
     viewpoints: Float64  # (W, 3) the cameras
@@ -146,7 +146,7 @@ def select_points(
     needed = isinstance(options.support, AutoPlane) or (options.support is not None and not given)
     if needed and len(sent.points) > 0:
         found = segment_cloud(sent, viewpoints, options.known_up, rows)
-        found = found if sent.segment_ids is None else found._replace(number=number)
+        found = found if sent.segment_ids is None else found._replace(object_of_point=number)
     seen = ViewedPoints(sent.points, viewpoints.sum(axis=0) / max(len(viewpoints), 1))
     support = find_support(seen, inside, found, options, warnings)
     above_all = np.ones(len(inside), np.float32), np.zeros(len(inside), np.float32)
@@ -156,27 +156,27 @@ def select_points(
     above = np.flatnonzero(height > margin)
     sent, inside = sent.take(above), inside[above]
     counts["above_support"] = int(inside.sum())
-    plan = (support.frame.points(sent.points) if support else sent.points.astype(np.float64))[:, :2]
+    plan = (support.frame.points_from_cloud(sent.points) if support else sent.points)[:, :2]
     number, confidence = number[above], dict[int, float]()
     if found is not None and not given:
         if support is not None:
-            cut_off = math.isnan(support.growth)
-            number, certain = objects_above(found, above, plan, height, margin, cut_off)
+            is_cropped = math.isnan(support.growth)
+            number, certain = objects_above(found, above, plan, height, margin, is_cropped)
             confidence = dict(enumerate(certain.tolist()))
         elif options.viewpoint is not None and (
-            (found.number >= 0).any() or np.median(seen.distance()) < NEAREST_DEPTH
+            (found.object_of_point >= 0).any() or np.median(seen.distance()) < NEAREST_DEPTH
         ):
-            number, confidence = found.number, dict(enumerate(found.confidence.tolist()))
+            number, confidence = found.object_of_point, dict(enumerate(found.confidence.tolist()))
     if not given:
-        number = without_long(number, sent.points, options.max_object_size)
-        number = with_marked(number, len(confidence), sent, options)
+        number = drop_long_objects(number, sent.points, options.max_object_size)
+        number = add_marked(number, len(confidence), sent, options)
         if counts["above_support"] and not (inside & (number >= 0)).any():
             warnings.append(NO_OBJECT)
     number = np.where(inside | (number == BACKGROUND), number, UNDECIDED)
     labels[sent.row] = np.where(number >= 0, number, OBSTACLE)
     labels = labels_of_all_pixels(sent, labels) if options.debug else labels
     if options.at or options.near or isinstance(options.objects, ObjectChoice):
-        number = chosen_objects(number, sent, options, warnings)
+        number = keep_chosen_objects(number, sent, options, warnings)
     kept = near_objects_along(plan, number, HAND_REACH + further)
     near, number = sent.take(kept), number[kept]
     up = _up(options, seen, support, None if options.viewpoint is None else found)
@@ -189,7 +189,7 @@ def callers_objects(sent: CheckedCloud) -> Int64:
     return np.zeros(len(sent.points), int) if ids is None else np.where(ids > 0, ids, UNDECIDED)
 
 
-def with_marked(number: Int64, count: int, sent: CheckedCloud, options: DetectOptions) -> Int64:
+def add_marked(number: Int64, count: int, sent: CheckedCloud, options: DetectOptions) -> Int64:
     """Objects (N,), numbered below `count`; the rows that regions include may be one more.
 
     They are if no object has most of its points among them: the network did not recognise the
@@ -226,20 +226,20 @@ def build_scene(
 
     None if there is no object; InvalidRequest: there are too many voxels.
     """
-    sent, support, viewpoints = selected.sent, selected.support, selected.viewpoints
+    sent, support, viewpoints = selected.cloud, selected.support, selected.viewpoints
     obstacles = options.collision.obstacles
-    if not (selected.number >= 0).any():
+    if not (selected.object_of_point >= 0).any():
         counts |= {"voxels": 0, "kept": 0}
         return None
-    frame = CanonicalFrame.of_scene(sent.points, selected.up, viewpoints[0])
-    eyes = frame.points(viewpoints)
+    frame = CanonicalFrame.from_scene(sent.points, selected.up, viewpoints[0])
+    eyes = frame.points_from_cloud(viewpoints)
     projection = None if options.viewpoint is None else sent.projection(frame, eyes)
-    voxels = voxelise(canonical := frame.points(sent.points), voxel_size, max_voxels)
+    voxels = voxelise(canonical := frame.points_from_cloud(sent.points), voxel_size, max_voxels)
     middles = voxels.mean(canonical)
     cloud, kept = clean_cloud(sent, voxels, middles, frame, eyes)
     counts |= {"voxels": len(kept), "kept": len(cloud.points)}
-    in_cloud = frame.points_in_cloud(middles)
-    number = voxels.commonest(selected.number)[kept]
+    in_cloud = frame.points_to_cloud(middles)
+    number = voxels.commonest(selected.object_of_point)[kept]
     held = inside_workspace(in_cloud, options.workspace)[kept] & (number >= 0)
     approach, contact = (
         held if region is None else held & inside_region(region, in_cloud, voxels, sent)[kept]
@@ -247,7 +247,7 @@ def build_scene(
     )
     counts["in_approach_region"] = int(approach.sum())
     point_of_row = np.full(sent.rows_sent, -1, dtype=np.int64)
-    point_of_row[sent.row] = np.where(kept, np.cumsum(kept) - 1, -1)[voxels.voxel]
+    point_of_row[sent.row] = np.where(kept, np.cumsum(kept) - 1, -1)[voxels.of_point]
     spare = 0.0 if isinstance(options.support, SupportPlane) else FOUND_PLANE_CLEARANCE
     objects = in_cloud[kept][number >= 0]
     return Scene(
@@ -259,7 +259,7 @@ def build_scene(
         approach_allowed=approach,
         contact_allowed=contact,
         object_of_point=number,
-        support=None if support is None else plane_in(frame, support.under(objects, spare)),
+        support=None if support is None else plane_in(frame, support.plane_under(objects, spare)),
         at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, sent.points),
         viewpoints=(eyes[:0] if options.viewpoint is None else eyes).astype(np.float32),
         confidence=selected.confidence,
@@ -292,12 +292,12 @@ def _up(
         return np.asarray(support.frame.T_canonical_cloud[2, :3])
     if segmentation is not None:
         return segmentation.up
-    if in_camera_frame(options) and len(seen.points) > 0:
+    if has_camera_at_origin(options) and len(seen.points) > 0:
         return up_of_cropped(seen.points, seen.viewpoint, None)
     return np.array([0.0, 0.0, 1.0])
 
 
-def near_objects_along(plan: Float64, number: Int64, reach: float) -> Bools:
+def near_objects_along(plan: Floats, number: Int64, reach: float) -> Bools:
     """Which points (M,) a hand at any object could reach; `plan` (M, 2) is along the support."""
     if not (number >= 0).any():
         return np.zeros(len(plan), dtype=bool)
@@ -362,7 +362,7 @@ def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
                 raise InvalidRequest("segment_ids", "nothing", fix)
 
 
-def chosen_objects(
+def keep_chosen_objects(
     number: Int64, cloud: CheckedCloud, options: DetectOptions, warnings: list[str]
 ) -> Int64:
     """The object (N,) of each point, but BACKGROUND if the request does not choose that object.
@@ -376,7 +376,7 @@ def chosen_objects(
     held = number[number >= 0]
     # Counting is many times faster, but its memory grows with the caller's highest number.
     found = np.flatnonzero(np.bincount(held)) if cloud.segment_ids is None else np.unique(held)
-    wanted = numbers_chosen(found, options.objects, warnings)
+    wanted = resolve_object_choice(found, options.objects, warnings)
     for name, target in (("at", options.at), ("near", options.near)):
         if target is None:
             continue
@@ -409,7 +409,7 @@ def _image_width(pixel: tuple[float, ...], cloud: CheckedCloud) -> int:
     return width
 
 
-def numbers_chosen(found: Int64, choice: ObjectChoice | str, warnings: list[str]) -> Int64:
+def resolve_object_choice(found: Int64, choice: ObjectChoice | str, warnings: list[str]) -> Int64:
     """The numbers in `found` of the objects that a choice names; all if the choice is a word."""
     if isinstance(choice, str):
         return found
@@ -450,7 +450,7 @@ def _inside_shape(shape: Shape, points: Float32, voxels: Voxels, cloud: CheckedC
         case HalfSpace():
             return np.asarray(points @ np.asarray(shape.normal) >= shape.offset)
     listed = _listed(shape, cloud)
-    return np.asarray(np.bincount(voxels.voxel, listed, len(voxels.size)) >= voxels.size / 2)
+    return np.asarray(np.bincount(voxels.of_point, listed, len(voxels.counts)) >= voxels.counts / 2)
 
 
 def _listed(shape: Rows, cloud: CheckedCloud) -> Bools:

@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 from torch.nn import functional
 
-from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.scene.cloud import CheckedCloud, grid_cells, subsample, unit
 from edgegrasp_model.scene.network import FAST, NEAREST_DEPTH, SceneNet, range_image, scene_features
@@ -44,9 +44,9 @@ CROPPED_CONFIDENCE = 0.95  # of clusters in a cloud that was cropped above its s
 class Segmentation(NamedTuple):
     """The segmentation of N points."""
 
-    number: Int64  # (N,) each point's object, from 0, or BACKGROUND or UNDECIDED
-    object: Float32  # (N,) probability of an object
-    support: Float32  # (N,) probability of a support
+    object_of_point: Int64  # (N,) each point's object, from 0, or BACKGROUND or UNDECIDED
+    object_probability: Float32  # (N,) probability of an object
+    support_probability: Float32  # (N,) probability of a support
     confidence: Float64  # (O,) confidence of each object
     up: Float64  # (3,) unit, away from gravity, estimated by the network; cloud frame
 
@@ -62,7 +62,7 @@ class Pixels(NamedTuple):
 
 
 @cache
-def shipped() -> tuple[SceneNet, Float64]:
+def load_scene_network() -> tuple[SceneNet, Float64]:
     """The `scene` network with the shipped weights, loaded once per process, and its calibration.
 
     The calibration (2,) gives the log odds that an instance is an object: a constant, plus a factor
@@ -78,7 +78,7 @@ def shipped() -> tuple[SceneNet, Float64]:
 
 def confidences(mean: Float64) -> Float64:
     """The confidence (O,) of instances, from the mean probability (O,) of an object over each."""
-    constant, factor = shipped()[1]
+    constant, factor = load_scene_network()[1]
     return np.asarray(1.0 / (1.0 + np.exp(-(constant + factor * mean))))
 
 
@@ -109,11 +109,12 @@ def segment_cloud(
     views = [view for view in seen if len(view[1])]
     for rows, part, viewpoint in views:
         own = segment(part, viewpoint, up, down)
-        number[rows] = np.where(own.number >= 0, own.number + len(confidence), own.number)
-        objects[rows], support[rows] = own.object, own.support
+        own_number = own.object_of_point
+        number[rows] = np.where(own_number >= 0, own_number + len(confidence), own_number)
+        objects[rows], support[rows] = own.object_probability, own.support_probability
         confidence = np.concatenate([confidence, own.confidence])
         sizes.append(len(own.confidence))
-        seen_up += own.up * len(own.number)
+        seen_up += own.up * len(own.object_of_point)
     if len(views) > 1:
         view = np.repeat(np.arange(len(views)), sizes)
         number, confidence = merge_views(points, number, confidence, view)
@@ -127,17 +128,17 @@ def segment(
     down: Float64 | None,  # (3,) downward in the image, used if `up` is unknown
 ) -> Segmentation:
     """Segment points seen by one camera."""
-    image, (network, _) = range_image(points, viewpoint, up, down), shipped()
-    up_in_view = None if up is None else image.turn @ up
+    image, (network, _) = range_image(points, viewpoint, up, down), load_scene_network()
+    up_in_view = None if up is None else image.R_camera_cloud @ up
     features = scene_features(image.points, up_in_view, image.footprint)
     pixels, seen_up = run_network(network, features, image.points, image.footprint)
     of_pixel, mean = group_pixels(pixels)
     confidence = confidences(mean)
     likely = confidence > MIN_CONFIDENCE
     new = np.append(np.where(likely, np.cumsum(likely) - 1, BACKGROUND), [UNDECIDED, BACKGROUND])
-    eye = image.turn @ viewpoint
-    labels = _label_points(points, image.turn, eye, image.corner, pixels, new[of_pixel])
-    return Segmentation(*labels, confidence[likely], seen_up @ image.turn)
+    eye = image.R_camera_cloud @ viewpoint
+    labels = _label_points(points, image.R_camera_cloud, eye, image.corner, pixels, new[of_pixel])
+    return Segmentation(*labels, confidence[likely], seen_up @ image.R_camera_cloud)
 
 
 def run_network(
@@ -289,14 +290,14 @@ def merge_views(
 def objects_above(
     found: Segmentation,  # of N points
     above: Int64,  # (M,) which of them rise above the support
-    plan: Float64,  # (M, 2) positions along the support, metres
+    plan: Floats,  # (M, 2) positions along the support, metres
     height: Float32,  # (N,) metres over the support
     margin: Float32,  # (N,) metres over the support up to which points belong to it
-    cut_off: bool,  # whether the cloud was cropped above the support
+    is_cropped: bool,  # whether the cloud was cropped above the support
 ) -> tuple[Int64, Float64]:
     """The object (M,) of each point above the support, and the confidence (O,) of each object."""
-    likely = (found.object + found.support)[above] > MIN_CONFIDENCE
-    number, height = found.number[above], height[above]
+    likely = (found.object_probability + found.support_probability)[above] > MIN_CONFIDENCE
+    number, height = found.object_of_point[above], height[above]
     # The network misses thin parts, such as handles and edges: they join the object beside them.
     rows = np.flatnonzero((number < 0) & (height > margin[above] + MIN_RISE) & likely)
     held, places = subsample(np.flatnonzero(number >= 0)), np.column_stack([plan, height])
@@ -307,17 +308,17 @@ def objects_above(
     # If there are objects, background stays background: only parts that were too small are left.
     alone = not (number >= 0).any()
     among = likely & ((number == UNDECIDED) | alone)
-    number = with_clusters(number, plan, among | cut_off, first)
+    number = add_clusters(number, plan, among | is_cropped, first)
     new = np.flatnonzero(number >= first)
     which = number[new] - first
-    mean = np.bincount(which, found.object[above[new]]) / np.bincount(which)
-    certain = np.full(len(mean), CROPPED_CONFIDENCE) if cut_off else confidences(mean)
-    certain *= 1.0 if alone or cut_off else BESIDE_FACTOR
+    mean = np.bincount(which, found.object_probability[above[new]]) / np.bincount(which)
+    certain = np.full(len(mean), CROPPED_CONFIDENCE) if is_cropped else confidences(mean)
+    certain *= 1.0 if alone or is_cropped else BESIDE_FACTOR
     number[new[certain[which] <= MIN_CONFIDENCE]] = BACKGROUND
     return number, np.concatenate([found.confidence, certain])
 
 
-def with_clusters(number: Int64, plan: Float64, among: Bools, first: int) -> Int64:
+def add_clusters(number: Int64, plan: Floats, among: Bools, first: int) -> Int64:
     """The numbers (N,), with clusters of other points as additional objects, from `first` on.
 
     The network misses objects in clouds that were cropped above the support, as it does not see
@@ -341,7 +342,7 @@ def with_clusters(number: Int64, plan: Float64, among: Bools, first: int) -> Int
     return number
 
 
-def without_long(number: Int64, points: Float32, max_size: float) -> Int64:
+def drop_long_objects(number: Int64, points: Float32, max_size: float) -> Int64:
     """The numbers (N,), with objects longer than `max_size` metres turned into background."""
     held = np.flatnonzero(number >= 0)
     if len(held) == 0:

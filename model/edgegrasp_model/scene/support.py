@@ -60,19 +60,19 @@ class Support:
 
     plane: SupportPlane
     frame: CanonicalFrame  # its z is the height over the plane, along the unit normal
-    least: float  # metres above it that always belong to it
+    margin: float  # metres above it that always belong to it
     residual: float | None = None  # metres, median distance of its points; None: it is not seen
     share: float = 0.0  # of the points that lie in it
     growth: float = math.nan  # noise of its points, metres per squared metre of distance
     # Rise over the plane at (x, y): of 1, x, y, x^2, x y, y^2.
     bow: Float64 = field(default_factory=lambda: np.zeros(6))
 
-    def under(self, objects: Floats, least: float) -> SupportPlane:
+    def plane_under(self, objects: Floats, least: float) -> SupportPlane:
         """The plane that hands stay above, fitted to the visible support under objects (N, 3).
 
         It is `least` metres over the support's plane, or higher where the support rises more.
         """
-        terms = _bow_terms(*self.frame.points(objects)[:, :2].T)
+        terms = _bow_terms(*self.frame.points_from_cloud(objects)[:, :2].T)
         rise = np.minimum(self.bow @ terms, MAX_BOW)
         if rise.max(initial=0.0) < max(least, HEEDED_RISE):
             offset = self.plane.offset + least * float(np.linalg.norm(self.plane.normal))
@@ -90,9 +90,9 @@ class Support:
         T_plane_cloud, eye = self.frame.T_canonical_cloud, seen.viewpoint
         height, squared = _heights(seen.points, T_plane_cloud, self.bow, eye)
         if math.isnan(self.growth):
-            return height, np.full_like(height, self.least)
+            return height, np.full_like(height, self.margin)
         squared *= np.float32(MARGIN_DEVIATIONS * self.growth)
-        return height, np.clip(squared, self.least, max(MAX_MARGIN, self.least), out=squared)
+        return height, np.clip(squared, self.margin, max(MAX_MARGIN, self.margin), out=squared)
 
 
 class ViewedPoints(NamedTuple):
@@ -116,8 +116,8 @@ def plane_in(frame: CanonicalFrame, plane: SupportPlane) -> SupportPlane:
     """Transform a plane from the cloud's frame to another one."""
     normal = np.asarray(plane.normal)
     length = float(np.linalg.norm(normal))
-    foot = frame.points(normal * (plane.offset / length**2))
-    turned = frame.directions(normal) / length
+    foot = frame.points_from_cloud(normal * (plane.offset / length**2))
+    turned = frame.directions_from_cloud(normal) / length
     return SupportPlane.model_construct(normal=tuple(turned.tolist()), offset=float(foot @ turned))
 
 
@@ -176,7 +176,7 @@ def _given_support(
             f"the given support plane lies {below:.3g} m below everything that is seen: check "
             "its frame, normal, and offset in metres."
         )
-    on = np.flatnonzero([] if segmentation is None else segmentation.support > 0.5)
+    on = np.flatnonzero([] if segmentation is None else segmentation.support_probability > 0.5)
     # In a cloud cropped above its support, only flat tops may be classified as support.
     whole = len(on) > MIN_SUPPORT_SHARE * len(seen.points)
     whole = whole and _wider_than_object(seen.points[subsample(on)], plane)
@@ -187,8 +187,8 @@ def _fit_support(
     seen: ViewedPoints, segmentation: Segmentation, up: Float64 | None, rng: np.random.Generator
 ) -> Support | None:
     """The plane of the points classified as support, weighted toward those near objects."""
-    on = np.flatnonzero(segmentation.support > 0.5)
-    held = np.flatnonzero(segmentation.number >= 0)
+    on = np.flatnonzero(segmentation.support_probability > 0.5)
+    held = np.flatnonzero(segmentation.object_of_point >= 0)
     part = ViewedPoints(seen.points[subsample(on)], seen.viewpoint)
     around = seen.points[subsample(held, 500)]
     # Metres to the nearest object; infinity beyond NEAR_DISTANCE, or where there is no object.
@@ -216,7 +216,7 @@ def _fit_support(
         near = near[np.abs(height - np.median(height)) < within * PLANE_NOISE]
         plane = _fit_least_squares(near, plane) if len(near) >= MIN_PLANE_POINTS else plane
     found = measure_support(part, plane, PLANE_NOISE, True)
-    places = found.frame.points(part.points)
+    places = found.frame.points_from_cloud(part.points)
     _, count = grid_cells(places[np.abs(places[:, 2]) < MAX_MARGIN, :2], AREA_CELL)
     if len(count) * AREA_CELL**2 <= MIN_SUPPORT_AREA:
         return None
@@ -227,10 +227,10 @@ def _assume_support(
     seen: ViewedPoints, segmentation: Segmentation, options: DetectOptions, warnings: list[str]
 ) -> Support | None:
     """A support under the lowest points of a cloud that was cropped above it."""
-    if (segmentation.support > 0.5).mean() > MIN_SUPPORT_SHARE:
+    if (segmentation.support_probability > 0.5).mean() > MIN_SUPPORT_SHARE:
         return None
-    up, objects = options.known_up, segmentation.number >= 0
-    if up is None and in_camera_frame(options):
+    up, objects = options.known_up, segmentation.object_of_point >= 0
+    if up is None and has_camera_at_origin(options):
         if objects.mean() <= 1.0 - MIN_SUPPORT_SHARE:
             return None
         up = up_of_cropped(seen.points[objects], seen.viewpoint, segmentation.up)
@@ -249,7 +249,7 @@ def _assume_support(
     return measure_support(seen, plane, 0.0, False)
 
 
-def in_camera_frame(options: DetectOptions) -> bool:
+def has_camera_at_origin(options: DetectOptions) -> bool:
     """Whether a camera is at the origin; if not, z is up, as in the frame of a robot or a world."""
     cameras = options.viewpoint
     return cameras is not None and not np.reshape(cameras, (-1, 3)).any(axis=1).all()
@@ -347,9 +347,9 @@ def measure_support(seen: ViewedPoints, plane: SupportPlane, least: float, whole
     `whole`: the cloud was not cropped above the plane.
     """
     sample = ViewedPoints(subsample(seen.points), seen.viewpoint)
-    frame = CanonicalFrame.of_scene(sample.points, plane.normal, seen.viewpoint)
+    frame = CanonicalFrame.from_scene(sample.points, plane.normal, seen.viewpoint)
     frame.T_canonical_cloud[2, 3] = -plane.offset / np.linalg.norm(plane.normal)
-    x, y, height = frame.points(sample.points).T
+    x, y, height = frame.points_from_cloud(sample.points).T
     distance = sample.distance()
     thick = PLANE_NOISE + NOISE_GROWTH * np.square(distance)
     near = np.abs(height) < thick
@@ -447,8 +447,8 @@ def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> floa
 
 def _wider_than_object(points: Floats, plane: SupportPlane) -> bool:
     """Whether points (N, 3) cover more of a plane than an object's flat top."""
-    frame = CanonicalFrame.of_scene(points, plane.normal, None)
-    _, count = grid_cells(frame.points(points)[:, :2], AREA_CELL)
+    frame = CanonicalFrame.from_scene(points, plane.normal, None)
+    _, count = grid_cells(frame.points_from_cloud(points)[:, :2], AREA_CELL)
     return len(count) * AREA_CELL**2 > MIN_CORRECTED_AREA
 
 

@@ -32,7 +32,7 @@ from grpc_reflection.v1alpha import reflection, reflection_pb2
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
 from edgegrasp_service import errors
-from edgegrasp_service.front.service import MAX_HEADERS, GraspService, Places
+from edgegrasp_service.front.service import MAX_HEADERS, EvictingLimiter, GraspService
 from edgegrasp_service.observability import REQUEST_ID_HEADER, UNTIMED_METHODS, Call, network_of
 from edgegrasp_service.settings import UNIX_PREFIX, Settings
 from edgegrasp_service.worker.process import Job, Method
@@ -82,8 +82,8 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         self._service = service
         names = (SERVICE.full_name, HEALTH_SERVICE, *REFLECTION)
         self._reflection = reflection.aio.ReflectionServicer(names)  # type: ignore[attr-defined]
-        self._watchers = Places(MAX_WATCHERS)
-        self._streams = Places(service.settings.max_streams, STREAM_GRACE_SECONDS)
+        self._watchers = EvictingLimiter(MAX_WATCHERS)
+        self._streams = EvictingLimiter(service.settings.max_streams, STREAM_GRACE_SECONDS)
         ours: dict[str, Behaviour] = {
             "DetectGrasps": partial(self._answer, "DetectGrasps"),
             "ScoreGrasps": partial(self._answer, "ScoreGrasps"),
@@ -165,7 +165,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                     await context.send_initial_metadata(name)
                 await behave(call, context)
             except errors.Cancelled as error:
-                call.problem = errors.report(error)
+                call.problem = errors.to_problem(error)
                 # Otherwise gRPC would keep the answer until the connection closes.
                 _disconnect(self._port, network_of(address), port)
                 raise asyncio.CancelledError from None
@@ -177,7 +177,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                 if not isinstance(error, EdgeGraspError):
                     logger.exception("%s failed", method)
                 try:
-                    await _abort(call, context, errors.report(error))
+                    await _abort(call, context, errors.to_problem(error))
                 except aio.InternalError:  # an answer is being sent, and the deadline has passed
                     if context.time_remaining() is None:
                         _disconnect(self._port, network_of(address), port)
@@ -213,9 +213,9 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         stopping = asyncio.create_task(service.stopping.wait())
         reading: asyncio.Task[Any] | None = asyncio.create_task(_next_request(context))
         try:
-            async with self._streams.hold(call.client) as place:
+            async with self._streams.hold(call.client) as permit:
                 while reading or ahead:
-                    self._streams.use(place, idle=not ahead)
+                    self._streams.use(permit, idle=not ahead)
                     waiting: set[asyncio.Task[Any]] = {ahead[0]} if ahead else set()
                     if reading and len(ahead) < service.settings.max_stream_requests:
                         waiting |= {reading, stopping}
@@ -247,7 +247,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
 
     async def _list(self, name: str, call: Call, context: Any) -> None:
         response = getattr(grasp_pb2, f"List{name.capitalize()}Response")
-        await context.write(response(**{name: getattr(self._service.loaded(), name)}))
+        await context.write(response(**{name: getattr(self._service.require_pool(), name)}))
 
     async def _reload_models(self, call: Call, context: Any) -> None:
         models: Any = await self._service.reload(call)
@@ -277,7 +277,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                 try:
                     request = reflection_pb2.ServerReflectionRequest.FromString(data)
                 except DecodeError:
-                    raise errors.no_message(data) from None
+                    raise errors.unreadable_message(data) from None
                 yield request
 
         async with self._watchers.hold(call.client):
@@ -351,7 +351,7 @@ async def _next_request(context: Any) -> dict[str, Any] | None:
             place += size
     except (LookupError, UnicodeDecodeError):
         pass
-    raise errors.no_message(data)
+    raise errors.unreadable_message(data)
 
 
 def _varint(data: bytes, place: int) -> tuple[int, int]:

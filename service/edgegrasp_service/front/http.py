@@ -27,7 +27,7 @@ from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, brief
 from edgegrasp_model.gripper import gripper_names, load_gripper
 from edgegrasp_service import errors
-from edgegrasp_service.front.service import MAX_HEADERS, GraspService, Place, Places
+from edgegrasp_service.front.service import MAX_HEADERS, EvictingLimiter, GraspService, Permit
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics, network_of
 from edgegrasp_service.worker.process import PIECE_BYTES, Job, Method
 
@@ -86,7 +86,7 @@ class HttpMiddleware:
     def __init__(self, app: ASGIApp, service: GraspService) -> None:
         self._app = app
         self._service = service
-        self._pages = Places(MAX_PAGES_AT_ONCE, PAGE_GRACE_SECONDS)
+        self._pages = EvictingLimiter(MAX_PAGES_AT_ONCE, PAGE_GRACE_SECONDS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request, or refuse it."""
@@ -130,7 +130,7 @@ class HttpMiddleware:
                 if not isinstance(error, EdgeGraspError | HTTPException):
                     logger.exception("%s failed", method)
                 if call.code:  # the answer has begun: the client must see that it is incomplete
-                    call.problem, call.code = errors.report(error), ""
+                    call.problem, call.code = errors.to_problem(error), ""
                     scope["state"]["abort"]()
                     await _disconnected(receive, call)
                 else:
@@ -168,7 +168,7 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
     settings = service.settings
 
     async def listed(name: str, request: Request) -> Response:
-        return JSONResponse({name: getattr(service.loaded(), name)})
+        return JSONResponse({name: getattr(service.require_pool(), name)})
 
     async def reload(request: Request) -> Response:
         return JSONResponse({"models": await service.reload(request.scope["call"])})
@@ -189,7 +189,7 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
     )
     index = RedirectResponse(PLAYGROUND if settings.playground else "/docs")
     routes: list[BaseRoute] = [
-        *(Route(path, _Work(service, WORK[path]), methods=["POST"]) for path in WORK),
+        *(Route(path, _WorkerRoute(service, WORK[path]), methods=["POST"]) for path in WORK),
         Route("/v1/models", partial(listed, "models")),
         Route("/v1/robots", partial(listed, "robots")),
         Route("/v1/models:reload", reload, methods=["POST"]),
@@ -219,7 +219,7 @@ def create_router(service: GraspService, metrics: Metrics) -> Router:
 
 
 @dataclass
-class _Work:
+class _WorkerRoute:
     """A route to the workers: reads a body once there is room, and sends their answer."""
 
     service: GraspService
@@ -284,7 +284,7 @@ def _problem_response(call: Call, problem: errors.Problem) -> Response:
 
 def _error_response(call: Call, scope: Scope, error: Exception) -> Response:
     if not isinstance(error, HTTPException):
-        return _problem_response(call, errors.report(error))
+        return _problem_response(call, errors.to_problem(error))
     # Raised by the router: no such path, or no such method.
     detail = f"{scope['method']} {scope['path']}: {error.detail}. See /docs."
     problem = errors.Problem("http", detail, "", "", "", "", error.status_code)
@@ -299,22 +299,22 @@ def _error_response(call: Call, scope: Scope, error: Exception) -> Response:
 class HttpProtocol(HttpToolsProtocol):
     """Closes connections whose headers arrive too slowly; refused clients can still read why."""
 
-    def __init__(self, service: GraspService, places: Places, **arguments: Any) -> None:
+    def __init__(self, service: GraspService, limiter: EvictingLimiter, **arguments: Any) -> None:
         super().__init__(**arguments)
         self._service, self._settings = service, service.settings
-        self._places = places
+        self._limiter = limiter
         self._header_timer: asyncio.TimerHandle | None = None  # while headers arrive
         self._header_bytes = 0
-        self._place = Place("", lambda: None)
+        self._permit = Permit("", lambda: None)
 
     def connection_made(self, transport: Any) -> None:
-        """Take a place, and wait for the first headers."""
+        """Take a permit, and wait for the first headers."""
         super().connection_made(transport)
         transport.max_size = PIECE_BYTES  # read in one turn of the event loop
         self.on_message_begin()  # starts the timer for the first headers
         try:
             owner = network_of(self.client[0] if self.client else "")
-            self._place = self._places.take(owner, transport.abort)
+            self._permit = self._limiter.acquire(owner, transport.abort)
         except errors.Overloaded as error:
             self._refuse(error)
 
@@ -323,7 +323,7 @@ class HttpProtocol(HttpToolsProtocol):
         if self.transport.is_closing():
             return
         self._header_bytes += len(data)
-        self._places.use(self._place, self._place.idle)
+        self._limiter.use(self._permit, self._permit.idle)
         super().data_received(data)
         if self._header_timer is None:
             self._header_bytes = 0
@@ -345,7 +345,7 @@ class HttpProtocol(HttpToolsProtocol):
 
     def on_headers_complete(self) -> None:
         """Mark the connection as busy for requests to /v1/."""
-        self._places.use(self._place, idle=not self.url.startswith(b"/v1/"))
+        self._limiter.use(self._permit, idle=not self.url.startswith(b"/v1/"))
         if self._header_timer is not None:
             self._header_timer.cancel()
             self._header_timer = None
@@ -362,14 +362,14 @@ class HttpProtocol(HttpToolsProtocol):
 
     def on_response_complete(self) -> None:
         """Mark the connection as idle."""
-        self._places.use(self._place)
+        self._limiter.use(self._permit)
         super().on_response_complete()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop the timer and return the place."""
+        """Stop the timer and return the permit."""
         if self._header_timer is not None:
             self._header_timer.cancel()
-        self._places.release(self._place)
+        self._limiter.release(self._permit)
         super().connection_lost(exc)
 
     def send_400_response(self, msg: str) -> None:
@@ -387,7 +387,7 @@ class HttpProtocol(HttpToolsProtocol):
         if pending and self.cycle.response_started:
             self.transport.abort()  # the client already has part of an answer
             return
-        problem = errors.report(error)
+        problem = errors.to_problem(error)
         body = errors.problem_document(problem)
         head = (
             f"HTTP/1.1 {problem.status} {problem.kind}\r\n"

@@ -1,7 +1,7 @@
 """The core of both transports: check, admit, run, record and report a request.
 
 `Admission` limits how many requests and bytes the server holds, shared fairly between clients;
-`Places` does the same for connections, streams, pages and reads.
+`EvictingLimiter` does the same for connections, streams, pages and reads.
 """
 
 import asyncio
@@ -61,7 +61,7 @@ class GraspService:
         """Whether requests can be answered."""
         return bool(self.pool.models) and self.pool.alive and not self.stopping.is_set()
 
-    def loaded(self) -> WorkerPool:
+    def require_pool(self) -> WorkerPool:
         """The workers; raises NotReady while weights are loading or the server is stopping."""
         if self.stopping.is_set():
             raise errors.NotReady(errors.STOPPING_MESSAGE)
@@ -79,7 +79,7 @@ class GraspService:
         except BaseException as error:
             gone = errors.Cancelled("The caller cancelled the request.")
             known = error if isinstance(error, Exception) else gone
-            call.problem = call.problem or errors.report(known)
+            call.problem = call.problem or errors.to_problem(known)
             raise
         finally:
             self.in_flight -= 1
@@ -110,7 +110,7 @@ class GraspService:
             PayloadTooLarge: The body is over the limit.
             DeadlineExceeded: The deadline passed.
         """
-        self.loaded()
+        self.require_pool()
         self.check_size(size)
         call.deadline = call.start + min(timeout, self.settings.max_request_seconds)
         return self.admission.admit(call, size)
@@ -195,14 +195,14 @@ class GraspService:
         self.stopping.set()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(grace):
-                return await self.admission.empty()
+                return await self.admission.wait_until_empty()
         logger.warning("grace is over: requests in flight are abandoned")
         late = errors.NotReady("The server stopped before there was an answer. Try another one.")
         for call in self.admission.calls:
             call.refuse(late)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(SEND_SECONDS):
-                await self.admission.empty()
+                await self.admission.wait_until_empty()
 
     async def reload(self, call: Call | None = None) -> list[dict[str, Any]]:
         """Reload weights, tokens and certificates; the old ones stay in use meanwhile.
@@ -217,7 +217,7 @@ class GraspService:
         """
         if call is not None and not call.is_admin:  # here, so that no spelling of a path evades it
             raise errors.PermissionDenied(TOKEN_HEADER, "no token of an administrator", ADMIN_FIX)
-        self.loaded()
+        self.require_pool()
         if self._reloading.locked():
             raise errors.ReloadFailed("A reload is under way already. Try again later.")
         async with self._reloading:
@@ -316,7 +316,7 @@ class Admission:
             self._freed.set()
 
     @property
-    def at_work(self) -> int:
+    def num_at_work(self) -> int:
         """Number of requests that workers are processing."""
         return sum(call.at_work for call in self.calls)
 
@@ -350,7 +350,7 @@ class Admission:
         self._freed.set()
         return True
 
-    async def empty(self) -> None:
+    async def wait_until_empty(self) -> None:
         """Return once no request is in the server."""
         while self.calls:
             self._freed.clear()
@@ -385,12 +385,12 @@ class Admission:
         self.resize(call, size)
 
 
-# Places
+# Limits of connections, streams and pages
 
 
 @dataclass(eq=False)
-class Place:
-    """A slot of `Places`."""
+class Permit:
+    """A slot of an `EvictingLimiter`."""
 
     owner: str
     on_eviction: Callable[[], None]
@@ -398,64 +398,64 @@ class Place:
     used: float = field(default_factory=time.monotonic)
 
 
-class Places:
+class EvictingLimiter:
     """A limited number of connections, streams, pages or reads.
 
-    When all places are taken, a newcomer evicts an idle one: the longest idle of the client that
-    has most idle places. A place used within the last `grace` seconds is evicted only for a client
-    that then still has fewer. `spare` places cannot be busy, so that one is always left.
+    When all permits are taken, a newcomer evicts an idle one: the longest idle of the client that
+    has most idle permits. One used within the last `grace` seconds is evicted only for a client
+    that then still has fewer. `spare` permits cannot be busy, so that one is always left.
     """
 
     def __init__(self, most: int, grace: float = 0.0, spare: int = 0) -> None:
         self._most, self._grace, self._spare = most + spare, grace, spare
-        self.taken: dict[Place, None] = {}  # the most recently used at the end
+        self.taken: dict[Permit, None] = {}  # the most recently used at the end
 
-    def take(self, owner: str, on_eviction: Callable[[], None]) -> Place:
-        """Take a place until `release`, or until it is evicted. Raises Overloaded."""
+    def acquire(self, owner: str, on_eviction: Callable[[], None]) -> Permit:
+        """Take a permit until `release`, or until it is evicted. Raises Overloaded."""
         if len(self.taken) >= self._most:
             since = time.monotonic() - self._grace
             counts = Counter(one.owner for one in self.taken)
             mine = counts[owner] + 1
             idle = [
-                place
-                for place in self.taken
-                if place.idle and (place.used <= since or counts[place.owner] > mine)
+                permit
+                for permit in self.taken
+                if permit.idle and (permit.used <= since or counts[permit.owner] > mine)
             ]
             if not idle:
                 raise errors.Overloaded(f"All {self._most} places are in use. Try again in 1 s.")
-            greedy = Counter(place.owner for place in idle).most_common(1)[0][0]
-            evicted = next(place for place in idle if place.owner == greedy)
+            greedy = Counter(permit.owner for permit in idle).most_common(1)[0][0]
+            evicted = next(permit for permit in idle if permit.owner == greedy)
             self.release(evicted)
             evicted.on_eviction()
-        place = Place(owner, on_eviction)
-        self.taken[place] = None
-        return place
+        permit = Permit(owner, on_eviction)
+        self.taken[permit] = None
+        return permit
 
-    def use(self, place: Place, idle: bool = True) -> None:
-        """Mark a place as used now, and as idle or busy. Raises Overloaded."""
-        if place.idle and not idle and self._spare:
+    def use(self, permit: Permit, idle: bool = True) -> None:
+        """Mark a permit as used now, and as idle or busy. Raises Overloaded."""
+        if permit.idle and not idle and self._spare:
             busy = sum(not other.idle for other in self.taken)
             if busy >= self._most - self._spare:
                 raise errors.Overloaded(f"{busy} connections have requests. Try again in 1 s.")
-        place.idle, place.used = idle, time.monotonic()
-        if place in self.taken:
-            self.taken[place] = self.taken.pop(place)
+        permit.idle, permit.used = idle, time.monotonic()
+        if permit in self.taken:
+            self.taken[permit] = self.taken.pop(permit)
 
-    def release(self, place: Place) -> None:
-        """Return a place."""
-        self.taken.pop(place, None)
+    def release(self, permit: Permit) -> None:
+        """Return a permit."""
+        self.taken.pop(permit, None)
 
     @asynccontextmanager
-    async def hold(self, owner: str) -> AsyncIterator[Place]:
-        """Hold a place; raises Overloaded if there is none, or on eviction, cancelling the body."""
+    async def hold(self, owner: str) -> AsyncIterator[Permit]:
+        """Hold a permit. Raises Overloaded if there is none, or on eviction, and ends the body."""
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(None) as eviction:
-                place = self.take(owner, lambda: eviction.reschedule(loop.time()))
+                permit = self.acquire(owner, lambda: eviction.reschedule(loop.time()))
                 try:
-                    yield place
+                    yield permit
                 finally:
-                    self.release(place)
+                    self.release(permit)
         except TimeoutError:
             if not eviction.expired():
                 raise

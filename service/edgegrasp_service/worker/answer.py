@@ -94,7 +94,7 @@ def load_robots(settings: Settings) -> "Mapping[str, Robot]":
 def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
     """Decode a job, detect, and encode the answer; nothing is kept for the next job.
 
-    A cloud that would exceed its deadline, at the pace measured when the catalogue was loaded, is
+    A cloud that would exceed its deadline, at the costs measured when the catalogue was loaded, is
     refused before any work.
 
     Returns:
@@ -103,7 +103,7 @@ def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
     Raises:
         MemoryError: Out of memory; the process should be replaced.
     """
-    work = _Work(job, catalogue, settings, time.monotonic() + job.remaining)
+    work = _RunningJob(job, catalogue, settings, time.monotonic() + job.remaining)
     facts = work.facts
     try:
         if job.method == "RecordOutcome":
@@ -122,16 +122,16 @@ def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
             facts.grasps = len(result.evaluations)
         facts.model, facts.counts = result.model, dict(result.counts)
         with work.stage("encode"):
-            body = write(job.transport, result)
+            body = serialize_result(job.transport, result)
         return Answer(body, facts)
     except EdgeGraspError as error:
-        problem = errors.report(error)
+        problem = errors.to_problem(error)
     except Exception as error:
         # PyTorch raises an error of its own for each kind of device.
         torch_error = type(error).__name__ == "OutOfMemoryError"
         if isinstance(error, MemoryError) or torch_error or "can't allocate memory" in str(error):
             raise MemoryError(str(error)) from None
-        problem = errors.report(error)
+        problem = errors.to_problem(error)
         facts.traceback = traceback.format_exc()
         if work.options is not None:  # its lists may have millions of rows
             facts.options = work.options.model_dump_json(exclude_defaults=True)[:2000]
@@ -139,7 +139,7 @@ def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
 
 
 @dataclass
-class _Work:
+class _RunningJob:
     """One job while it is being answered."""
 
     job: Job
@@ -171,12 +171,12 @@ class _Work:
             if name not in robots:
                 fix = f"Use one of: {', '.join(robots)}." if robots else "Set the setting `robots`."
                 raise InvalidRequest("options.robot.name", repr(name), fix)
-            from edgegrasp_robot import plan_picks, with_robot
+            from edgegrasp_robot import options_for_robot, plan_picks
 
             robot = robots[name]
-            options = with_robot(options, robot)
+            options = options_for_robot(options, robot)
         with self.stage("prepare"):
-            most = self._within_deadline(self.settings.max_voxels, self.catalogue.pace.voxel)
+            most = self._within_deadline(self.settings.max_voxels, self.catalogue.unit_costs.voxel)
             prepared = detector.prepare(cloud, options, most)
             self.facts.counts = dict(prepared.counts)
         with self.stage("network"):
@@ -199,7 +199,7 @@ class _Work:
                 self.options = options = parse_options(fields["options"])
                 detector = self.catalogue.get(options.model)
                 given = _given(fields, options, most) if self.job.method == "ScoreGrasps" else {}
-                in_time = self._within_deadline(most, self.catalogue.pace.point)
+                in_time = self._within_deadline(most, self.catalogue.unit_costs.point)
                 cloud, options = decode_cloud(fields, options, in_time)
         except MemoryError:
             value, fix = f"{size} bytes that take too much memory to read", "Send packed arrays."
@@ -293,7 +293,7 @@ def read_request(job: Job) -> dict[str, Any]:
     return fields
 
 
-def write(transport: Transport, result: Detection | Scoring) -> bytes:
+def serialize_result(transport: Transport, result: Detection | Scoring) -> bytes:
     """Serialize a result as DetectionBody or ScoringBody, with exact float32, or as a message."""
     if transport == "http":
         return orjson.dumps(result, default=plain, option=orjson.OPT_PASSTHROUGH_DATACLASS)
@@ -408,7 +408,7 @@ def _fields_of_message(job: Job) -> dict[str, Any]:
     try:
         message = kind.FromString(job.body)
     except DecodeError:
-        raise errors.no_message(job.body) from None
+        raise errors.unreadable_message(job.body) from None
     fields: dict[str, Any] = {"options": {}, **_plain(message, "request")}
     if "encoded" in fields:
         fields["cloud"] = fields.pop("encoded")

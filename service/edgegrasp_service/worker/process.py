@@ -1,7 +1,7 @@
 """Worker processes as the front sees them: their messages, and the pool that runs jobs in them.
 
-`WorkerPool` runs jobs, replaces dead processes and reloads. Its workers are forked by a `Nursery`,
-a process that runs `nursery.py`. A message consists of plain values as JSON and a body as bytes.
+`WorkerPool` runs jobs, replaces dead processes and reloads. A `ForkServer`, a process that runs
+`fork_server.py`, forks its workers. A message is plain values as JSON and a body as bytes.
 """
 
 import asyncio
@@ -27,7 +27,7 @@ from edgegrasp_service import errors
 from edgegrasp_service.settings import Settings
 
 # -P: nothing is imported from the folder the server was started in.
-NURSERY_COMMAND = (sys.executable, "-P", "-m", "edgegrasp_service.worker.nursery")
+FORK_SERVER_COMMAND = (sys.executable, "-P", "-m", "edgegrasp_service.worker.fork_server")
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 # Freed memory is kept for the next request: the system hands out new pages slowly.
 KEPT_MEMORY = {"MALLOC_TRIM_THRESHOLD_": str(2**26), "MALLOC_MMAP_THRESHOLD_": str(2**24)}
@@ -36,12 +36,12 @@ MAX_DEATHS = 3  # dead workers after which a request is refused; a crash counts 
 CRASH_SIGNALS = {signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL}
 STATUS_SECONDS = 1.0  # seconds to learn how a worker ended
 START_SECONDS = 20.0  # seconds for a worker to fork, if it need not load
-BEAT_SECONDS = 3.0  # seconds between two checks that a worker is alive
-PULSE_SECONDS = 10.0  # seconds for the worker to answer the check
+HEARTBEAT_SECONDS = 3.0  # seconds between two checks that a worker is alive
+HEARTBEAT_TIMEOUT = 10.0  # seconds for the worker to answer the check
 KILL_SECONDS = 0.5  # seconds that a worker may use to finish an abandoned job
-RETRY_SECONDS = 1.0  # seconds after a worker or the nursery failed to start
+RETRY_SECONDS = 1.0  # seconds after a worker or the fork server failed to start
 
-ENDED = struct.Struct("=ii")  # the nursery's message about a worker: process id and wait status
+ENDED = struct.Struct("=ii")  # the fork server's message about a worker: process id and wait status
 LOST = "The worker of this request died or ran out of memory. Try again, or send fewer points."
 MESSAGE_HEADER = struct.Struct(">QQ")  # bytes of a message's JSON, and of the body that follows it
 PIECE_BYTES = 2**16  # bytes of a body that the front reads or writes at a time
@@ -90,7 +90,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Ready:
-    """The first message of the nursery and of each worker."""
+    """The first message of the fork server and of each worker."""
 
     pid: int
     models: list[dict[str, Any]]  # the catalogue's description of its weights; from workers
@@ -162,16 +162,16 @@ class WorkerPool:
         self,
         settings: Settings,
         replaced: Callable[[], None],  # called for each worker that died
-        nursery: "Nursery | None",  # one that is already loading
+        fork_server: "ForkServer | None",  # one that is already loading
     ) -> None:
         self._settings = settings
-        self.command: Sequence[str] = ()  # in place of NURSERY_COMMAND
+        self.command: Sequence[str] = ()  # in place of FORK_SERVER_COMMAND
         self._replaced = replaced
-        self._launched = nursery
+        self._launched = fork_server
         self.models: list[dict[str, Any]] = []  # facts of loaded weights; empty before `start`
         self.robots: list[dict[str, Any]] = []
         self.size = settings.workers or len(os.sched_getaffinity(0))
-        self._nursery: Nursery | None = None
+        self._fork_server: ForkServer | None = None
         self._workers: set[_Worker] = set()
         # Last in, first out: the caches of the latest worker are warm.
         self._idle: asyncio.LifoQueue[_Worker] = asyncio.LifoQueue()
@@ -192,29 +192,29 @@ class WorkerPool:
 
         Raises EdgeGraspError if the weights cannot be used.
         """
-        nursery = self._launched or Nursery(self._settings, self.command)
+        fork_server = self._launched or ForkServer(self._settings, self.command)
         self._launched = None
-        workers = [_Worker(nursery) for _ in range(self.size)]
+        workers = [_Worker(fork_server) for _ in range(self.size)]
         try:
-            await nursery.loaded()
+            await fork_server.wait_until_loaded()
             await asyncio.gather(*(worker.start() for worker in workers))
         except BaseException:
-            nursery.close()
+            fork_server.close()
             for worker in workers:
                 worker.close()
             raise
-        old_nursery, old_workers = self._nursery, self._workers
-        self._nursery, self._workers = nursery, set(workers)
+        old_fork_server, old_workers = self._fork_server, self._workers
+        self._fork_server, self._workers = fork_server, set(workers)
         while not self._idle.empty():
             self._idle.get_nowait()
         self.models, self.robots = workers[0].ready.models, workers[0].ready.robots
-        self.spawn(self._watch(nursery))
+        self.spawn(self._watch(fork_server))
         for worker in workers:
             self.spawn(self._tend(worker))
-        if old_nursery is None:
+        if old_fork_server is None:
             self.spawn(self._beat())
         else:
-            old_nursery.close()
+            old_fork_server.close()
         for worker in old_workers:
             if worker.answer is None:  # the others finish their current job
                 worker.close()
@@ -239,17 +239,17 @@ class WorkerPool:
         for worker in list(self._workers):
             worker.kill()
             worker.close()
-        if self._nursery is not None:
-            self._nursery.close()
+        if self._fork_server is not None:
+            self._fork_server.close()
 
     async def _beat(self) -> None:
         """Check regularly that an idle worker answers; one that does not is killed."""
         while True:
-            await asyncio.sleep(BEAT_SECONDS)
+            await asyncio.sleep(HEARTBEAT_SECONDS)
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(PULSE_SECONDS):
+                async with asyncio.timeout(HEARTBEAT_TIMEOUT):
                     worker, beat = await self.take(), Job("Beat", "http", b"", 0.0)
-                    await worker.run(beat, time.monotonic() + PULSE_SECONDS)
+                    await worker.run(beat, time.monotonic() + HEARTBEAT_TIMEOUT)
 
     async def _tend(self, worker: "_Worker") -> None:
         """Offer a worker for jobs until it dies, then replace it."""
@@ -267,65 +267,67 @@ class WorkerPool:
                 if answer.facts.deaths:
                     worker.kill()  # it ran out of memory: its state cannot be trusted
             self._workers.discard(worker)  # `take` skips it
-            if await worker.nursery.crashed(worker.ready.pid):
+            if await worker.fork_server.crashed(worker.ready.pid):
                 deaths = MAX_DEATHS
         finally:
             error = errors.WorkerLost(LOST) if deaths < MAX_DEATHS else errors.HarmfulRequest()
-            worker.finish(Answer(b"", Facts(deaths=deaths), errors.report(error)))
+            worker.finish(Answer(b"", Facts(deaths=deaths), errors.to_problem(error)))
             worker.close()
-        if worker.nursery is self._nursery:
+        if worker.fork_server is self._fork_server:
             logger.warning("worker %d died and is replaced", worker.ready.pid)
             self._replaced()
-            await self._until_done(worker.nursery, lambda: self._replace(worker.nursery))
+            await self._until_done(worker.fork_server, lambda: self._replace(worker.fork_server))
 
-    async def _replace(self, nursery: "Nursery") -> None:
-        worker = _Worker(nursery)
+    async def _replace(self, fork_server: "ForkServer") -> None:
+        worker = _Worker(fork_server)
         try:
             async with asyncio.timeout(START_SECONDS if self._settings.device == "cpu" else None):
                 await worker.start()
         except TimeoutError:  # it is stopped or hangs; its death is handled like any other
             worker.close()
-            nursery.close()
+            fork_server.close()
             why = "the process that workers fork from does not answer"
             raise errors.InvalidSettings(why) from None
         except BaseException:
             worker.close()
             raise
-        if nursery is self._nursery:
+        if fork_server is self._fork_server:
             self._workers.add(worker)
         self.spawn(self._tend(worker))
 
-    async def _until_done(self, nursery: "Nursery", start: Callable[[], Awaitable[None]]) -> None:
-        """Retry a start until it succeeds or there is a newer nursery."""
-        while nursery is self._nursery:
+    async def _until_done(
+        self, fork_server: "ForkServer", start: Callable[[], Awaitable[None]]
+    ) -> None:
+        """Retry a start until it succeeds or there is a newer fork server."""
+        while fork_server is self._fork_server:
             try:
                 return await start()
             except (EdgeGraspError, OSError) as error:
                 logger.error("a dead process cannot be replaced yet: %s", error)
                 await asyncio.sleep(RETRY_SECONDS)
 
-    async def _watch(self, nursery: "Nursery") -> None:
-        """When a nursery dies, load the weights again in a new one; the workers go on meanwhile."""
-        await nursery.watch()
-        if nursery is self._nursery:
+    async def _watch(self, fork_server: "ForkServer") -> None:
+        """When a fork server dies, load the weights in a new one; the workers go on meanwhile."""
+        await fork_server.watch()
+        if fork_server is self._fork_server:
             logger.error("the process that workers fork from died; weights are loaded again")
-            await self._until_done(nursery, self.start)
+            await self._until_done(fork_server, self.start)
 
 
-class Nursery:
+class ForkServer:
     """The process that loads the weights, then forks workers; `command` replaces its command."""
 
     def __init__(self, settings: Settings, command: Sequence[str] = ()) -> None:
         self._control, theirs = socket.socketpair()
         with theirs:
             environment = KEPT_MEMORY | os.environ | dict.fromkeys(ONE_THREAD, "1")
-            words = [*(command or NURSERY_COMMAND), settings.model_dump_json()]
+            words = [*(command or FORK_SERVER_COMMAND), settings.model_dump_json()]
             self._process = subprocess.Popen(words, stdin=theirs.fileno(), env=environment)
         self._writer: asyncio.StreamWriter | None = None  # once it has loaded
         # By process id of an ended worker: whether it crashed or exited, not killed by the pool.
         self._crashed: defaultdict[int, asyncio.Future[bool]] = defaultdict(asyncio.Future)
 
-    async def loaded(self) -> None:
+    async def wait_until_loaded(self) -> None:
         """Wait until it has loaded; raises InvalidSettings on failure."""
         self._reader, self._writer = await asyncio.open_unix_connection(sock=self._control)
         self.pid = (await _ready(self._reader)).pid
@@ -351,7 +353,7 @@ class Nursery:
         socket.send_fds(self._control, [b"w"], [its_end.fileno()])
 
     def close(self) -> None:
-        """Kill the nursery, even if it is stopped; `watch` notices, and its workers continue."""
+        """Kill the fork server, even if it is stopped; `watch` notices; its workers continue."""
         self._process.kill()
         self._process.wait()
         (self._writer or self._control).close()
@@ -360,8 +362,8 @@ class Nursery:
 class _Worker:
     """One worker process, at the other end of a socket."""
 
-    def __init__(self, nursery: Nursery) -> None:
-        self.nursery = nursery
+    def __init__(self, fork_server: ForkServer) -> None:
+        self.fork_server = fork_server
         self.ready = Ready(0, [])  # the message that it sent when it had loaded
         self.answer: asyncio.Future[Answer] | None = None  # of the job that it works on
         self._writer: asyncio.StreamWriter | None = None
@@ -372,7 +374,7 @@ class _Worker:
         ours, theirs = socket.socketpair()
         with theirs:
             self.reader, self._writer = await asyncio.open_unix_connection(sock=ours)
-            self.nursery.fork(theirs)
+            self.fork_server.fork(theirs)
         self.ready = await _ready(self.reader)
 
     async def run(self, job: Job, deadline: float) -> Answer:

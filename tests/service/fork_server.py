@@ -1,6 +1,6 @@
 """The processes that test servers' workers fork from: dummies whose stages wait and fail as told.
 
-usage: nursery.py SOCKET    import everything once, then fork a nursery for each that asks there
+usage: fork_server.py SOCKET    import everything once, then fork a fork server per request
 """
 
 import contextlib
@@ -20,15 +20,15 @@ from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, UnknownModel
 from edgegrasp_service import errors
 from edgegrasp_service.errors import Overloaded, kind_of
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker import answer as answer  # what a nursery imports
-from edgegrasp_service.worker.nursery import main
+from edgegrasp_service.worker import answer as answer  # what a fork server imports
+from edgegrasp_service.worker.fork_server import main
 
 PATIENCE = 20  # seconds; longer than anything takes
 FOLDER = Path()  # what a test writes into it tells what happens
 
 
-def fork_nurseries(path: str) -> None:
-    """Who asks sends the socket of its pool, a folder and settings; its nursery ends with it."""
+def fork_fork_servers(path: str) -> None:
+    """A client sends its pool's socket, a folder and settings; its fork server ends with it."""
     global FOLDER
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     listening = socket.socket(socket.AF_UNIX)
@@ -144,4 +144,4 @@ def load(settings: Settings) -> Catalogue:
 
 
 if __name__ == "__main__":
-    fork_nurseries(sys.argv[1])
+    fork_fork_servers(sys.argv[1])

@@ -50,8 +50,8 @@ class Load(NamedTuple):
         return cut / 2, self.half - (0.0, 0.0, cut / 2)
 
 
-class Surroundings(NamedTuple):
-    """What is around a robot."""
+class ArmObstacles(NamedTuple):
+    """What an arm must not touch."""
 
     own: set[int]  # numbers of objects that are the arm itself, as the camera sees it
     boxes: list[Obstacle]  # the support and the request's obstacles
@@ -67,27 +67,27 @@ class Surroundings(NamedTuple):
         cells[:, :3] = self.voxels
         return [*self.boxes, ("the cloud", core.OcTree(list(cells), VOXEL_SIZE), np.eye(4))]
 
-    def without(self, load: Load) -> "Surroundings":
-        """The surroundings without a load that is taken away."""
-        inside = np.abs(moved(np.linalg.inv(load.T_base_box), self.voxels)) < load.half
+    def without(self, load: Load) -> "ArmObstacles":
+        """The obstacles without a load that is taken away."""
+        inside = np.abs(transform(np.linalg.inv(load.T_base_box), self.voxels)) < load.half
         near = cKDTree(load.points).query(self.voxels, distance_upper_bound=NEAR_HELD)[0]
         own = inside.all(axis=1) | (near <= NEAR_HELD)
         return self._replace(voxels=self.voxels[~own])
 
 
 @contextmanager
-def carrying(
-    robot: Robot, around: Surroundings, load: Load, T_base_hand: Floats
+def scene_with_load(
+    robot: Robot, obstacles: ArmObstacles, load: Load, T_base_hand: Floats
 ) -> Iterator[core.Scene]:
     """A scene in which the hand holds a load as at the grasp, without its foot, which may touch."""
-    scene, (off, half) = robot.carrying, load.above_its_foot
+    scene, (off, half) = robot.carrying_scene, load.above_its_foot
     # The planner expects the pose in the frame of the joint that carries the flange.
     T_base_joint = scene.forwardKinematics(robot.home, robot.joint_names[-1], robot.base_frame)
-    T_joint_hand = np.linalg.inv(T_base_joint) @ robot.hand_pose(robot.home)
+    T_joint_hand = np.linalg.inv(T_base_joint) @ robot.forward_kinematics(robot.home)
     T_joint_box = T_joint_hand @ np.linalg.inv(T_base_hand) @ load.T_base_box
     T_joint_box[:3, 3] += off * T_joint_box[:3, 2]
     pose, box = np.asfortranarray(T_joint_box), core.Box(*(2 * half))
-    with _standing_in([scene], robot, around.all()):
+    with _standing_in([scene], robot, obstacles.all()):
         scene.addBoxGeometry(HELD_NAME, robot.flange_frame, box, pose, GREY)
         scene.setCollisions(HELD_NAME, HAND, False)
         try:
@@ -98,19 +98,19 @@ def carrying(
 
 
 @contextmanager
-def surrounded(
+def arm_obstacles(
     robot: Robot,
     scene: Scene,  # what the camera's cloud shows
-    asked: RobotArm,  # where the robot is
+    robot_option: RobotArm,  # where the robot is
     boxes: Sequence[Box | OrientedBox],  # obstacles in addition to the cloud, cloud frame
-) -> Iterator[Surroundings]:
-    """Add the surroundings to the robot's scenes, and remove them afterwards; yields them.
+) -> Iterator[ArmObstacles]:
+    """Add the obstacles to the robot's scenes, and remove them afterwards; yields them.
 
     The hand may touch them in `robot.straight`, since the detection has checked it there.
     InvalidRequest: the start is in collision, or the base stands inside an object.
     """
-    joints = np.array(asked.joints)
-    T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
+    joints = np.array(robot_option.joints)
+    T_base_cloud = np.reshape(robot_option.T_base_cloud, (4, 4))
     own = _own_objects(robot, joints, scene, T_base_cloud)
     known: list[Obstacle] = []
     for row, (T_cloud_box, half) in enumerate(map(box_pose, boxes)):
@@ -123,22 +123,22 @@ def surrounded(
         known.append(("the support", *_slab(support, scene.readings, T_base_cloud)))
     voxels = _voxels(support, scene.readings, T_base_cloud)
     voxels = voxels[~_near_robot(robot, joints, voxels, SELF_DISTANCE)]
-    if asked.avoid_unseen:
-        hidden = _hidden(support, voxels, in_base.points(scene.viewpoints))
+    if robot_option.avoid_unseen:
+        hidden = _hidden(support, voxels, in_base.points_from_cloud(scene.viewpoints))
         hidden = hidden[~_near_robot(robot, joints, hidden, SELF_DISTANCE)]
         voxels = np.concatenate([voxels, hidden])
-    around = Surroundings(own, known, voxels)
-    obstacles = around.all()
+    found = ArmObstacles(own, known, voxels)
+    obstacles = found.all()
     names = [name for name, _, _ in obstacles]
-    with _standing_in([robot.scene, robot.straight], robot, obstacles):
-        robot.straight.setCollisions([(HAND, name) for name in names], False)
+    with _standing_in([robot.scene, robot.straight_scene], robot, obstacles):
+        robot.straight_scene.setCollisions([(HAND, name) for name in names], False)
         if robot.scene.hasCollisions(joints):
             again = robot.model.scene(robot)
             with _standing_in([again], robot, obstacles):
                 pair = touching(again, robot.model, joints, names)
             fix = "Send the actual joints and T_base_cloud, and obstacles in the cloud's frame."
             raise StartCollision("options.robot.joints", f"a start where {pair} touch", fix)
-        yield around
+        yield found
 
 
 @contextmanager
@@ -172,7 +172,7 @@ def _slab(support: SupportPlane, points: Floats, T_base_cloud: Float64) -> tuple
     upright = Rotation.align_vectors([support.normal], [[0.0, 0.0, 1.0]])[0].as_matrix()
     size, middle = np.array(SUPPORT_SIZE), np.zeros(3)
     if -support.offset < LOW_BASE:
-        seen = moved(T_base_cloud, points)
+        seen = transform(T_base_cloud, points)
         seen = seen[np.abs(heights_over(support, seen)) < VOXEL_SIZE]
         if len(seen):
             low, high = np.percentile(seen @ upright[:, :2], (0.5, 99.5), axis=0)
@@ -185,7 +185,7 @@ def _own_objects(robot: Robot, joints: Float64, scene: Scene, T_base_cloud: Floa
     """Numbers of detected objects that are the arm itself."""
     of_object = scene.object_of_point >= 0
     number = scene.object_of_point[of_object]
-    objects = moved(T_base_cloud, scene.points_in_cloud[of_object])
+    objects = transform(T_base_cloud, scene.points_in_cloud[of_object])
     near = _near_robot(robot, joints, objects, SELF_DISTANCE)
     within = _near_robot(robot, joints, objects, VOXEL_SIZE / 2)
     own: set[int] = set()
@@ -203,7 +203,7 @@ def _near_robot(robot: Robot, joints: Float64, points: Float64, distance: float)
     """Which points (N, 3) of the base frame lie within a distance of the robot, (N,)."""
     T_root_base = robot.scene.forwardKinematics(joints, robot.base_frame)
     options = core.RobotBodyFilterOptions(distance, num_threads=1)
-    placed = np.ascontiguousarray(moved(T_root_base, points))
+    placed = np.ascontiguousarray(transform(T_root_base, points))
     return core.RobotBodyFilter(robot.scene, options).computeMask(joints, placed)
 
 
@@ -258,6 +258,6 @@ def _centers(*groups: Floats, shifts: Sequence[float] = (0.0,)) -> Float64:
     return np.asarray((np.argwhere(common) + corner.T + 0.5) * VOXEL_SIZE)
 
 
-def moved(T_b_a: Floats, points: ArrayLike) -> Float64:
+def transform(T_b_a: Floats, points: ArrayLike) -> Float64:
     """Points (N, 3) of frame a in frame b."""
     return np.asarray(np.asarray(points, np.float64) @ T_b_a[:3, :3].T + T_b_a[:3, 3])

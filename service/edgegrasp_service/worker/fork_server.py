@@ -1,7 +1,7 @@
-"""The nursery, the process that workers are forked from, and the loop of a worker.
+"""The fork server, the process that workers are forked from, and the loop of a worker.
 
-usage: python -m edgegrasp_service.worker.nursery SETTINGS    as JSON; standard input: the pool's
-socket
+usage: python -m edgegrasp_service.worker.fork_server SETTINGS    as JSON; standard input: the
+pool's socket
 
 It imports and loads what a worker needs, then forks a worker whenever the pool asks for one; that
 takes milliseconds, and memory is shared until written to. It never has a second thread.
@@ -48,9 +48,9 @@ def main(settings_json: str, load: Callable[[Settings], Any] | None = None) -> N
     pool, settings = socket.socket(fileno=0), Settings(**json.loads(settings_json))
     load = load or load_catalogue
     # A GPU's context cannot be forked: with one, every worker loads the weights for itself.
-    catalogue = _loaded(pool, settings, load) if settings.device == "cpu" else None
+    catalogue = _load_or_exit(pool, settings, load) if settings.device == "cpu" else None
     send(pool, Ready(os.getpid(), []))
-    signal.signal(signal.SIGCHLD, lambda *_: _tell_of_ended(pool))
+    signal.signal(signal.SIGCHLD, lambda *_: _report_exits(pool))
     gc.freeze()  # collecting garbage would write to shared pages
     while True:
         _, descriptors, _, _ = socket.recv_fds(pool, 1, 1)
@@ -68,13 +68,13 @@ def main(settings_json: str, load: Callable[[Settings], Any] | None = None) -> N
         os.close(descriptors[0])
 
 
-def _tell_of_ended(pool: socket.socket) -> None:
+def _report_exits(pool: socket.socket) -> None:
     with contextlib.suppress(OSError):  # no children are left
         while (ended := os.waitpid(-1, os.WNOHANG))[0]:
             pool.send(ENDED.pack(*ended), socket.MSG_DONTWAIT)
 
 
-def _loaded(pool: socket.socket, settings: Settings, load: Callable[[Settings], Any]) -> Any:
+def _load_or_exit(pool: socket.socket, settings: Settings, load: Callable[[Settings], Any]) -> Any:
     """Load what answers requests; if that fails, tell the pool why and end this process."""
     try:
         return load(settings)
@@ -90,7 +90,7 @@ def _work(
     """Answer jobs, one after another, until the pool closes the socket."""
     from edgegrasp_service.worker.answer import answer, load_robots
 
-    catalogue = catalogue or _loaded(pool, settings, load)
+    catalogue = catalogue or _load_or_exit(pool, settings, load)
     robots = [robot.describe() for robot in load_robots(settings).values()]
     with limited_memory(settings.max_worker_bytes):
         send(pool, Ready(os.getpid(), catalogue.describe(), robots=robots))
@@ -101,7 +101,7 @@ def _work(
                 found = answer(job, catalogue, settings)
             except BaseException:  # out of memory
                 facts = Facts(traceback=traceback.format_exc(), deaths=1)
-                send(pool, Answer(b"", facts, errors.report(errors.WorkerLost(LOST))))
+                send(pool, Answer(b"", facts, errors.to_problem(errors.WorkerLost(LOST))))
                 return
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             send(pool, found)

@@ -1,6 +1,6 @@
-"""The surroundings of a scene's objects: a table, an open bin, a crowded table, or a shelf.
+"""The fixed parts of a scene: a table, an open bin, a crowded table, or a shelf.
 
-The surroundings never move. The plane that the objects rest on is at `TABLE_HEIGHT` in every scene.
+They never move. The plane that the objects rest on is at `TABLE_HEIGHT` in every scene.
 """
 
 from dataclasses import dataclass
@@ -69,7 +69,7 @@ class Box:
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class FixedParts:
     """The fixed parts of a scene, and the region of its objects."""
 
     boxes: tuple[Box, ...]  # all fixed parts
@@ -83,7 +83,7 @@ class Surroundings:
         added = [(box.add_to(world).uid, box) for box in self.boxes]
         return frozenset(uid for uid, box in added if box.obstacle)
 
-    def contain(self, body: Body) -> bool:
+    def contains(self, body: Body) -> bool:
         """Whether an object is within the bounds."""
         low, high = np.asarray(self.bounds)
         return bool(((low <= body.position) & (body.position <= high)).all())
@@ -94,16 +94,16 @@ def _slab(size: Vector, top: float, x: float = MIDDLE, y: float = MIDDLE) -> Box
     return Box((length, width, height), (x, y, top - height / 2), obstacle=False)
 
 
-def open_table(thickness: float = OPEN_THICKNESS) -> Surroundings:
+def open_table(thickness: float = OPEN_THICKNESS) -> FixedParts:
     """A table without other parts, of a thickness in metres."""
     table = _slab((OPEN_EXTENT, OPEN_EXTENT, thickness), TABLE_HEIGHT)
-    return Surroundings((table,), WORKSPACE, ((0.0, 0.0, 0.0), (SIZE, SIZE, np.inf)))
+    return FixedParts((table,), WORKSPACE, ((0.0, 0.0, 0.0), (SIZE, SIZE, np.inf)))
 
 
 OPEN_TABLE = open_table()
 
 
-def random_bin(rng: np.random.Generator, extents: Spans = BIN_INSIDE) -> Surroundings:
+def random_bin(rng: np.random.Generator, extents: Spans = BIN_INSIDE) -> FixedParts:
     """An open box of inner `extents` on or above a table, with its floor at `TABLE_HEIGHT`."""
     length, width, height = (rng.uniform(*extent) for extent in extents)
     wall = rng.uniform(*BIN_WALL)
@@ -118,10 +118,10 @@ def random_bin(rng: np.random.Generator, extents: Spans = BIN_INSIDE) -> Surroun
         boxes.append(Box((wall, 2 * float(outer[1]), height), (float(x), MIDDLE, z)))
         boxes.append(Box((length, wall, height), (MIDDLE, float(y), z)))
     top = TABLE_HEIGHT + height + HEAP
-    return Surroundings(tuple(boxes), _corners(half, BOTTOM, top), _corners(half, 0.0, top))
+    return FixedParts(tuple(boxes), _corners(half, BOTTOM, top), _corners(half, 0.0, top))
 
 
-def random_table(rng: np.random.Generator) -> Surroundings:
+def random_table(rng: np.random.Generator) -> FixedParts:
     """A table with an edge near the objects, a floor below, and one to three large objects."""
     over = float(rng.uniform(*TABLE_OVER_FLOOR))
     size = rng.uniform(*TABLE_LENGTH, size=2)
@@ -133,10 +133,10 @@ def random_table(rng: np.random.Generator) -> Surroundings:
     boxes += [_large_object(rng) for _ in range(large)]
     half = np.full(2, REACH + 0.05)
     workspace = _corners(half, BOTTOM, TABLE_HEIGHT + 0.30)
-    return Surroundings(tuple(boxes), workspace, _corners(half, 0.0, np.inf))
+    return FixedParts(tuple(boxes), workspace, _corners(half, 0.0, np.inf))
 
 
-def random_shelf(rng: np.random.Generator) -> Surroundings:
+def random_shelf(rng: np.random.Generator) -> FixedParts:
     """A shelf's compartment, open toward -y, with its floor at `TABLE_HEIGHT`; another is above."""
     width, depth, height = (float(rng.uniform(*extent)) for extent in SHELF_INSIDE)
     board, over = float(rng.uniform(*SHELF_BOARD)), float(rng.uniform(*SHELF_OVER_FLOOR))
@@ -149,7 +149,7 @@ def random_shelf(rng: np.random.Generator) -> Surroundings:
     back = Box((width + 2 * board, board, tall), (MIDDLE, MIDDLE + (depth + board) / 2, middle))
     ceiling = Box((width, depth, board), (MIDDLE, MIDDLE, TABLE_HEIGHT + height + board / 2))
     half, top = np.array([width, depth]) / 2, TABLE_HEIGHT + height
-    return Surroundings(
+    return FixedParts(
         (*boxes, back, ceiling),
         _corners(half, BOTTOM, top),
         _corners(half, TABLE_HEIGHT, top),

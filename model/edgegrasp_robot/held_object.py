@@ -16,7 +16,7 @@ from edgegrasp_model.scene.obstacles import SolidBoxes, box_pose, near_pairs, se
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.support import heights_over
 from edgegrasp_results import DetectedObject, Grasp
-from edgegrasp_robot.surroundings import FOOT_HEIGHT, VOXEL_SIZE, Load, moved
+from edgegrasp_robot.obstacles import FOOT_HEIGHT, VOXEL_SIZE, Load, transform
 
 WAY_STEP = 0.005  # metres between the positions that are checked
 TOUCHING = 0.01  # metres; points nearer to the held object already touch it
@@ -29,31 +29,31 @@ TURNS_IN_REGION = 8  # of an object about the vertical, in a region
 PLACE_SHARES = (0.0, -0.5, 0.5, -1.0, 1.0)  # of the free space in a region, to each side
 
 
-class Held(NamedTuple):
+class HeldPoints(NamedTuple):
     """What a grasp holds, cloud frame."""
 
     points: Float64  # (H, 3) points of its object and points between the fingers
     others: Float64  # (V, 3) points that it does not already touch
 
 
-def held_by(grasp: Grasp, scene: Scene, gripper: Gripper) -> Held:
+def held_points(grasp: Grasp, scene: Scene, gripper: Gripper) -> HeldPoints:
     """The points of the object that a grasp is on, and those between the fingers."""
     points = scene.points_in_cloud.astype(np.float64)
     T_hand_cloud = np.linalg.inv(grasp.T_cloud_hand.astype(np.float64))
-    held = gripper.between_fingers(moved(T_hand_cloud, points).T)
+    held = gripper.between_fingers(transform(T_hand_cloud, points).T)
     if grasp.object is not None:
         held |= scene.object_of_point == grasp.object
     if not held.any():
-        return Held(points[held], points)
+        return HeldPoints(points[held], points)
     own = points[held]
     low, high = own.min(axis=0) - TOUCHING, own.max(axis=0) + TOUCHING
     near = ((points > low) & (points < high)).all(axis=1)
     near[near] = cKDTree(own).query(points[near], distance_upper_bound=TOUCHING)[0] <= TOUCHING
-    return Held(own, points[~near])
+    return HeldPoints(own, points[~near])
 
 
 def can_leave(
-    held: Held,
+    held: HeldPoints,
     scene: Scene,
     way: Floats,  # (3,) metres, cloud frame
     collision: Collision,  # obstacles in addition to the cloud
@@ -75,7 +75,7 @@ def can_leave(
             return False
         for T_cloud_box, half in map(box_pose, collision.obstacles):
             T_box_cloud = np.linalg.inv(T_cloud_box.astype(np.float64))
-            if (np.abs(moved(T_box_cloud, there)) < half).all(axis=1).any():
+            if (np.abs(transform(T_box_cloud, there)) < half).all(axis=1).any():
                 return False
     return True
 
@@ -84,11 +84,11 @@ def _lowest(scene: Scene, points: Float64) -> float:
     """Height of the lowest of points (N, 3), cloud frame, over the support; 0 without a support."""
     if scene.support is None:
         return 0.0
-    return float(heights_over(scene.support, scene.frame.points(points)).min())
+    return float(heights_over(scene.support, scene.frame.points_from_cloud(points)).min())
 
 
-def load_of(
-    held: Held, seen: DetectedObject | None, scene: Scene, T_base_cloud: Float64
+def build_load(
+    held: HeldPoints, seen: DetectedObject | None, scene: Scene, T_base_cloud: Float64
 ) -> Load | None:
     """The upright box of what is held: that of its object, else of its points; None: no points."""
     if not len(held.points):
@@ -97,13 +97,13 @@ def load_of(
         T_cloud_box = pose_matrix(Rotation.from_quat(seen.quaternion).as_matrix(), seen.center)
         half = seen.half_extents.astype(np.float64)
     else:
-        upright = scene.frame.points(held.points)
+        upright = scene.frame.points_from_cloud(held.points)
         low, high = upright.min(axis=0), upright.max(axis=0)
         T_scene_box, half = pose_matrix(np.eye(3), (low + high) / 2), (high - low) / 2
         T_cloud_box = np.linalg.inv(scene.frame.T_canonical_cloud) @ T_scene_box
     foot = _lowest(scene, (T_cloud_box[:3, 3] - half[2] * T_cloud_box[:3, 2])[None])
     below = foot if scene.support is not None and 0.0 < foot < MAX_HIDDEN_FOOT else 0.0
-    return Load(moved(T_base_cloud, held.points), T_base_cloud @ T_cloud_box, half, below)
+    return Load(transform(T_base_cloud, held.points), T_base_cloud @ T_cloud_box, half, below)
 
 
 def places_for(
@@ -119,19 +119,19 @@ def places_for(
     It must not touch voxels or obstacles, and its foot must not be pressed into the support.
     """
     T_cloud_base = np.linalg.inv(T_base_cloud)
-    in_box = moved(np.linalg.inv(load.T_base_box), load.points)
+    in_box = transform(np.linalg.inv(load.T_base_box), load.points)
     for pose in _places(place, load):
-        foot = _lowest(scene, moved(T_cloud_base @ pose, in_box)) - load.below
+        foot = _lowest(scene, transform(T_cloud_base @ pose, in_box)) - load.below
         if foot < -RELEASE_HEIGHT:
             if place.region is None or foot < -FOOT_HEIGHT:
                 continue
             pose[2, 3] -= foot  # the region's bottom is slightly too low
         off, half = load.above_its_foot
-        around = np.abs(moved(np.linalg.inv(pose), voxels) - (0.0, 0.0, off))
+        around = np.abs(transform(np.linalg.inv(pose), voxels) - (0.0, 0.0, off))
         if (around < half + VOXEL_SIZE / 2).all(axis=1).any():
             continue
         size = np.maximum(load.half - RELEASE_HEIGHT, 1e-6)
-        box = SolidBoxes.of_hands(pose[None].astype(np.float32), np.array([[-size, size]]))
+        box = SolidBoxes.from_hands(pose[None].astype(np.float32), np.array([[-size, size]]))
         pairs = near_pairs(box, obstacles, 0.0)
         if not any(
             (separation(box.take(near), each, np.zeros(3)) < 0).any() for near, each in pairs
