@@ -86,8 +86,8 @@ async def test_a_fork_server_that_is_stopped_is_replaced(running, cloud, monkeyp
 
 
 async def test_a_worker_that_is_stopped_is_replaced(serve, monkeypatch) -> None:
-    for name, seconds in (("BEAT", 0.2), ("PULSE", 1.0)):
-        monkeypatch.setattr(f"edgegrasp_service.worker.process.{name}_SECONDS", seconds)
+    for name, seconds in (("HEARTBEAT_SECONDS", 0.2), ("HEARTBEAT_TIMEOUT", 1.0)):
+        monkeypatch.setattr(f"edgegrasp_service.worker.process.{name}", seconds)
     running = await serve()
     (before,) = running.server.pool.pids
     os.kill(before, signal.SIGSTOP)

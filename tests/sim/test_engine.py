@@ -52,10 +52,10 @@ def test_the_engine_asked_for_comes_first_then_the_protocol_s_then_what_is_there
 
 DRAW_WHERE_MUJOCO_CAME_FIRST = """
 import mujoco, numpy
-from edgegrasp_sim.engine import Intrinsics, make_world
+from edgegrasp_sim.engine import SimCamera, make_world
 with make_world("mujoco") as world:
     world.add_box((9, 9, 1), (0, 0, 1.5), friction=1)
-    print(world.render_depth(numpy.eye(4), Intrinsics()).min().round(3))
+    print(world.render_depth(numpy.eye(4), SimCamera()).min().round(3))
 """
 
 
