@@ -440,6 +440,26 @@ async def test_large_and_many_metadata_and_compressed_messages_are_refused(serve
     assert await packed.code() is grpc.StatusCode.UNIMPLEMENTED
 
 
+async def test_a_message_far_over_the_limit_is_refused_as_such(serve) -> None:
+    """Without a deadline too, which clients in other languages leave out."""
+    call = (await serve(max_body_bytes=1024)).stub().DetectGrasps
+    reply = call(grasp_pb2.DetectGraspsRequest(points=bytes(3 * 2**20)))
+    assert await reply.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+
+
+def test_grpc_connections_that_were_left_are_closed(start_dummy) -> None:
+    with start_dummy() as server:
+        process = psutil.Process(server.process.pid)
+        before = process.num_fds()
+        for _ in range(300):
+            with connect(server.grpc_address) as connection:
+                connection.sendall(http2_opening())
+                connection.recv(1024)
+                connection.sendall(http2_frame(4, 1, 0, b""))
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        until(lambda: process.num_fds() < before + 10)
+
+
 def test_a_short_soak(tmp_path: Path) -> None:
     """Beside attacks each request comes to something, none to another's; health is answered."""
     command = [sys.executable, "-m", "benchmarks.soak", "--minutes", "0.05", "--clients", "3"]

@@ -5,6 +5,7 @@ from typing import Any
 
 import grpc
 import numpy as np
+import pytest
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 
@@ -125,3 +126,15 @@ async def test_a_stopping_server_answers_what_it_read_and_ends_the_stream(runnin
     for each in (stream, idle):
         assert await each.code() is grpc.StatusCode.UNAVAILABLE
     await running.serving
+
+
+async def test_what_came_before_an_unreadable_message_is_answered(running, cloud) -> None:
+    stream = running.stub().DetectGraspsStream()
+    await running.hold(stream.write(request("read", cloud)))
+    stream._request_serializer = lambda message: message.SerializeToString()
+    await stream.write(grasp_pb2.ErrorDetail(fix="x"))  # a field that the stream lacks
+    await asyncio.sleep(0.2)
+    running.stages.open("evaluate")
+    assert (await stream.read()).request_id == "read"
+    with pytest.raises(grpc.RpcError, match="not a message"):
+        await stream.read()

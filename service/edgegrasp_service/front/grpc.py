@@ -179,7 +179,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                 try:
                     await _abort(call, context, errors.to_problem(error))
                 except aio.InternalError:  # an answer is being sent, and the deadline has passed
-                    if context.time_remaining() is None:
+                    if call.bytes_out and context.time_remaining() is None:
                         _disconnect(self._port, network_of(address), port)
                     raise asyncio.CancelledError from None
 
@@ -211,6 +211,7 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
         service = self._service
         ahead: deque[asyncio.Task[bytes]] = deque()  # unanswered requests
         stopping = asyncio.create_task(service.stopping.wait())
+        unreadable: BaseException | None = None  # raised once earlier requests are answered
         reading: asyncio.Task[Any] | None = asyncio.create_task(_next_request(context))
         try:
             async with self._streams.hold(call.client) as permit:
@@ -231,13 +232,17 @@ class GrpcServer(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic i
                         async with service.sending(len(response)):
                             await context.write(response)
                     elif reading and reading.done():
-                        if (request := reading.result()) is not None:
+                        unreadable = reading.exception()
+                        request = None if unreadable else reading.result()
+                        if request is not None:
                             ahead.append(asyncio.create_task(_answer(service, call, request)))
                         last = request is None or stopping.done()
                         reading = None if last else asyncio.create_task(_next_request(context))
                     elif reading:  # the server is stopping
                         reading.cancel()
                         reading = None
+                if unreadable is not None:
+                    raise unreadable
                 if stopping.done():
                     raise errors.NotReady(errors.STOPPING_MESSAGE)
         finally:
