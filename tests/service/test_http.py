@@ -2,6 +2,8 @@
 
 import asyncio
 import re
+import time
+from contextlib import suppress
 from functools import partial, reduce
 from typing import Any
 
@@ -94,6 +96,31 @@ def test_what_is_no_good_request_is_told_why(dummy_server, data: bytes, status: 
     assert b"content-type: application/problem+json" in head
     assert b"connection: close" in head
     assert b'"status":%d' % status in body
+
+
+def test_trailers_of_a_body_are_bounded(dummy_server) -> None:
+    with connect(dummy_server.http_url) as connection:
+        connection.sendall(POST + b"Transfer-Encoding: chunked\r\n\r\n2\r\n{}\r\n0\r\n")
+        with suppress(ConnectionError):  # it may be closed before all is sent
+            for _ in range(100):
+                connection.sendall(b"a: b\r\n" * 1_000)
+                time.sleep(0.001)
+        assert connection.recv(12) == b"HTTP/1.1 431"
+
+
+def test_headers_in_pieces_may_follow_a_body(dummy_server) -> None:
+    pair = b"Content-Length: 50000\r\n\r\n" + bytes(50_000) + b"GET /he"
+    with connect(dummy_server.http_url) as connection:
+        connection.sendall(POST + pair)
+        time.sleep(0.3)
+        connection.sendall(b"alth/live HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
+        assert connection.recv(12) == b"HTTP/1.1 415"
+
+
+def test_an_upgrade_is_ignored(http) -> None:
+    """Java's HttpClient and curl --http2 ask for one."""
+    asked = {"connection": "Upgrade, HTTP2-Settings", "upgrade": "h2c", "http2-settings": "AAMA"}
+    assert "body: got []" in http.post("/v1/grasps", json=[], headers=asked).text
 
 
 async def test_a_refused_client_that_sends_on_leaves_no_traceback(running, caplog) -> None:

@@ -43,6 +43,7 @@ PAGE_GRACE_SECONDS = 10.0  # seconds after which a page yields its place to anot
 
 ASSETS = "/docs/assets"  # of fastapi_offline
 PLAYGROUND = "/playground/"
+UPGRADE = re.compile(rb"\r\nupgrade:", re.IGNORECASE)  # as Java's HttpClient sends
 PLAYGROUND_FILES = Path(__file__).parents[1] / "playground"
 CONTENT_POLICY = (  # what a page may load, and which sites may embed it
     "default-src 'none'; script-src 'self'{0}; style-src 'self'{0}; img-src 'self' data: blob:; "
@@ -70,6 +71,7 @@ METHODS = {
     "/health/ready": "Ready",
     "/metrics": "Metrics",
     "/": "Docs",
+    PLAYGROUND.rstrip("/"): "Docs",
     "/docs": "Docs",
     "/openapi.json": "Docs",
 }
@@ -324,10 +326,11 @@ class HttpProtocol(HttpToolsProtocol):
             return
         self._header_bytes += len(data)
         self._limiter.use(self._permit, self._permit.idle)
+        if self._header_timer is not None:  # httptools would read no body after this header
+            head, end, rest = data.partition(b"\r\n\r\n")
+            data = UPGRADE.sub(b"\r\nignored:", head) + end + rest
         super().data_received(data)
-        if self._header_timer is None:
-            self._header_bytes = 0
-        elif self._header_bytes > self._settings.max_header_bytes:
+        if self._header_bytes > self._settings.max_header_bytes:  # trailers of a body too
             most = f"Send at most {self._settings.max_header_bytes}."
             self._refuse(errors.HeadersTooLarge("headers", f"{self._header_bytes} bytes", most))
 
@@ -345,6 +348,7 @@ class HttpProtocol(HttpToolsProtocol):
 
     def on_headers_complete(self) -> None:
         """Mark the connection as busy for requests to /v1/."""
+        self._header_bytes = 0
         self._limiter.use(self._permit, idle=not self.url.startswith(b"/v1/"))
         if self._header_timer is not None:
             self._header_timer.cancel()
@@ -353,6 +357,7 @@ class HttpProtocol(HttpToolsProtocol):
 
     def on_body(self, body: bytes) -> None:
         """Refuse bodies in very small chunks."""
+        self._header_bytes = 0
         self._pieces += 1
         self._body_bytes += len(body)
         if self._pieces > MANY_PIECES and self._body_bytes < self._pieces * SMALL_PIECE:
