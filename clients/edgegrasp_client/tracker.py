@@ -36,7 +36,7 @@ class GraspTracker:
         self._objects: dict[int, DetectedObject] = {}
         self._next_id = 0
         self._since = 0  # images since the last search
-        self._score = 0.0  # of the first grasp at the last search
+        self._score = 0.0  # of the first grasp in the first image after the last search
         self._searching = True  # whether the current request searches
         self._reader: threading.Thread | None = None  # of `_images`
         self._images: object = None
@@ -113,7 +113,7 @@ class GraspTracker:
         self._objects |= {one.number: one for one in detection.objects if one.surface is not None}
         if detection.grasps:
             self._last, score = detection, detection.grasps[0].score
-            self._score = score if self._searching else self._score
+            self._score = 0.0 if self._searching else self._score or score
             if score < MIN_SCORE_SHARE * self._score:
                 self._since = self._every
 

@@ -150,7 +150,7 @@ class GraspDetector:
             chosen, given = bool(options.at or options.near), sent.segment_ids is not None
             scene, followed = tracking.follow(scene, previous, given, chosen)
             if options.debug:
-                labels = tracking.relabelled(selected.labels, followed.named)
+                labels = tracking.relabelled(selected, scene, followed, previous.search)
                 selected = replace(selected, labels=labels)
             if previous.search:
                 scene, followed = tracking.only_chosen(scene, followed, choice, warnings)

@@ -4,7 +4,7 @@ Nothing is kept between requests. An answer contains points on the surface of ea
 are sent back, they are registered with the next cloud and the object's grasps move with them.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -30,7 +30,12 @@ from edgegrasp_model.options import (
 from edgegrasp_model.ranking import COLLISION_FACTOR, objects_first, ranked
 from edgegrasp_model.results import OBSTACLE, Following
 from edgegrasp_model.scene.cloud import pose_matrix, subsample, unit
-from edgegrasp_model.scene.scene import Scene, resolve_object_choice
+from edgegrasp_model.scene.scene import (
+    Scene,
+    SelectedPoints,
+    labels_of_all_pixels,
+    resolve_object_choice,
+)
 from edgegrasp_model.scene.segment import BACKGROUND, UNDECIDED
 from edgegrasp_results import Evaluation, Grasp, Tracking
 
@@ -206,6 +211,13 @@ def merged(
         there = zip(old, number, score((move @ before).astype(np.float32), rule), strict=True)
         kept = [replace(e.grasp, id=one.id, object=now) for one, now, e in there if e.grasp]
     if kept:
+        # A new grasp near a followed one is the same grasp; its score is averaged, unlike this one.
+        near, some = options.suppression or Suppression(), [*kept, *found]
+        own = np.array([one.score for one in some], dtype=np.float32)
+        T_cloud_tcp, same = np.stack([one.T_cloud_tcp for one in some]), np.zeros(len(some), int)
+        average = mean_over_similar(own, T_cloud_tcp, same, near.translation, near.rotation)
+        best = np.fmax(own, average).tolist()
+        kept = [replace(one, score=score) for one, score in zip(kept, best, strict=False)]
         ways = scene.frame.directions_from_cloud([one.approach_direction for one in kept])
         fit = allowed_directions(ways, options.approach_direction, scene.frame)
         fit &= np.array([one.score >= options.min_score for one in kept])
@@ -333,9 +345,15 @@ def sampled(points: Float32) -> Float32:
     return points[coarse_to_fine_sample(points, MAX_SURFACE)]
 
 
-def relabelled(labels: Int64, named: Mapping[int, int]) -> Int64:
+def relabelled(selected: SelectedPoints, scene: Scene, followed: Followed, search: bool) -> Int64:
     """Labels (R,) of rows by the answer's object numbers; OBSTACLE where there is none."""
+    labels = selected.labels
     renamed = np.where(labels >= 0, OBSTACLE, labels)
-    for before, now in named.items():
-        renamed[labels == before] = now
-    return renamed
+    if search:
+        for before, now in followed.named.items():
+            renamed[labels == before] = now
+        return renamed
+    # Without a search, everything was one object while the scene was built.
+    rows = np.flatnonzero((labels >= 0) & (scene.point_of_row >= 0))
+    renamed[rows] = np.maximum(scene.object_of_point[scene.point_of_row[rows]], OBSTACLE)
+    return labels_of_all_pixels(selected.cloud, renamed)

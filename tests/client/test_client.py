@@ -285,8 +285,11 @@ def test_a_support_that_is_looked_for_is_the_last_answers_while_it_follows(asked
 def test_after_a_bad_answer_it_looks_for_others_too(bad: Detection) -> None:
     tracker = GraspTracker()
     tracker.options()
-    tracker.take(answer("started"))
-    assert not previous(tracker)["search"]
+    tracker.take(answer("started", score=0.9))
+    for _ in range(2):  # the first score without a search, which may be lower, is the one to keep
+        assert not previous(tracker)["search"]
+        tracker.take(answer(score=0.6))
+    tracker.options()
     tracker.take(bad)
     sent = previous(tracker)
     assert sent["search"]

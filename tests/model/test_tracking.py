@@ -142,6 +142,13 @@ def test_new_ids_are_above_all_that_are_sent(sent: Any) -> None:
     assert following.untracked(late).next_id == 8
 
 
+def test_a_followed_grasp_has_the_score_of_the_same_grasp_found_anew() -> None:
+    """A new grasp's score is averaged over similar hands; a followed one is a single pose."""
+    grasps, tracking = answer([grasp(0.85, 0.001), grasp(0.8, 0.2)], grasp(0.6, 0.0))
+    assert ([one.id for one in grasps], tracking.first) == ([7, 9], "kept")
+    assert grasps[0].score == pytest.approx(0.85)
+
+
 @pytest.mark.parametrize(
     ("gripper", "x", "error"),
     [
