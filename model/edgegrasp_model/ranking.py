@@ -19,6 +19,7 @@ from edgegrasp_model.kernels import mean_over_similar, non_max_suppression
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Outcome, UngraspableReason
 from edgegrasp_model.scene.scene import Scene
+from edgegrasp_model.scene.support import heights_over
 from edgegrasp_model.unseen import leaves_image, unseen_space
 from edgegrasp_results import DebugInfo, DetectedObject, Grasp
 
@@ -230,7 +231,11 @@ def detected_objects(
     objects = []
     for row in np.argsort(-count, kind="stable"):
         which = int(number[row])
-        T_cloud_box, half = _upright_box(scene, scene.object_of_point == which)
+        mine = scene.object_of_point == which
+        T_cloud_box, half, narrowest = _upright_box(scene, mine)
+        height = 2 * half[2]
+        if scene.support is not None:
+            height = heights_over(scene.support, scene.cloud.points[mine]).max()
         turn = Rotation.from_matrix(T_cloud_box[:3, :3])
         good = best.get(which, 0.0) >= GOOD_SCORE
         objects.append(
@@ -242,28 +247,36 @@ def detected_objects(
                 quaternion=turn.as_quat().astype(np.float32),
                 best_score=best.get(which),
                 confidence=scene.confidence.get(which),
-                reason=None if good else _reason(scene, which, 2 * half, sample, score, gripper),
+                reason=None
+                if good
+                else _reason(scene, which, (narrowest, height), sample, score, gripper),
             )
         )
     return objects
 
 
 def _reason(
-    scene: Scene, number: int, size: Float32, sample: Sample | None, score: Floats, gripper: Gripper
+    scene: Scene,
+    number: int,
+    size: tuple[float, float],  # least width seen from above, height over the support; metres
+    sample: Sample | None,
+    score: Floats,
+    gripper: Gripper,
 ) -> UngraspableReason | None:
-    """Why an object with a box of this size (3,), the last upward, has no good grasp."""
+    """Why an object has no good grasp."""
     if sample is None:
         return None
     drawn = scene.object_of_point[sample.drawn.contact_index] == number
     scored = np.flatnonzero(drawn[sample.row])
     if score[scored].max(initial=0.0) >= GOOD_SCORE:
         return None
-    if size[:2].min() > gripper.max_opening:
+    narrowest, height = size
+    if narrowest > gripper.max_opening:
         return UngraspableReason.TOO_WIDE
     outcome = sample.outcome[drawn]
     codes = OUTCOME_CODE[Outcome.SUPPORT], OUTCOME_CODE[Outcome.DIRECTION]
     out_of_reach = np.isin(outcome, codes)
-    if size[2] < FLAT_HEIGHT and out_of_reach.sum() >= len(outcome) / 2:
+    if height < FLAT_HEIGHT and out_of_reach.sum() >= len(outcome) / 2:
         return UngraspableReason.TOO_FLAT
     if not sample.collision_free[scored].any():
         allowed = outcome != OUTCOME_CODE[Outcome.DIRECTION]
@@ -273,8 +286,11 @@ def _reason(
     return UngraspableReason.HIDDEN if hidden.mean() > 0.5 else None
 
 
-def _upright_box(scene: Scene, held: Bools) -> tuple[Float32, Float32]:
-    """Pose T_cloud_box (4, 4) and half extents (3,) of the smallest upright box around points."""
+def _upright_box(scene: Scene, held: Bools) -> tuple[Float32, Float32, float]:
+    """The smallest upright box around points: its pose T_cloud_box (4, 4) and half extents (3,).
+
+    The last value is the points' least width as seen from above, metres.
+    """
     points = scene.cloud.points[held].astype(np.float64)
     corners = plan = points[:, :2]
     with suppress(QhullError, ValueError):  # too few points, or all on a line
@@ -294,7 +310,7 @@ def _upright_box(scene: Scene, held: Bools) -> tuple[Float32, Float32]:
     middle = axes[best].T @ (turned[best].min(axis=0) + size[best] / 2)
     T_canonical_box[:3, 3] = [*middle, (bottom + top) / 2]
     half: Float32 = np.array([*size[best], top - bottom], dtype=np.float32) / np.float32(2)
-    return scene.frame.poses_to_cloud(T_canonical_box), half
+    return scene.frame.poses_to_cloud(T_canonical_box), half, float(size.min())
 
 
 def debug_info(

@@ -390,6 +390,49 @@ def test_an_object_without_a_good_grasp_has_a_reason(size, options, reason) -> N
     assert single.reason == reason
 
 
+@pytest.mark.parametrize("options", [{"approach_direction": {"preset": "side"}}, {}])
+def test_a_high_box_of_which_only_the_top_is_seen_is_not_flat(options) -> None:
+    cloud = box_on_table(3000, size=(0.04, 0.06, 0.10))
+    z = cloud[:, 2]
+    top = cloud[(z > z.max() - 0.002) | (z < z.min() + 0.004)]
+    known = ASKED | {"viewpoint": (0.0, 0.0, 0.9), "objects": "off", "collision": {"margin": 0.05}}
+    (one,) = convinced(-50.0).detect(top, parse_options(known | options)).objects
+    assert one.reason != "too-flat"
+
+
+def test_an_object_that_is_narrow_in_one_direction_is_not_too_wide() -> None:
+    """The smallest rectangle around this triangle is 93 mm wide; its least width is 75 mm."""
+    places = np.random.default_rng(0).uniform(-0.2, 0.2, (40_000, 2))
+    x, y = places.T + np.array([[0.035], [0.04]])
+    top = (x > 0) & (y > 0) & (x / 0.100 + y / 0.115 < 1) & (x < 0.088) & (y < 0.100)
+    cloud = np.column_stack([places, np.where(top, 0.04, 0.0)]).astype(np.float32)
+    known = ASKED | {"viewpoint": (0.0, 0.0, 0.9), "objects": "off", "collision": {"margin": 0.05}}
+    (one,) = convinced(-50.0).detect(cloud, parse_options(known)).objects
+    assert one.reason == "blocked"
+
+
+def test_labels_name_the_followed_objects_without_a_search() -> None:
+    asked, network = {"viewpoint": (0.0, 0.0, 0.0), "debug": True}, convinced(50.0)
+    first = network.detect(rendered.SCENE, parse_options(asked | {"previous": {}}))
+    assert first.support is not None
+    objects = [
+        {"number": one.number, "surface": one.surface.ravel().tolist()}
+        for one in first.objects
+        if one.surface is not None
+    ]
+    best = first.grasps[0]
+    pose = best.T_cloud_hand.ravel().tolist()
+    grasps = [{"id": best.id, "T_cloud_hand": pose, "object": best.object}]
+    previous = {"gripper": "panda", "search": False, "grasps": grasps, "objects": objects}
+    plane = {"normal": first.support.normal.tolist(), "offset": first.support.offset}
+    follow = {"previous": previous, "support": plane, "up": first.up.tolist()}
+    found = network.detect(rendered.SCENE, parse_options(asked | follow))
+    assert found.debug is not None
+    named, count = np.unique(found.debug.labels[found.debug.labels >= 0], return_counts=True)
+    assert {one.number for one in found.objects} == {*named.tolist()} == {0, 1, 2, 3}
+    assert count.min() > 100
+
+
 def hands(places: list[float], turns: list[float]) -> np.ndarray:
     """Upright hands along x, turned about the approach, radians.  # (E, 4, 4)."""
     turned = Rotation.from_euler("z", np.reshape(turns, (-1, 1))).as_matrix()
