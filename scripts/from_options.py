@@ -50,10 +50,13 @@ def document() -> str:
     for model in (DetectOptions, PointCloud2, DepthImage):
         schema = model.model_json_schema(ref_template=f"{SCHEMAS}/{{model}}")
         schemas |= schema.pop("$defs", {}) | {model.__name__: schema}
+    for name, schema in schemas.items():
+        if "kind" in schema.get("properties", ()) and name != "SupportPlane":  # its default
+            schema["required"] = [*schema.get("required", ()), "kind"]
     for form in (schemas[name]["properties"] for name in ("DetectForm", "ScoreForm")):
         camera = schemas["DepthImage"]["properties"]
         form |= {name: camera[name] for name in camera if name != "depth"}
-        form["depth"]["anyOf"] = [{"$ref": f"{SCHEMAS}/File"}, camera["depth"]]
+        form["depth"]["anyOf"] = [{"$ref": f"{SCHEMAS}/FileBytes"}, camera["depth"]]
     found["paths"]["/v1/grasps"]["post"]["parameters"] = [TIMEOUT] + [
         {
             "name": name,

@@ -126,7 +126,7 @@ class PreviousGrasp(TypedDict):
     """A grasp of an earlier answer."""
 
     id: int
-    T_cloud_hand: Numbers
+    T_cloud_hand: Numbers | Sequence[Numbers]
     object: NotRequired[int | None]
 
 
@@ -134,7 +134,7 @@ class PreviousObject(TypedDict):
     """An object of an earlier answer."""
 
     number: int
-    surface: Numbers
+    surface: Numbers | Sequence[Numbers]
     confidence: NotRequired[float | None]
 
 
@@ -220,7 +220,7 @@ class GripperGeometry(TypedDict):
 class Place(TypedDict, total=False):
     """Where the arm puts the object down: in one pose, or anywhere in a region."""
 
-    T_base_object: Numbers | None
+    T_base_object: Numbers | Sequence[Numbers] | None
     region: PlaceRegion | None
 
 
@@ -245,7 +245,7 @@ class RobotArm(TypedDict):
     """The arm that executes the grasp; each grasp in the answer has its joints and motion."""
 
     name: str
-    T_base_cloud: Numbers
+    T_base_cloud: Numbers | Sequence[Numbers]
     joints: Numbers
     plan: NotRequired[Literal["reach", "motion"]]
     place: NotRequired[Place | None]

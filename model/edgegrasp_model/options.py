@@ -444,7 +444,9 @@ def _in_threes(value: Tuple) -> Tuple:
 
 
 RigidPose = Annotated[
-    Matrix, AfterValidator(rigid), BeforeValidator(_row_by_row, json_schema_input_type=Matrix)
+    Matrix,
+    AfterValidator(rigid),
+    BeforeValidator(_row_by_row, json_schema_input_type=Matrix | list[list[float]]),
 ]
 
 
@@ -502,7 +504,7 @@ class PreviousObject(Strict):
     surface: Annotated[
         FlatPoints,
         AfterValidator(_in_threes),
-        BeforeValidator(_row_by_row, json_schema_input_type=FlatPoints),
+        BeforeValidator(_row_by_row, json_schema_input_type=FlatPoints | list[list[float]]),
     ] = Field(description="as in that answer: x, y, z of points on it, one after another, metres")
     confidence: Share | None = Field(default=None, description="as in that answer")
 
@@ -521,7 +523,7 @@ class Previous(Strict):
     """objects of these grasps, and others"""
     search: StrictBool = True
     """whether to detect other grasps too; false: these are only moved and scored again, in a
-    fraction of the time; then also send the `support` of that answer"""
+    fraction of the time; then also send `normal` and `offset` of that answer's `support`"""
 
     @property
     def free_id(self) -> int:

@@ -291,9 +291,9 @@ def options_of_texts(items: Iterable[tuple[str, str]]) -> dict[str, Any]:
 def value_of_text(name: str, text: str) -> object:
     """One value of an option or form part, as `options_of_texts` reads it."""
     field = DetectOptions.model_fields.get(name)
-    if field is not None and field.annotation is str:
+    if field is not None and field.annotation is str and not text.startswith('"'):
         return text  # a model may be named 7 or null
-    if name == "gripper" and not text.startswith(("{", "[")) and text != "null":
+    if name == "gripper" and not text.startswith(("{", "[", '"')) and text != "null":
         return text  # as may grippers
     with suppress(ValueError, RecursionError):
         return json.loads(text, object_pairs_hook=partial(unique_keys, f"options.{name}"))

@@ -1338,7 +1338,7 @@ class Previous(_message.Message):
     """As in that answer."""
     search: _builtins.bool
     """Whether to detect other grasps too; false: these are only moved and scored again, in a fraction
-    of the time; then also send the `support` of that answer.
+    of the time; then also send `normal` and `offset` of that answer's `support`.
     """
     @_builtins.property
     def grasps(self) -> _containers.RepeatedCompositeFieldContainer[Global___PreviousGrasp]:
@@ -2272,7 +2272,9 @@ class Grasp(_message.Message):
     width: _builtins.float
     """Opening to approach with, metres; the hand's maximum if far_side_hidden."""
     collision_free: _builtins.bool
-    """Whether the open hand touches nothing at the grasp and along its approach and retreat."""
+    """Whether the open hand touches nothing at the grasp and along its approach and retreat; that of a
+    followed grasp may overlap the cloud or the support by 6 mm.
+    """
     clearance: _builtins.float
     """Metres from the open hand at the grasp to the nearest surface; less than 0: within it."""
     object: _builtins.int

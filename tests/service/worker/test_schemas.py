@@ -78,6 +78,14 @@ def test_answers(name: str) -> None:
     assert ours == in_grpc == set(in_json["properties"]) == set(in_json["required"])
 
 
+def test_kinds_are_required_and_tokens_described() -> None:
+    for name, schema in SCHEMAS.items():
+        if "kind" in schema.get("properties", ()) and name != "SupportPlane":
+            assert "kind" in schema.get("required", ()), name
+    assert "securitySchemes" in OPENAPI_DOCUMENT["components"]
+    assert "File" not in SCHEMAS  # the name of a type of JavaScript
+
+
 def test_generators_of_clients_find_nothing_to_stumble_over() -> None:
     def check(part: dict[str, Any]) -> dict[str, Any]:
         assert "/properties/" not in str(part.get("$ref", ""))
@@ -151,7 +159,9 @@ def test_a_request_means_the_same_however_it_is_sent(name: str) -> None:
         assert parse_options(options_from_message(arrived)) == expected
         assert parse_options(json.loads(json.dumps(sent))) == expected
         texts = [(name, v if isinstance(v, str) else json.dumps(v)) for name, v in plain.items()]
+        quoted = [(name, json.dumps(value)) for name, value in plain.items()]
         assert parse_options(options_of_texts(texts)) == expected
+        assert parse_options(options_of_texts(quoted)) == expected
 
 
 def test_every_option_has_an_example() -> None:
