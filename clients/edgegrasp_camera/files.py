@@ -297,7 +297,7 @@ def _read_pcd(data: bytes, max_points: int) -> CloudInput:
     cloud = cloud_from_records(_read_records(body, record, count, max_points, end[1].decode()))
     place = tuple(map(float, header.get("VIEWPOINT", [])[:3]))  # of the camera
     if any(place):  # zeros: unknown
-        if len(place) < 3 or not max(map(abs, place)) <= MAX_VIEWPOINT_DISTANCE:
+        if len(place) < 3 or not all(abs(one) <= MAX_VIEWPOINT_DISTANCE for one in place):
             raise ValueError(f"VIEWPOINT {' '.join(map(str, place))}")
         cloud = replace(cloud, viewpoint=place)
     height, width = (int(header.get(name, ["1"])[0]) for name in ("HEIGHT", "WIDTH"))

@@ -236,12 +236,12 @@ def judge(
 
 def _meet_points(scene: RealScene, grasps: Sequence[Any], gripper: Gripper) -> Bools:
     """Which open hands (E,) contain a measured point, before any cleaning, deeper than NOISE."""
-    from edgegrasp_model.kernels import any_point_in_boxes, loop_input  # loads Numba
+    from edgegrasp_model.kernels import any_point_in_boxes, in_hands  # loads Numba
 
     seen = scene.points[np.isfinite(scene.points).all(axis=1)]
     hands = np.reshape([grasp.T_cloud_hand for grasp in grasps], (-1, 4, 4)).astype(np.float32)
     boxes = np.add(gripper.boxes(gripper.max_opening), [[NOISE], [-NOISE]])
-    return any_point_in_boxes(loop_input(seen, hands), boxes)
+    return any_point_in_boxes(in_hands(seen, hands), boxes)
 
 
 def _objects_held(scene: RealScene, grasps: Sequence[Any]) -> Int64:

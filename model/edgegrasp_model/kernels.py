@@ -32,7 +32,7 @@ def compiled(*freedom: str) -> Callable[[Loop], Loop]:
     return decorate
 
 
-class Inputs(NamedTuple):
+class InHands(NamedTuple):  # Numba's cached loops refer to it by this name
     """N points, and the transforms from their frame to those of E hands."""
 
     columns: Float32  # (3, N) x, y and z, metres
@@ -40,16 +40,16 @@ class Inputs(NamedTuple):
     t_hand_cloud: Float32  # (E, 3) metres
 
 
-def loop_input(points: Float32, T_cloud_hand: Float32) -> Inputs:
+def in_hands(points: Float32, T_cloud_hand: Float32) -> InHands:
     """Points (N, 3) and hands (E, 4, 4), arranged for the loops below."""
     columns = np.ascontiguousarray(points.T, dtype=np.float32)
     R = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
-    return Inputs(columns, R, -(R @ T_cloud_hand[:, :3, 3:])[:, :, 0])
+    return InHands(columns, R, -(R @ T_cloud_hand[:, :3, 3:])[:, :, 0])
 
 
 @compiled("contract")
 def points_in_hand_boxes(
-    hands: Inputs, low: Float32, high: Float32
+    hands: InHands, low: Float32, high: Float32
 ) -> tuple[Int64, Int64, Float32]:
     """The points between two corners (3,) of each hand's frame.
 
@@ -78,7 +78,7 @@ def points_in_hand_boxes(
 
 
 @compiled("contract")
-def any_point_in_boxes(hands: Inputs, boxes: Float64) -> Bools:
+def any_point_in_boxes(hands: InHands, boxes: Float64) -> Bools:
     """Which hands (E,) have a point in one of their boxes (B, 2, 3), hand frame."""
     columns, R, t = hands
     sphere, hit, solid = _blocks(columns), np.zeros(len(R), np.bool_), boxes.astype(np.float32)
@@ -101,7 +101,7 @@ def any_point_in_boxes(hands: Inputs, boxes: Float64) -> Bools:
 
 
 @compiled("contract")
-def any_point_swept(hands: Inputs, boxes: Float64, lift: Float32) -> Bools:
+def any_point_swept(hands: InHands, boxes: Float64, lift: Float32) -> Bools:
     """Like `any_point_in_boxes`, for hands that move along `lift` (E, 3), in their own frames."""
     columns, R, t = hands
     sphere, hit, solid = _blocks(columns), np.zeros(len(R), np.bool_), boxes.astype(np.float32)
@@ -122,7 +122,7 @@ def any_point_swept(hands: Inputs, boxes: Float64, lift: Float32) -> Bools:
 
 
 @compiled("contract", "nnan", "nsz", "reassoc")
-def signed_distance_to_boxes(hands: Inputs, boxes: Float64) -> Float32:
+def signed_distance_to_boxes(hands: InHands, boxes: Float64) -> Float32:
     """Least signed distance (E,) of the points to the boxes (B, 2, 3) of each hand."""
     columns, R, t = hands
     extents = np.empty(boxes.shape, np.float32)  # middles and halves
@@ -141,7 +141,7 @@ def signed_distance_to_boxes(hands: Inputs, boxes: Float64) -> Float32:
 
 
 @compiled("contract")
-def free_reach(hands: Inputs, boxes: Float64, behind: float, least: float, most: float) -> Float32:
+def free_reach(hands: InHands, boxes: Float64, behind: float, least: float, most: float) -> Float32:
     """How far (E,) hands can move along their z until a box has a point right ahead, metres.
 
     The hand's boxes are (B, 2, 3); points up to `behind` metres behind a box are in its way too.
@@ -172,7 +172,7 @@ def free_reach(hands: Inputs, boxes: Float64, behind: float, least: float, most:
 
 
 @compiled("contract")
-def extents_between(hands: Inputs, first: Int64, last: Int64, pads: Float32) -> Float32:
+def extents_between(hands: InHands, first: Int64, last: Int64, pads: Float32) -> Float32:
     """Least and greatest y (E, 2) of the points between the pads of hands; (inf, -inf) without one.
 
     Hand e has points first[e] to last[e]; `pads` are least and greatest x and z, hand frame.

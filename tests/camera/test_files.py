@@ -103,6 +103,7 @@ DEEP = b"-" * 9900 + b"1"  # an expression
 ENDED = b"end_header\n" + bytes(100)
 TWO_POINTS = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 1\nPOINTS 2\n"
 BAD_FILES = [  # and what is said of their value, and of what to send
+    ("pcd", pcd(POINTS).replace(b"VIEWPOINT 0 0", b"VIEWPOINT 0 nan"), "", ""),
     ("npz", npz(a=POINTS, b=POINTS), "a, b", "points=points"),
     ("npz", npz(), "no array points", "points=points"),
     ("npz", npz_packed_by(zipfile.ZIP_LZMA, npy(POINTS)), "", "savez"),

@@ -65,6 +65,8 @@ async def test_the_oldest_are_deleted_with_those_of_earlier_runs(serve, cloud, t
     for number in range(5):
         headers["x-request-id"] = f"r{number}"
         await http.post("/v1/grasps", content=body, headers=headers)
+    headers["x-request-id"] = "large"  # not worth all others
+    await http.post("/v1/grasps", content=npy(np.tile(cloud, (240, 1))), headers=headers)
     running.stop.set()
     await running.serving
     assert [path.stem[-2:] for path in sorted(tmp_path.glob("*.job"))] == ["r3", "r4"]
@@ -118,6 +120,8 @@ def test_outcomes_are_appended_until_the_file_is_full(start_dummy, cloud, tmp_pa
         for changes, field in (
             ({"score": 1.5}, "body.score"),
             ({"held": None}, "body.held"),
+            ({"held": "no"}, "body.held"),
+            ({"score": True}, "body.score"),
             ({"cloud": []}, "body.cloud"),
             ({"model": "resnet"}, "options.model"),
         ):

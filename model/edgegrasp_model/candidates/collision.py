@@ -11,7 +11,7 @@ from edgegrasp_model.kernels import (
     SLACK,
     any_point_in_boxes,
     any_point_swept,
-    loop_input,
+    in_hands,
     points_in_hand_boxes,
     signed_distance_to_boxes,
 )
@@ -46,10 +46,10 @@ def collides(
     lift = request.retreat_length if request.retreat_direction == "up" else 0.0  # metres
     swept = boxes.copy()
     swept[:, 0, 2] -= request.behind
-    hit = any_point_in_boxes(loop_input(scene.cloud.points, T_cloud_hand), swept)
+    hit = any_point_in_boxes(in_hands(scene.cloud.points, T_cloud_hand), swept)
     if lift > 0:
         free = np.flatnonzero(~hit)
-        hands = loop_input(scene.cloud.points, T_cloud_hand[free])
+        hands = in_hands(scene.cloud.points, T_cloud_hand[free])
         hit[free] = any_point_swept(hands, boxes, hands.R_hand_cloud @ (lift * UP))
     if scene.support is not None:
         normal = np.asarray(scene.support.normal)
@@ -70,7 +70,7 @@ def collides(
     if request.margin >= 0.0:
         free = np.flatnonzero(~hit)
         background = scene.cloud.points[scene.object_of_point == BACKGROUND]
-        hands = loop_input(background, T_cloud_hand[free])
+        hands = in_hands(background, T_cloud_hand[free])
         between, *_ = points_in_hand_boxes(hands, *np.array([low, high], np.float32))
         hit[free] = np.bincount(between, minlength=len(free)) >= MIN_BACKGROUND_VOXELS
         hit[free] |= enters_unseen(scene.depths, T_cloud_hand[free], gripper)
@@ -83,7 +83,7 @@ def clearances(scene: Scene, T_cloud_hand: Float32, opening: Float32, gripper: G
     Canonical frame. Negative: the greatest depth at which something lies inside a box of the hand.
     """
     boxes = gripper.open_boxes
-    nearest = signed_distance_to_boxes(loop_input(scene.cloud.points, T_cloud_hand), boxes)
+    nearest = signed_distance_to_boxes(in_hands(scene.cloud.points, T_cloud_hand), boxes)
     if scene.support is not None:
         above = support_clearance(T_cloud_hand, opening, scene.support, gripper)
         nearest = np.minimum(nearest, above)
@@ -111,7 +111,7 @@ def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandVie
     low = boxes[:, 0].min(axis=0) - np.array([near, near, APPROACH_LENGTH])
     high = boxes[:, 1].max(axis=0) + np.array([near, near, 2 * near])
     high[2] += gripper.max_tip_z - gripper.tip_z
-    hands = loop_input(cloud.points, T_cloud_hand)
+    hands = in_hands(cloud.points, T_cloud_hand)
     hand, row, position = points_in_hand_boxes(hands, *np.array([low, high], np.float32))
     bounds = np.searchsorted(hand, np.arange(len(T_cloud_hand) + 1))
     return HandView(hand, row, position, bounds)

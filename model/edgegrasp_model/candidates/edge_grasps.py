@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from edgegrasp_camera.arrays import Bools, Float32, Int64
 from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
-from edgegrasp_model.kernels import compiled, extents_between, free_reach, loop_input
+from edgegrasp_model.kernels import compiled, extents_between, free_reach, in_hands
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.results import NoGraspReason
 from edgegrasp_model.scene.cloud import UP, Cloud, pose_matrix, unit
@@ -217,7 +217,7 @@ def centred_grasps(
     ball = crop.ball_of_point[candidates.pair[wide]]
     half = gripper.pad_half_width + PAD_ALLOWANCE
     pads = np.array([[-half, gripper.palm_z], [half, gripper.max_tip_z]], dtype=np.float32)
-    hands = loop_input(points[crop.ball_rows], candidates.T_cloud_hand[wide])
+    hands = in_hands(points[crop.ball_rows], candidates.T_cloud_hand[wide])
     low, high = extents_between(hands, crop.start[ball], crop.start[ball + 1], pads).T
     middle, width = (low + high) / 2, high - low
     moved = (width > WIDE_SHARE * gripper.max_opening) & (width < gripper.max_opening)
@@ -347,7 +347,7 @@ def _inserted(
     enough = np.flatnonzero(room >= least)
     candidates = candidates.take(enough)
     boxes = gripper.open_boxes + margin * np.array([[-1.0], [1.0]])
-    seen = loop_input(points, candidates.T_cloud_hand)
+    seen = in_hands(points, candidates.T_cloud_hand)
     ends = least + FIT_MARGIN, MAX_INSERTION + FIT_MARGIN  # the exact way does not matter beyond
     way = free_reach(seen, boxes, APPROACH_LENGTH, *ends) - FIT_MARGIN
     way = np.minimum(way, room[enough])

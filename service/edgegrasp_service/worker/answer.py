@@ -23,7 +23,7 @@ import numpy as np
 import orjson
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.unknown_fields import UnknownFieldSet
-from werkzeug.exceptions import HTTPException
+from werkzeug.exceptions import HTTPException, RequestEntityTooLarge
 from werkzeug.formparser import MultiPartParser
 from werkzeug.http import parse_options_header
 
@@ -276,7 +276,7 @@ def read_request(job: Job) -> dict[str, Any]:
         file = File(FILE_TYPES[media_type], job.body)
         return {"cloud": file, "options": options_of_texts(parameters)}
     if parameters:
-        fix = "Send options in the part `options`."
+        fix = "Send options in the body: a JSON body's `options`, or a form's part `options`."
         raise InvalidRequest(parameters[0][0], "a query parameter", fix)
     known = ("points" if media_type == JSON else "cloud", *FIELDS, *(GIVEN if scores else ()))
     if media_type == JSON:
@@ -341,7 +341,8 @@ def read_json(field: str, text: bytes) -> Any:
     except (ValueError, RecursionError) as error:
         is_array = field in ("depth", *PER_POINT)  # perhaps an image of another format
         fix = "Send an .npy or .png file, or JSON." if is_array else "Send a JSON object."
-        raise InvalidRequest(field, f"invalid JSON ({error})", fix) from None
+        why = str(error).partition(";")[0]  # the rest is advice for programmers of Python
+        raise InvalidRequest(field, f"invalid JSON ({why})", fix) from None
 
 
 # Forms
@@ -384,6 +385,8 @@ def _parts(body: bytes, boundary: str, most: int) -> Iterator[tuple[str, str | N
         if not boundary:
             raise ValueError("no boundary in its Content-Type")
         form, files = parser.parse(io.BytesIO(body), boundary.encode("utf-8", "replace"), len(body))
+    except RequestEntityTooLarge:
+        raise InvalidRequest("body", f"more than {most} parts", "Send each part once.") from None
     except (ValueError, HTTPException) as error:
         fix = "Send a file part `cloud` and a JSON part `options`."
         raise InvalidRequest("body", f"a form that cannot be read ({error})", fix) from None

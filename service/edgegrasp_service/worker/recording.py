@@ -63,11 +63,14 @@ class Recorder:
     def _write(self, time: datetime, job: Job, answer: Answer) -> None:
         name = "".join(letter if letter.isalnum() else "_" for letter in job.request_id)
         path = self._folder / f"{time:%Y%m%dT%H%M%S%fZ}-{name}.job"
+        parts = *pack(job), *pack(answer)
         try:
+            if (size := sum(map(len, parts))) > self._most:
+                raise OSError(f"it has {size} bytes, more than record_bytes")
             with path.open("wb") as file:
-                file.writelines((*pack(job), *pack(answer)))
-            self._files.append((path, path.stat().st_size))
-            self._bytes += self._files[-1][1]
+                file.writelines(parts)
+            self._files.append((path, size))
+            self._bytes += size
             while self._bytes > self._most:
                 oldest, size = self._files.popleft()
                 self._bytes -= size
@@ -83,7 +86,7 @@ class Recorder:
 class TriedGrasp(BaseModel):
     """A grasp that a robot executed."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
     model: str = Field(min_length=1, max_length=200, description="weights that scored it")
     score: float = Field(ge=0.0, le=1.0, description="as it was answered")
