@@ -1,12 +1,14 @@
 """Space around a hand that no camera saw, and the visible extent of objects."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import lru_cache
 from itertools import product
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import ConvexHull, QhullError
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
 from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
@@ -22,6 +24,12 @@ HAND_SLICES = 9  # of the hand, along y
 OUTSIDE_SHARE = 0.5  # share of a slice's swept space, from which a hand reaches out of the image
 PLACES = 27  # places on the closing line, from beyond one finger to beyond the other
 NO_SURFACE = np.float32(np.inf)
+MIN_AHEAD = (
+    0.2  # cosine to the middle of the map from which a reading counts for an image's outline
+)
+HAND_CELLS = (
+    50  # cells of the map beyond the points if there are several cameras: a hand opens less
+)
 MIN_UP_SINE = 1e-3  # sine of the angle to up below which up cannot orient the map
 HALF_MAP_CELLS = 256  # most cells from the middle of the map to its edge: some 0.5 m
 FAR_CELL = 10 * HALF_MAP_CELLS  # stands for everything beyond
@@ -55,8 +63,7 @@ def unseen_space(
     parts, ways, (y, line) = probes(gripper), _ways(gripper), _closing_line(gripper)
     places = [*parts, *ways, line]
     ends = np.cumsum([len(place) for place in places])[:-1]
-    nearest = [depth.behind(T_cloud_hand, np.concatenate(places)) for depth in depths]
-    behind: list[Float32] = np.split(np.min(nearest, axis=0), ends, axis=1)
+    behind = np.split(_behind(depths, T_cloud_hand, np.concatenate(places)), ends, axis=1)
     shares = [unseen(part).mean(axis=1) for part in behind[:-1]]
     tips = [np.minimum(part, MAX_UNSEEN_DEPTH).mean(axis=1) for part in behind[:2]]
     along = behind[-1].reshape(len(T_cloud_hand), PLACES, len(line) // PLACES)  # (E, Y, P)
@@ -77,9 +84,15 @@ def enters_unseen(depths: Sequence["DepthMap"], T_cloud_hand: Float32, gripper: 
     entered = np.zeros(len(T_cloud_hand), dtype=np.bool_)
     for places in (*_palm_ways(gripper), *_ways(gripper)) if depths else ():
         left = np.flatnonzero(~entered)
-        behind = np.min([depth.behind(T_cloud_hand[left], places) for depth in depths], axis=0)
+        behind = _behind(depths, T_cloud_hand[left], places)
         entered[left] = unseen(behind).mean(axis=1) > UNKNOWN_SHARE
     return entered
+
+
+def _behind(depths: Sequence["DepthMap"], T_cloud_hand: Float32, places: Float32) -> Float32:
+    """Metres (E, S) behind a surface for the camera that sees most; 0 if no image contains it."""
+    nearest = np.min([depth.behind(T_cloud_hand, places) for depth in depths], axis=0)
+    return np.where(np.isinf(nearest), np.float32(0.0), nearest)
 
 
 def leaves_image(
@@ -259,11 +272,17 @@ class DepthMap(NamedTuple):
     viewpoint: Float32  # (3,)
     axes: Float32  # (3, 3) rows: across, down, toward the middle of the cloud
     cell: float  # tangent of the angle of a cell
-    distance: Float32  # (2 H + 1, 2 H + 1) metres from the camera; inf where nothing was seen
+    # (2 H + 1, 2 H + 1) metres from the camera; inf where nothing was seen, -inf outside its image
+    distance: Float32
 
     @classmethod
-    def of_cloud(cls, points: Float32, viewpoint: Float32, up: Float32) -> Self:
-        """The depth map of points (N, 3), metres, from a camera; `up` fixes its roll."""
+    def of_cloud(
+        cls, points: Float32, viewpoint: Float32, up: Float32, own: Float32 | None = None
+    ) -> Self:
+        """The depth map of points (N, 3), metres, from a camera; `up` fixes its roll.
+
+        `own` (M, 3) are this camera's readings if there are several cameras: they show its image.
+        """
         way = points.mean(axis=0, dtype=np.float64) - viewpoint.astype(np.float64)
         away = max(float(np.linalg.norm(way)), 1e-6)
         ahead = way / away
@@ -275,10 +294,14 @@ class DepthMap(NamedTuple):
         along = (points - viewpoint) @ axes.T  # (N, 3)
         tangents = along[:, :2] / np.maximum(along[:, 2:], np.float32(1e-6))
         cell = np.clip(np.floor(tangents / np.float32(MAP_CELL / away)), -FAR_CELL, FAR_CELL)
-        half = min(int(np.abs(cell).max()) + SPLAT, HALF_MAP_CELLS)
+        margin = SPLAT if own is None else HAND_CELLS
+        half = min(int(np.abs(cell).max()) + margin, HALF_MAP_CELLS)
         depth = np.full((2 * half + 1, 2 * half + 1), NO_SURFACE)
         distance = np.linalg.norm(along, axis=1).astype(np.float32)
         _cover(depth, cell.astype(np.int64) + half, distance)
+        if own is not None:
+            middles = (np.arange(-half, half + 1) + 0.5) * (MAP_CELL / away)
+            depth[_outside_own((own - viewpoint) @ axes.T, middles)] = -NO_SURFACE
         return cls(viewpoint, axes, MAP_CELL / away, depth)
 
     def behind(self, T_cloud_hand: Float32, places: Float32) -> Float32:
@@ -286,6 +309,22 @@ class DepthMap(NamedTuple):
         turn = np.ascontiguousarray(self.axes @ T_cloud_hand[:, :3, :3], dtype=np.float32)
         shift = ((T_cloud_hand[:, :3, 3] - self.viewpoint) @ self.axes.T).astype(np.float32)
         return distance_behind(self.distance, turn, shift, places, np.float32(1.0 / self.cell))
+
+
+def _outside_own(sight: Floats, tangents: Floats) -> Bools:
+    """Which directions (K, K), of tangents (K,) across and down, a camera's image does not contain.
+
+    Its image is the convex outline of its readings (M, 3), along the axes of the map.
+    """
+    ahead = sight[sight[:, 2] > MIN_AHEAD * np.linalg.norm(sight, axis=1)].astype(np.float64)
+    low, high = np.ones((2, len(tangents), 1)) * [[[np.inf]], [[-np.inf]]]
+    with suppress(QhullError, ValueError):  # too few readings, or all on a line
+        a, b, c = ConvexHull(ahead[:, :2] / ahead[:, 2:]).equations.T  # inside: a x + b y + c <= 0
+        b[b == 0.0] = 1e-12
+        bound = -(np.multiply.outer(tangents, a) + c) / b
+        low = np.where(b < 0.0, bound, -np.inf).max(axis=1, keepdims=True)
+        high = np.where(b > 0.0, bound, np.inf).min(axis=1, keepdims=True)
+    return np.asarray((tangents < low) | (tangents > high))
 
 
 @compiled()

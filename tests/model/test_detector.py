@@ -390,6 +390,19 @@ def test_an_object_without_a_good_grasp_has_a_reason(size, options, reason) -> N
     assert single.reason == reason
 
 
+@pytest.mark.parametrize("second", [False, True])
+def test_a_camera_that_looks_elsewhere_does_not_see_an_object(second: bool) -> None:
+    box = box_on_table(3000)
+    floor = np.random.default_rng(0).uniform((-1.1, -0.9, 0), (-0.9, -0.7, 0), (2000, 3))
+    views = np.repeat(np.int64([0, 1]), [len(box), len(floor)])
+    eyes = [(1.0, 0.0, 0.04), (-1.0, -0.8, 0.5)]
+    known = ASKED | {"objects": "off", "approach_direction": {"preset": "top-down"}}
+    asked = parse_options(known | {"viewpoint": eyes if second else eyes[0]})
+    both = CloudInput(np.concatenate([box, floor]).astype(np.float32), view_ids=views)
+    (one,) = convinced(-50.0).detect(both if second else box, asked).objects
+    assert one.reason == "hidden"
+
+
 @pytest.mark.parametrize("options", [{"approach_direction": {"preset": "side"}}, {}])
 def test_a_high_box_of_which_only_the_top_is_seen_is_not_flat(options) -> None:
     cloud = box_on_table(3000, size=(0.04, 0.06, 0.10))

@@ -39,6 +39,7 @@ from edgegrasp_model.scene.cloud import (
     Voxels,
     clean_cloud,
     inside_workspace,
+    subsample,
     unit,
     voxelise,
 )
@@ -65,6 +66,7 @@ from edgegrasp_model.unseen import DepthMap
 
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 FOLLOWED_REACH = 0.16  # metres; replaces HAND_REACH if only known grasps are checked
+OUTLINE_READINGS = 20_000  # readings that show what a camera's image contains
 FOUND_PLANE_CLEARANCE = 0.0015  # metres that hands stay above a plane that was not given
 NO_OBJECT = (
     "no object was recognised above the support plane. Send objects: off to look for grasps on "
@@ -82,12 +84,18 @@ class Surroundings:
     viewpoints: Float32  # (W, 3) the cameras; none if they are unknown
     at_side: Bools  # (N,) where a side of the workspace cuts the cloud off
     object_of_point: Int64  # (N,) number of each point's object, or BACKGROUND or UNDECIDED
+    # Some (M, 3) of each camera's readings, which show its image; none if there is one camera.
+    readings_by_camera: list[Float32] = field(default_factory=list, kw_only=True)
 
     @cached_property
     def depths(self) -> list[DepthMap]:
         """The depth map of each camera; none if the cameras are unknown."""
         eyes = self.viewpoints if len(self.cloud.points) else ()
-        return [DepthMap.of_cloud(self.cloud.points, eye, self.up) for eye in eyes]
+        own: list[Float32 | None] = [*self.readings_by_camera] or [None] * len(eyes)
+        return [
+            DepthMap.of_cloud(self.cloud.points, eye, self.up, readings)
+            for eye, readings in zip(eyes, own, strict=False)
+        ]
 
 
 @dataclass(frozen=True)
@@ -118,7 +126,7 @@ class SelectedPoints:
     viewpoints: Float64  # (W, 3) the cameras
     labels: Int64  # (R,) of the rows of the cloud as sent, as in `DebugInfo`
     confidence: dict[int, float]  # of each object that the network found
-    readings: Float32  # (N, 3) all readings, as in `Scene`
+    readings: CheckedCloud  # all readings
 
 
 def select_points(
@@ -133,7 +141,7 @@ def select_points(
     counts["points"], found = len(sent.points), None
     if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
         sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
-    readings, further = sent.points, max(options.collision.behind - APPROACH_LENGTH, 0.0)
+    readings, further = sent, max(options.collision.behind - APPROACH_LENGTH, 0.0)
     if options.workspace is not None:
         reach = further + (FOLLOWED_REACH if options.follows_only else HAND_REACH)
         sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
@@ -265,8 +273,18 @@ def build_scene(
         confidence=selected.confidence,
         P_image_cloud=projection,
         obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
-        readings=selected.readings,
+        readings=selected.readings.points,
+        readings_by_camera=_readings_by_camera(selected.readings, frame, len(eyes)),
     )
+
+
+def _readings_by_camera(sent: CheckedCloud, frame: CanonicalFrame, cameras: int) -> list[Float32]:
+    """Some of each camera's readings, (M, 3) in the frame; none if there is one camera."""
+    if sent.view_ids is None or cameras < 2:
+        return []
+    own = (sent.points[sent.view_ids == number] for number in range(cameras))
+    some = (frame.points_from_cloud(subsample(points, OUTLINE_READINGS)) for points in own)
+    return [points.astype(np.float32) for points in some]
 
 
 def _seen_from_above(points: Float32, up: Float64 | None) -> tuple[Int64, Float64]:
