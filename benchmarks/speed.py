@@ -54,7 +54,7 @@ def main(
     """Measure everything, write the results and the pages' tables."""
     torch.set_num_threads(1)
     results: dict[str, Any] = {"machine": machine()}
-    for part in (time_camera, time_networks, time_simulator, time_server_start):
+    for part in (camera, shipped, simulator, server):
         name = part.__name__
         results[name] = part()
         print(name, results[name], flush=True)
@@ -64,7 +64,7 @@ def main(
         write_table(ROOT / "docs" / "speed.md", table(results))
 
 
-def time_networks() -> list[dict[str, Any]]:
+def shipped() -> list[dict[str, Any]]:
     """Time each network in the whole pipeline on a view of each kind of scene, given the table.
 
     Processor seconds on one thread, and wall-clock seconds on two.
@@ -83,7 +83,7 @@ def time_networks() -> list[dict[str, Any]]:
     return list(rows.values())
 
 
-def time_camera() -> dict[str, float]:
+def camera() -> dict[str, float]:
     """Seconds for camera images with the default weights, given only the camera's position.
 
     The demo's scene; each image in SHARED, if it exists; and the same enlarged to 1280 x 720.
@@ -105,7 +105,7 @@ def time_camera() -> dict[str, float]:
     return {name: statistics.median(times) for name, times in time_interleaved(runs).items()}
 
 
-def time_server_start() -> dict[str, float]:
+def server() -> dict[str, float]:
     """Wall-clock seconds until a server is ready, and its memory, MiB, then and after requests."""
     start = time.perf_counter()
     with local_server() as running:
@@ -119,7 +119,7 @@ def time_server_start() -> dict[str, float]:
         return {"ready_seconds": ready, "rest_mb": at_rest, "used_mb": memory(running.pid)}
 
 
-def time_simulator() -> list[dict[str, Any]]:
+def simulator() -> list[dict[str, Any]]:
     """Labels per second and rounds per minute of each engine and kind, without the start."""
     protocol, options = load_protocol("edgegrasp"), GenerationOptions(grasps_per_view=LABELS)
     # Number of labels, seconds for them, and seconds of a round.
