@@ -239,6 +239,7 @@ def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
         raise invalid(path, found[:80], fix)
     given = image.get("T_cloud_camera", np.eye(4))
     pose = np.asarray(given, dtype=object)  # accepts rows of different lengths
+    pose = pose.reshape(4, 4) if pose.shape == (16,) else pose
     if pose.shape != (4, 4) or not all(isinstance(each, Real) for each in pose.flat):
         raise invalid(f"{path}.T_cloud_camera", repr(given)[:80], "Give a 4 x 4 matrix.")
     depth = _depth_fields(image["depth"], f"{path}.depth")

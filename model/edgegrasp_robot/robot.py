@@ -269,7 +269,9 @@ def _located(path: Path, field: str, name: str, packages: Sequence[str]) -> Path
     for place in places:
         if place.is_file():
             return place.absolute()
-    fix = f"Name a file beside {path.name}, or add the folder of its package to `packages`"
+    fix = (
+        f"Name a file beside {path.name}, or add the folder that contains its package to `packages`"
+    )
     raise InvalidRobot(f"{field}: there is no {brief(name)}. {fix}.")
 
 

@@ -67,8 +67,9 @@ def test_depth_images_are_sent_in_every_form(client) -> None:
     found = client.detect(depth_images=[depth_image(depth=masked)])
     zeros = client.detect(depth_images=[depth_image(depth=masked.filled(0))])
     assert contacts(found) == contacts(zeros) != contacts(expected)
-    views = [depth_image(), depth_image(T_cloud_camera=np.eye(4).tolist())]
-    assert client.detect(depth_images=views, segment_ids=np.arange(1200)).counts["points"] == 1200
+    rows = np.eye(4).tolist(), np.eye(4).ravel().tolist()
+    views = [depth_image(), *(depth_image(T_cloud_camera=pose) for pose in rows)]
+    assert client.detect(depth_images=views, segment_ids=np.arange(1800)).counts["points"] == 1800
 
 
 def test_depth_files_are_read_with_their_scale(client, tmp_path) -> None:

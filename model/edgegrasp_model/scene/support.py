@@ -149,7 +149,7 @@ def find_support(
     if found is None:
         warnings.append(
             "no support plane is seen: objects are returned without one, and hands may reach "
-            "under them. Send support, or up in the cloud's frame."
+            "under them. Send support, or check up and the camera's pose, whose z is forward."
         )
     elif heights_over(found.plane, seen.viewpoint) < 0:
         warnings.append(
