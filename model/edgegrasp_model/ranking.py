@@ -231,11 +231,7 @@ def detected_objects(
     objects = []
     for row in np.argsort(-count, kind="stable"):
         which = int(number[row])
-        mine = scene.object_of_point == which
-        T_cloud_box, half, narrowest = _upright_box(scene, mine)
-        height = 2 * half[2]
-        if scene.support is not None:
-            height = heights_over(scene.support, scene.cloud.points[mine]).max()
+        T_cloud_box, half, width = _upright_box(scene, scene.object_of_point == which)
         turn = Rotation.from_matrix(T_cloud_box[:3, :3])
         good = best.get(which, 0.0) >= GOOD_SCORE
         objects.append(
@@ -247,35 +243,31 @@ def detected_objects(
                 quaternion=turn.as_quat().astype(np.float32),
                 best_score=best.get(which),
                 confidence=scene.confidence.get(which),
-                reason=None
-                if good
-                else _reason(scene, which, (narrowest, height), sample, score, gripper),
+                reason=None if good else _reason(scene, which, width, sample, score, gripper),
             )
         )
     return objects
 
 
 def _reason(
-    scene: Scene,
-    number: int,
-    size: tuple[float, float],  # least width seen from above, height over the support; metres
-    sample: Sample | None,
-    score: Floats,
-    gripper: Gripper,
+    scene: Scene, number: int, width: float, sample: Sample | None, score: Floats, gripper: Gripper
 ) -> UngraspableReason | None:
-    """Why an object has no good grasp."""
+    """Why an object whose least width as seen from above is `width` has no good grasp."""
     if sample is None:
         return None
     drawn = scene.object_of_point[sample.drawn.contact_index] == number
     scored = np.flatnonzero(drawn[sample.row])
     if score[scored].max(initial=0.0) >= GOOD_SCORE:
         return None
-    narrowest, height = size
-    if narrowest > gripper.max_opening:
+    if width > gripper.max_opening:
         return UngraspableReason.TOO_WIDE
     outcome = sample.outcome[drawn]
     codes = OUTCOME_CODE[Outcome.SUPPORT], OUTCOME_CODE[Outcome.DIRECTION]
     out_of_reach = np.isin(outcome, codes)
+    mine = scene.cloud.points[scene.object_of_point == number]
+    height = np.ptp(mine[:, 2])
+    if scene.support is not None:
+        height = heights_over(scene.support, mine).max()
     if height < FLAT_HEIGHT and out_of_reach.sum() >= len(outcome) / 2:
         return UngraspableReason.TOO_FLAT
     if not sample.collision_free[scored].any():

@@ -212,11 +212,9 @@ def merged(
         kept = [replace(e.grasp, id=one.id, object=now) for one, now, e in there if e.grasp]
     if kept:
         # A new grasp near a followed one is the same grasp; its score is averaged, unlike this one.
-        near, some = options.suppression or Suppression(), [*kept, *found]
+        some = [*kept, *found]
         own = np.array([one.score for one in some], dtype=np.float32)
-        T_cloud_tcp, same = np.stack([one.T_cloud_tcp for one in some]), np.zeros(len(some), int)
-        average = mean_over_similar(own, T_cloud_tcp, same, near.translation, near.rotation)
-        best = np.fmax(own, average).tolist()
+        best = np.fmax(own, _mean_over_same(own, some, options)).tolist()
         kept = [replace(one, score=score) for one, score in zip(kept, best, strict=False)]
         ways = scene.frame.directions_from_cloud([one.approach_direction for one in kept])
         fit = allowed_directions(ways, options.approach_direction, scene.frame)
@@ -251,16 +249,13 @@ def _order(
     """
     if kept == 0:
         return list(range(len(grasps)))
-    rule = options.suppression or Suppression()
-    T_cloud_tcp = np.stack([grasp.T_cloud_tcp for grasp in grasps])
     rows = np.arange(len(grasps), dtype=np.int64)
-    near = rule.translation, rule.rotation
-    if options.suppression is None:  # a grasp near a kept one is the same; all others stay
-        of_kept = (rows < kept).astype(np.float32)
-        like_kept = mean_over_similar(of_kept, T_cloud_tcp, np.zeros_like(rows), *near) > 0.0
+    if (rule := options.suppression) is None:  # only new grasps near a kept one are left out
+        like_kept = _mean_over_same((rows < kept).astype(np.float32), grasps, options) > 0.0
         rows = rows[(rows < kept) | ~like_kept]
     else:
-        rows, _ = non_max_suppression(T_cloud_tcp, rows, *near)
+        T_cloud_tcp = np.stack([grasp.T_cloud_tcp for grasp in grasps])
+        rows, _ = non_max_suppression(T_cloud_tcp, rows, rule.translation, rule.rotation)
     some = [grasps[row] for row in rows]
     score = np.array([one.score for one in some])
     free = np.array([one.collision_free for one in some])
@@ -338,6 +333,13 @@ def register_icp(before: Float64, cloud: Surface) -> tuple[Float64, float]:
     now = before @ T[:3, :3].T + T[:3, 3]
     apart, _ = cloud.tree.query(now, distance_upper_bound=REGISTRATION_DISTANCES[-1])
     return T, float(np.isfinite(apart).mean())
+
+
+def _mean_over_same(values: Float32, grasps: list[Grasp], options: DetectOptions) -> Float32:
+    """The mean value (E,), for each grasp, of the others near enough to be the same; NaN: none."""
+    rule = options.suppression or Suppression()
+    T_cloud_tcp, number = np.stack([one.T_cloud_tcp for one in grasps]), np.zeros(len(grasps), int)
+    return mean_over_similar(values, T_cloud_tcp, number, rule.translation, rule.rotation)
 
 
 def sampled(points: Float32) -> Float32:

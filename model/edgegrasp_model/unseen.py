@@ -1,7 +1,6 @@
 """Space around a hand that no camera saw, and the visible extent of objects."""
 
 from collections.abc import Sequence
-from contextlib import suppress
 from functools import lru_cache
 from itertools import product
 from typing import NamedTuple, Self
@@ -91,8 +90,9 @@ def enters_unseen(depths: Sequence["DepthMap"], T_cloud_hand: Float32, gripper: 
 
 def _behind(depths: Sequence["DepthMap"], T_cloud_hand: Float32, places: Float32) -> Float32:
     """Metres (E, S) behind a surface for the camera that sees most; 0 if no image contains it."""
-    nearest = np.min([depth.behind(T_cloud_hand, places) for depth in depths], axis=0)
-    return np.where(np.isinf(nearest), np.float32(0.0), nearest)
+    nearest: Float32 = np.min([depth.behind(T_cloud_hand, places) for depth in depths], axis=0)
+    nearest[np.isinf(nearest)] = 0.0
+    return nearest
 
 
 def leaves_image(
@@ -317,13 +317,14 @@ def _outside_own(sight: Floats, tangents: Floats) -> Bools:
     Its image is the convex outline of its readings (M, 3), along the axes of the map.
     """
     ahead = sight[sight[:, 2] > MIN_AHEAD * np.linalg.norm(sight, axis=1)].astype(np.float64)
-    low, high = np.ones((2, len(tangents), 1)) * [[[np.inf]], [[-np.inf]]]
-    with suppress(QhullError, ValueError):  # too few readings, or all on a line
+    try:
         a, b, c = ConvexHull(ahead[:, :2] / ahead[:, 2:]).equations.T  # inside: a x + b y + c <= 0
-        b[b == 0.0] = 1e-12
-        bound = -(np.multiply.outer(tangents, a) + c) / b
-        low = np.where(b < 0.0, bound, -np.inf).max(axis=1, keepdims=True)
-        high = np.where(b > 0.0, bound, np.inf).min(axis=1, keepdims=True)
+    except (QhullError, ValueError):  # too few readings, or all on a line
+        return np.ones((len(tangents), len(tangents)), dtype=np.bool_)
+    b[b == 0.0] = 1e-12
+    bound = -(np.multiply.outer(tangents, a) + c) / b
+    low = np.where(b < 0.0, bound, -np.inf).max(axis=1, keepdims=True)
+    high = np.where(b > 0.0, bound, np.inf).min(axis=1, keepdims=True)
     return np.asarray((tangents < low) | (tangents > high))
 
 

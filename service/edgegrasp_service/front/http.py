@@ -43,8 +43,8 @@ PAGE_GRACE_SECONDS = 10.0  # seconds after which a page yields its place to anot
 
 ASSETS = "/docs/assets"  # of fastapi_offline
 PLAYGROUND = "/playground/"
-UPGRADE = re.compile(rb"\r\nupgrade:", re.IGNORECASE)  # as Java's HttpClient sends
 PLAYGROUND_FILES = Path(__file__).parents[1] / "playground"
+UPGRADE = re.compile(rb"\r\nupgrade:", re.IGNORECASE)  # as Java's HttpClient sends
 CONTENT_POLICY = (  # what a page may load, and which sites may embed it
     "default-src 'none'; script-src 'self'{0}; style-src 'self'{0}; img-src 'self' data: blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
