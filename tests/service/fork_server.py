@@ -27,7 +27,7 @@ PATIENCE = 20  # seconds; longer than anything takes
 FOLDER = Path()  # what a test writes into it tells what happens
 
 
-def fork_fork_servers(path: str) -> None:
+def answer_fork_requests(path: str) -> None:
     """A client sends its pool's socket, a folder and settings; its fork server ends with it."""
     global FOLDER
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
@@ -144,4 +144,4 @@ def load(settings: Settings) -> Catalogue:
 
 
 if __name__ == "__main__":
-    fork_fork_servers(sys.argv[1])
+    answer_fork_requests(sys.argv[1])
