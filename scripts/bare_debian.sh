@@ -19,7 +19,7 @@ import ast, re, subprocess, sys
 found = {}
 listed = subprocess.run([sys.executable, "-m", "pip", "config", "list"], capture_output=True)
 for key, value in re.findall(r"^(?::env:|\w+)\.([\w-]+)=(.*)$", listed.stdout.decode(), re.M):
-    found[key] = ast.literal_eval(value)
+    found[key] = ast.literal_eval(value).replace("\n", "\n    ")
 print("[global]", *(f"{key} = {value}" for key, value in found.items()), sep="\n")
 CODE
 }

@@ -11,7 +11,7 @@ cd "$(dirname "$0")/.."
 . scripts/bare_debian.sh
 suite=${1:?usage: $0 SUITE [PYTHON]}
 other=${2:-}
-if [ "$(id -u)" != 0 ] || ! command -v debootstrap apt-get >/dev/null; then
+if [ "$(id -u)" != 0 ] || ! command -v debootstrap >/dev/null; then
     echo "newcomer: needs root, and Debian with debootstrap" >&2
     exit 1
 fi

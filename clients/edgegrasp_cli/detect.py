@@ -140,14 +140,15 @@ def models(*, flags: DetectorFlags) -> None:
 
 
 def open_client(flags: DetectorFlags) -> AbstractContextManager[Any]:
-    """A client of a server, or an OwnDetector if no server is given."""
+    """A client of a server, or an InProcessDetector if no server is given."""
     if flags.server:
         # benchmark-real needs --grippers too, to judge the server's grasps.
         alone = {"weights", "device"} | ({"grippers"} if isinstance(flags, DetectFlags) else set())
         for name in sorted(flags.model_fields_set & alone):
             raise ValueError(f"--{name}: got --server as well. Set it at the server.")
         return flags.connect(flags.server)
-    return nullcontext(InProcessDetector(flags.weights, flags.grippers, flags.device))
+    robot = getattr(flags, "robot", None)
+    return nullcontext(InProcessDetector(flags.weights, flags.grippers, flags.device, robot))
 
 
 @dataclass(eq=False)
@@ -237,7 +238,8 @@ def _robot_option(flags: DetectFlags) -> dict[str, Any]:
     joints = value_of_text("--joints", str(flags.joints))
     joints = joints if isinstance(joints, list) else [joints]  # an arm with one joint
     pose = value_of_text("--base", str(flags.base))
-    robot = {"name": flags.robot, "joints": joints, "T_base_cloud": pose}
+    name = flags.robot if flags.server else Path(str(flags.robot)).stem  # a path may be long
+    robot = {"name": name, "joints": joints, "T_base_cloud": pose}
     robot["avoid_unseen"] = flags.avoid_unseen
     if flags.place is not None:
         robot["place"] = value_of_text("--place", flags.place)

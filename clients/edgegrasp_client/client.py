@@ -4,6 +4,7 @@ import asyncio
 import os
 import threading
 import time
+from collections import Counter
 from collections.abc import (
     AsyncGenerator,
     AsyncIterable,
@@ -67,6 +68,11 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
         token: str | None = None,
         tls: Tls | None = None,
     ) -> None:
+        if not is_rest(address):
+            _ASKED_OVER_GRPC.add(os.getpid())
+            if len(_ASKED_OVER_GRPC) > 1:  # gRPC would wait forever
+                fix = "Start processes by `spawn`, or ask over REST."
+                raise invalid("address", "gRPC in a fork of a process that has used it", fix)
         self._timeout = checked_timeout(timeout)
         self._retry, self._closed, self._answered = retry, False, False
         self._pid = os.getpid()
@@ -188,20 +194,25 @@ class AsyncGraspClient(AbstractAsyncContextManager["AsyncGraspClient"]):
         """Make a call, retrying while the server is unavailable or busy and time is left."""
         left = self._seconds(timeout)
         end = time.monotonic() + left
-        attempt = 0
+        attempts: Counter[type[Exception]] = Counter()
         while True:
             try:
                 answer = await call(left)
                 self._answered = True
                 return answer
+            except asyncio.CancelledError:  # gRPC cancels its calls when it is closed
+                if not self._closed:
+                    raise
+                raise errors.GraspClientError(CLOSED) from None
             except errors.ServerUnavailableError as error:
-                delay = retry_delay(error, attempt, self._answered)
+                delay = retry_delay(error, attempts[type(error)], self._answered)
                 if not self._retry or delay is None or time.monotonic() + delay >= end:
                     raise
                 # The request itself may have killed the worker, so it is retried only once.
-                attempt += RETRIES if isinstance(error, errors.WorkerLostError) else 1
+                lost = isinstance(error, errors.WorkerLostError)
+                attempts[type(error)] += RETRIES if lost else 1
             await asyncio.sleep(delay)
-            left = self._seconds(max(end - time.monotonic(), 0.0))
+            left = self._seconds(max(end - time.monotonic(), 1e-3))
 
 
 async def _sent(
@@ -245,12 +256,6 @@ class GraspClient(AbstractContextManager["GraspClient"]):
         token: str | None = None,
         tls: Tls | None = None,
     ) -> None:
-        if not is_rest(address):
-            _ASKED_OVER_GRPC.add(os.getpid())
-            if len(_ASKED_OVER_GRPC) > 1:  # gRPC would wait forever
-                fix = "Start processes by `spawn`, or ask over REST."
-                raise invalid("address", "gRPC in a fork of a process that has used it", fix)
-
         async def make() -> AsyncGraspClient:
             return AsyncGraspClient(address, timeout=timeout, retry=retry, token=token, tls=tls)
 
@@ -313,8 +318,9 @@ async def _from_thread(requests: Iterable[StreamRequest]) -> AsyncIterator[Strea
         if found.set_running_or_notify_cancel():
             try:
                 found.set_result(next(source, None))
-            except Exception as error:
-                found.set_exception(error)
+            except BaseException as error:  # SystemExit would end the loop of all clients
+                known = isinstance(error, Exception)
+                found.set_exception(error if known else errors.GraspClientError(repr(error)))
 
     while True:
         found: Future[StreamRequest | None] = Future()

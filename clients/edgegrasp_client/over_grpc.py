@@ -222,6 +222,8 @@ def _target(message: Any, value: Any, path: str) -> tuple[Any, Any]:
     """The message to fill and its fields; some messages have another form in JSON."""
     names = [field.name for field in message.DESCRIPTOR.fields]
     fields = dict(value) if isinstance(value, Mapping) else {}
+    if "disabled" in fields:  # null in JSON
+        raise invalid(f"{path}.disabled", "an unknown field", f"Give {_known(message)} only.")
     match message.DESCRIPTOR.name:
         case "DetectOptions":  # one viewpoint may be given without a list
             if isinstance(fields.get("objects"), Mapping):

@@ -199,7 +199,7 @@ def cloud_file(cloud: Cloud) -> tuple[str, bytes]:
     if isinstance(cloud, np.ndarray) and not cloud.dtype.hasobject:
         if cloud.shape[1:] == (3,) and cloud.dtype in (np.float32, np.float64):
             with np.errstate(over="ignore"):  # the server refuses infinity
-                cloud = np.ascontiguousarray(cloud, dtype=np.float32)
+                cloud = np.asanyarray(cloud, dtype=np.float32, order="C")  # stays masked
         return "npy", npy_bytes(np.ma.filled(cloud, np.nan))
     if not isinstance(cloud, str | PathLike):
         kind = f"a {type(cloud).__name__}"

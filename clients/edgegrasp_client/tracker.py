@@ -61,7 +61,7 @@ class GraspTracker:
         self._reader.start()
         try:
             while (image := latest.get()) is not None:
-                if isinstance(image, Exception):
+                if isinstance(image, BaseException):
                     raise image
                 detection = client.detect(**{**image, **self.options()})
                 self.take(detection)
@@ -120,7 +120,7 @@ class GraspTracker:
 
 def _read(images: Iterable[Any], latest: "queue.Queue[Any]", stopped: threading.Event) -> None:
     """Keep the latest image in a queue of one; at the end put None, or the error of the images."""
-    end = None
+    end: BaseException | None = None
     try:
         for image in images:
             if stopped.is_set():
@@ -128,7 +128,7 @@ def _read(images: Iterable[Any], latest: "queue.Queue[Any]", stopped: threading.
             with suppress(queue.Empty):
                 latest.get_nowait()
             latest.put(image)
-    except Exception as error:
+    except BaseException as error:
         end = error
     while not stopped.is_set():  # once the last image is taken
         with suppress(queue.Full):

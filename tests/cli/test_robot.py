@@ -75,3 +75,8 @@ def test_what_no_camera_saw_is_avoided_only_with_a_camera(tmp_path: Path) -> Non
     said = refused("detect", tmp_path / "cloud.npy", *flags, "--avoid-unseen")
     assert "options.robot.avoid_unseen: got true, without a camera" in said
     assert "Send the option viewpoint" in said
+    long = tmp_path / ("folder" * 20) / "arm.toml"
+    long.parent.mkdir()
+    run("robot", "add", UR5, *LINKS, "--output", long)
+    said = refused("detect", tmp_path / "cloud.npy", "--robot", long, *flags[2:])
+    assert "options.robot.joints: got 7" in said  # of the six of its file

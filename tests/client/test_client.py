@@ -4,6 +4,7 @@ import asyncio
 import dataclasses
 import itertools
 import os
+import sys
 import threading
 from base64 import b64encode
 from collections.abc import AsyncIterator, Iterator
@@ -108,7 +109,11 @@ async def test_concurrent_requests_get_their_own_answers(dummy_server, transport
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # of several threads
-def test_a_forked_process_asks_over_rest_alone(dummy_server, cloud) -> None:
+@pytest.mark.parametrize("kind", [GraspClient, AsyncGraspClient])
+def test_a_forked_process_asks_over_rest_alone(kind: Any, dummy_server, cloud) -> None:
+    async def of_fork() -> None:
+        kind(dummy_server.grpc_address)
+
     with GraspClient(dummy_server.grpc_address) as client:
         assert client.detect(cloud).grasps
         child = os.fork()
@@ -116,7 +121,7 @@ def test_a_forked_process_asks_over_rest_alone(dummy_server, cloud) -> None:
             with GraspClient(dummy_server.http_url) as of_child:
                 found = bool(of_child.detect(cloud).grasps)
             try:
-                GraspClient(dummy_server.grpc_address)
+                asyncio.run(of_fork())
             except api.InvalidRequestError:
                 try:
                     client.detect(cloud)  # its connection is its parent's
@@ -315,3 +320,22 @@ def test_images_that_come_while_one_is_at_work_are_dropped_but_for_the_latest() 
         seen.extend(image["cloud"][0, 0] for image, _ in GraspTracker().follow(client, camera()))
     assert seen[-1] == 9
     assert len(seen) <= 2
+
+
+def test_a_source_that_exits_ends_the_loop(client) -> None:
+    def camera() -> Iterator[Any]:
+        sys.exit("no camera")
+        yield
+
+    def read(results: Iterator[Any]) -> None:
+        with pytest.raises((SystemExit, api.GraspClientError), match="no camera"):
+            list(results)
+        ended.append(True)
+
+    ended: list[bool] = []
+    for results in (client.detect_stream(camera()), GraspTracker().follow(client, camera())):
+        reader = threading.Thread(target=read, args=(results,), daemon=True)
+        reader.start()
+        reader.join(60)
+    assert ended == [True, True]
+    assert client.ready()

@@ -1,5 +1,6 @@
 """What goes wrong is the same exception over either transport, or is tried again."""
 
+import asyncio
 import itertools
 import socket
 import time
@@ -16,7 +17,7 @@ from tests.programs import free_ports
 
 import edgegrasp_client as api
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_client import GraspClient, StreamRequest, Tls, connection
+from edgegrasp_client import AsyncGraspClient, GraspClient, StreamRequest, Tls, connection
 
 
 class Problem(NamedTuple):
@@ -178,7 +179,10 @@ def hasty_retries(monkeypatch: pytest.MonkeyPatch) -> None:
 RESTARTED = [None] + [AWAY] * connection.RETRIES  # it answered before
 
 
-@pytest.mark.parametrize("problems", [[AWAY, BUSY, LOST], [BUSY] * 8, RESTARTED])
+BUSY_FIRST = [[BUSY] * 8 + [LOST], [BUSY] * 4 + [AWAY]]
+
+
+@pytest.mark.parametrize("problems", [[AWAY, BUSY, LOST], *BUSY_FIRST, RESTARTED])
 def test_a_server_that_is_away_or_busy_is_asked_again(problems: Any, failing, cloud) -> None:
     client, server = failing(problems)
     while server.calls < len(problems):
@@ -245,6 +249,23 @@ def test_an_address_that_is_none_or_without_tls_is_refused() -> None:
     for address in ("http://127.0.0.1:8000", "http+unix:/run/http.sock"):
         with pytest.raises(api.InvalidRequestError, match="tls: got a Tls for http"):
             GraspClient(address, tls=Tls(), token="secret")
+
+
+async def test_closing_ends_a_call_with_an_error(start_dummy, transport: str, cloud) -> None:
+    with start_dummy(seconds=2.0) as server:
+        client = AsyncGraspClient(server.address(transport))
+        call = asyncio.create_task(client.detect(cloud))
+        await asyncio.sleep(0.5)
+        await client.close()
+        with pytest.raises(api.GraspClientError):
+            await call
+
+
+async def test_a_retry_that_starts_too_late_is_refused_as_the_server_is(monkeypatch) -> None:
+    sleep = asyncio.sleep
+    monkeypatch.setattr(asyncio, "sleep", lambda _: sleep(1.0))
+    with pytest.raises((api.DeadlineError, api.ServerUnavailableError)):
+        await AsyncGraspClient(f"127.0.0.1:{free_ports(1)[0]}", timeout=0.5).models()
 
 
 def test_a_closed_client_says_so(client, cloud) -> None:

@@ -152,6 +152,8 @@ OPTIONS: list[tuple[dict[str, Any], str]] = [
     (region(kind="mask", mask=[[True], [False, True]]), "contact_region.include.0.mask"),
     (region(kind="indices", indices=[0, -1]), "contact_region.include.0.indices.1"),
     ({"gripper": [7]}, "gripper"),
+    ({"suppression": {"disabled": True}}, "suppression.disabled"),
+    ({"support": {"disabled": True}}, "support."),
     ({"robot": {"name": "fr3", "T_base_cloud": 3, "joints": [0.0]}}, "robot.T_base_cloud"),
 ]
 
@@ -162,6 +164,7 @@ OPTIONS: list[tuple[dict[str, Any], str]] = [
         *(({"cloud": SOME} | options, f"options.{field}", "") for options, field in OPTIONS),
         ({"cloud": np.zeros((40, 2), np.float32)}, "cloud", "shape (40, 2)"),
         ({"cloud": np.zeros((40, 3), np.int64)}, "cloud", "dtype int64"),
+        ({"cloud": np.ma.masked_equal(SOME, 0.0)}, "cloud", "NaN"),
         ({"cloud": np.zeros((40, 3), dtype=object)}, "cloud", "dtype object"),
         ({"cloud": [[0.0, 0.0, 0.0]]}, "cloud", "a list"),
         ({"cloud": "cloud.las"}, "cloud", "'cloud.las'"),
