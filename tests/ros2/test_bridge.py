@@ -237,6 +237,8 @@ def test_a_mask_is_of_the_image_it_was_made_of_and_grows_old() -> None:
     of_first = at(1, mask, "mono8")
     assert inbox.take("mask", of_first, 1.5)
     assert inbox.scene(1.5) == Scene(depth=first, camera=CAMERA, mask=of_first)
+    late = sent("sensor_msgs/msg/CameraInfo", SIZE | {"header": HEADER | {"frame_id": "late"}})
+    assert inbox.take("camera", late, 1.5)  # the first of its camera
     assert not inbox.take("depth", second, 1.5)  # its mask is still to come
     assert inbox.take("depth", first, 1.5)  # that of the mask, which came before it
     assert inbox.take("depth", third, 1.5)  # the masks have stopped: an error
@@ -260,6 +262,8 @@ def test_a_slow_camera_stays_in_the_scene_and_the_first_image_waits_for_its_came
     assert inbox.scene(1.0).depth is slow
     fast.header.stamp.sec += 9  # the slow one has stopped
     assert inbox.scene(1.0).depth is fast
+    inbox.take("depth", slow, 1.0)  # it is late
+    assert inbox.scene(1.0).others == ()
 
 
 def test_images_of_several_cameras_are_one_cloud(asked) -> None:

@@ -151,6 +151,11 @@ def test_lines_are_whole_or_not_there(tmp_path: Path) -> None:
         file.write_text(body + "\n")
         with pytest.raises(ValueError, match="line 1"):
             read_outcomes(file, "abc")
+    file.write_bytes(b'{"a": 1}')  # an editor left out the newline
+    check_outcomes(file)
+    assert file.read_bytes() == b'{"a": 1}'
+    append_line(file, b'{"b": 2}\n')
+    assert file.read_bytes() == b'{"a": 1}\n{"b": 2}\n'
     file.write_bytes(b'{"a": 1}\n{"half')
     append_line(file, b'{"b": 2}\n')
     assert file.read_bytes() == b'{"a": 1}\n{"b": 2}\n'

@@ -129,7 +129,7 @@ class Inbox:
             self._sources[field].append(message)
             if field == "depth":
                 self._newest[message.header.frame_id] = message
-        masked = self._mask is not None and mask_age > 0
+        masked = self._mask is not None and mask_age > 0 and field != "camera"
         return self._mask_is_due(field, message, mask_age) if masked else new
 
     def _mask_is_due(self, field: str, message: Any, mask_age: float) -> bool:
@@ -170,7 +170,7 @@ class Inbox:
         if mask is None:
             # The first image's frame is the frame of the answer, which must not change.
             now, newest = source.header.stamp, sorted(self._newest.copy().items())
-            latest = [each for _, each in newest if _seconds(now, each.header.stamp) <= MAX_BEHIND]
+            latest = [it for _, it in newest if abs(_seconds(now, it.header.stamp)) <= MAX_BEHIND]
         source, *more = latest
         others = tuple((each, self._camera_of(each)) for each in more)
         return Scene(None, source, self._camera_of(source), mask, others, self._joints)

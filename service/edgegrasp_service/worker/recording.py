@@ -95,7 +95,7 @@ class TriedGrasp(BaseModel):
 
 
 def append_line(path: Path, line: bytes) -> None:
-    """Append a whole line or nothing; an incomplete last line is removed first.
+    """Append a whole line or nothing; an incomplete last line is replaced.
 
     Raises PayloadTooLarge if the file is full, and DiskFull if the disk is full or the file cannot
     be written.
@@ -106,8 +106,14 @@ def append_line(path: Path, line: bytes) -> None:
             end = file.seek(0, os.SEEK_END)
             if end > MAX_OUTCOMES_BYTES:
                 raise PayloadTooLarge("outcomes", "more than the file takes", "Move the file away.")
+            if not line:
+                return
             start = file.seek(max(0, end - MAX_LINE_BYTES))
-            end = start + file.read(MAX_LINE_BYTES).rfind(b"\n") + 1
+            tail = file.read(MAX_LINE_BYTES)
+            if tail.endswith(b"}"):  # complete; an editor left out the newline
+                line = b"\n" + line
+            else:
+                end = start + tail.rfind(b"\n") + 1
             file.truncate(end)
             file.seek(end)
             if file.write(line) != len(line):
