@@ -228,34 +228,36 @@ def _voxels(support: SupportPlane | None, points: Floats, T_base_cloud: Float64)
 def _hidden(support: SupportPlane | None, voxels: Float64, viewpoints: Float64) -> Float64:
     """Centers (U, 3) of voxels that `voxels` hide from every camera (W, 3), above the support."""
     steps = np.arange(VOXEL_SIZE, 2 * MAX_RANGE, VOXEL_SIZE)[:, None, None]
-    hidden = []
-    for eye in viewpoints:
-        places = (voxels + steps * unit(voxels - eye)).reshape(-1, 3)
-        kept = np.einsum("ij,ij->i", places, places) < MAX_RANGE**2
-        if support is not None:
-            kept &= heights_over(support, places) > VOXEL_SIZE / 2
-        hidden.append(places[kept] / VOXEL_SIZE)
-    return _centers(*hidden)
+    first, *others = viewpoints
+    places = (voxels + steps * unit(voxels - first)).reshape(-1, 3)
+    kept = np.einsum("ij,ij->i", places, places) < MAX_RANGE**2
+    if support is not None:
+        kept &= heights_over(support, places) > VOXEL_SIZE / 2
+    hidden = _centers(places[kept] / VOXEL_SIZE)
+    for eye in others:  # what lies behind a voxel from there too
+        away = np.linalg.norm(voxels - eye, axis=1)
+        aside, row = cKDTree(unit(voxels - eye)).query(unit(hidden - eye))
+        behind = np.linalg.norm(hidden - eye, axis=1) - away[row]
+        hidden = hidden[(aside * away[row] < VOXEL_SIZE) & (behind > VOXEL_SIZE / 2)]
+    return hidden
 
 
-def _centers(*groups: Floats, shifts: Sequence[float] = (0.0,)) -> Float64:
-    """Centers (V, 3) of the voxels that contain places (N, 3), in cells, of every group.
+def _centers(places: Floats, shifts: Sequence[float] = (0.0,)) -> Float64:
+    """Centers (V, 3) of the voxels that contain places (N, 3), in cells.
 
     Each place counts at every combination of the ascending shifts along the axes.
     """
-    columns = [np.ascontiguousarray(places.T) for places in groups]
-    if not all(column.size for column in columns):
+    if len(places) == 0:
         return np.empty((0, 3))
-    cells = [[np.floor(column + s).astype(np.int32) for s in shifts] for column in columns]
-    corner = np.min([cell[0].min(axis=1) for cell in cells], axis=0)[:, None]
-    size = np.max([cell[-1].max(axis=1) for cell in cells], axis=0) - corner[:, 0] + 1
-    common, strides = np.ones(size, dtype=bool), np.array([[size[1] * size[2]], [size[2]], [1]])
-    for cell in cells:
-        taken, steps = np.zeros(size, dtype=bool), [(each - corner) * strides for each in cell]
-        for x, y, z in product(steps, repeat=3):
-            taken.reshape(-1)[x[0] + y[1] + z[2]] = True
-        common &= taken
-    return np.asarray((np.argwhere(common) + corner.T + 0.5) * VOXEL_SIZE)
+    columns = np.ascontiguousarray(places.T)
+    cells = [np.floor(columns + shift).astype(np.int32) for shift in shifts]
+    corner = cells[0].min(axis=1)[:, None]
+    size = cells[-1].max(axis=1) - corner[:, 0] + 1
+    taken, strides = np.zeros(size, dtype=bool), np.array([[size[1] * size[2]], [size[2]], [1]])
+    steps = [(each - corner) * strides for each in cells]
+    for x, y, z in product(steps, repeat=3):
+        taken.reshape(-1)[x[0] + y[1] + z[2]] = True
+    return np.asarray((np.argwhere(taken) + corner.T + 0.5) * VOXEL_SIZE)
 
 
 def transform(T_b_a: Floats, points: ArrayLike) -> Float64:

@@ -4,6 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain, islice, pairwise
 from typing import NamedTuple
 
@@ -90,7 +91,8 @@ def plan_picks(
     start = time.perf_counter()
     picks: list[_Pick] = []
     failures: Counter[str] = Counter()
-    kept = _kept(detection)
+    joints, kept = np.array(start_joints), _kept(detection)
+    rank = partial(_rank, joints=joints, options=options, kept=kept)
     with arm_obstacles(robot, scene, robot_option, options.collision.obstacles) as obstacles:
         grasps = [grasp for grasp in detection.grasps if grasp.object not in obstacles.own]
         failures["on_arm"] = len(detection.grasps) - len(grasps)
@@ -103,14 +105,14 @@ def plan_picks(
             if not tried:
                 break
             failures.update(pick.outcome for pick in tried)
-            tried.sort(key=lambda pick: _rank(pick, np.array(robot_option.joints), options, kept))
+            tried.sort(key=rank)
             for pick in tried:
                 if moves and missing > 0 and pick.line and time.monotonic() <= deadline:
                     pick = arm.motion(pick)
                 picks.append(pick)
                 missing -= pick.tier <= (0 if moves else 1)
         untried = [_Pick(grasp, ArmPlan(False), "untried") for grasp in waiting]
-    picks = sorted([*picks, *untried], key=lambda pick: pick.tier)[: options.top_k]
+    picks = sorted([*picks, *untried], key=rank)[: options.top_k]
     return _reported(detection, picks, failures, robot_option, time.perf_counter() - start)
 
 
@@ -278,7 +280,8 @@ class _Arm:
         free = obstacles.voxels, boxes
         places = places_for(place, load, *free, self._scene, self._T_base_cloud)
         if (first := next(places, None)) is None:
-            if grasp.object is not None:
+            own = self._scene.object_of_point == grasp.object
+            if grasp.object is not None and own.sum() == len(held.points):  # and nothing beside it
                 self._without_place.add(grasp.object)
             return None
         T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand

@@ -13,13 +13,13 @@ pytest.importorskip("roboplan", reason="the extra robot is not installed")
 
 from tests.checks import refusal
 from tests.model.scenes import grid
-from tests.robot.arms import BOXES, HALF, TURNED, picks_of, scene_of, surface
+from tests.robot.arms import BOXES, HALF, TURNED, hand_over, picks_of, scene_of, surface
 
 from edgegrasp_model.gripper import HALF_TURN
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.scene.cloud import CanonicalFrame, pose_matrix
 from edgegrasp_results import Tracking
-from edgegrasp_robot import load_robot
+from edgegrasp_robot import load_robot, picks
 from edgegrasp_robot.obstacles import _near_robot, arm_obstacles
 
 CLOSE, CLOSE_ANGLE = 1e-3, np.deg2rad(0.2)  # metres, radians
@@ -215,6 +215,13 @@ def test_what_no_camera_saw_is_avoided_where_asked(fr3, eyes, reachable):
         detection = picks_of(fr3, boxes=BOXES[:1], more=[sign], eyes=eyes, avoid_unseen=avoid)
         assert detection.counts["reachable"] == expected
         assert detection.counts["arm_collision"] == 1 - expected
+
+
+def test_what_several_cameras_side_by_side_did_not_see_is_avoided(fr3):
+    sign = grid(np.arange(0.3, 0.7, 0.008), [-0.6], np.arange(0.16, 0.4, 0.008))
+    eyes = [(0.5 + 0.02 * row, -0.75, 0.12) for row in range(3)]
+    found = picks_of(fr3, boxes=BOXES[:1], more=[sign], eyes=eyes, avoid_unseen=True)
+    assert found.counts["reachable"] == 0
 
 
 TOUCHING = [{"kind": "box", "min": (x, 0.5, -0.1), "max": (x + 0.2, 0.9, 0.3)} for x in (0.4, 0.5)]
@@ -417,6 +424,40 @@ def test_what_stands_in_the_region_is_not_met(fr3):
     ((grasp, plan),) = plans_of(detection)
     assert np.abs(placed(grasp, plan)[:, None, :2] - there[None, :, :2]).max(axis=2).min() > 0.0
     assert np.abs(plan.T_base_place[:2, 3] - (0.45, -0.4)).max() > HALF
+
+
+def test_a_grasp_that_holds_more_than_its_object_does_not_rule_out_others_of_it(fr3):
+    def stacked(scene, detection):
+        raised = np.float32([0.0, 0.0, 0.06])
+        points = scene.points_in_cloud + raised * (scene.object_of_point == 0)[:, None]
+        readings = np.concatenate([points, scene.readings[len(points) :]])
+        box, block = detection.objects
+        poses = [hand_over(fr3.gripper, 0.5, 0.0, 0.04 - deep / 2) for deep in (0.025, -0.005)]
+        grasps = [replace(detection.grasps[0], T_cloud_hand=np.float32(pose)) for pose in poses]
+        objects = [replace(box, center=box.center + raised), block]
+        found = replace(detection, grasps=grasps, objects=objects)
+        return replace(scene, points_in_cloud=points, readings=readings), found
+
+    boxes = ((0.5, 0.0, 0.01), (0.5, 0.0, 0.03))
+    place = {"region": {"min": (0.3, -0.5, 0.0), "max": (0.6, -0.3, 0.3)}}
+    found = picks_of(fr3, np.eye(4), boxes=boxes, changed=stacked, place=place)
+    assert found.counts["reachable"] == 1
+
+
+def test_picks_whose_motions_are_found_late_are_sorted_too(fr3, monkeypatch):
+    def several(scene, detection):
+        one, other = detection.grasps
+        grasps = [replace(one, score=0.9)] * 6 + [replace(other, score=0.895)]
+        return scene, replace(detection, grasps=grasps)
+
+    motion, tried = picks._Arm.motion, count()
+    late = lambda self, pick: motion(self, pick) if next(tried) >= 5 else pick  # noqa: E731
+    monkeypatch.setattr(picks._Arm, "motion", late)
+    boxes = ((0.0, -0.5, 0.04), (0.5, 0.0, 0.05))
+    found = picks_of(fr3, np.eye(4), boxes=boxes, options={"top_k": 2}, changed=several)
+    away = [np.abs(grasp.arm.pregrasp_joints - fr3.home).max() for grasp in found.grasps]
+    keys = 0.02 * np.array(away) - [grasp.score for grasp in found.grasps]
+    assert (np.diff(keys) >= 0.0).all()
 
 
 def test_without_a_place_nothing_is_within_reach(fr3):
