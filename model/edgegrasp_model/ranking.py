@@ -161,7 +161,7 @@ def ranked(
     collision_free = collision_free | (options.collision.mode == "ignore")
     if options.order == "score":
         score = score - _drawbacks(scene, contact_index, hands, gripper)
-    worth = np.where(collision_free, score, COLLISION_FACTOR * score)
+    worth = np.where(collision_free, score, score - COLLISION_FACTOR * np.abs(score))
     keys: tuple[Array, ...] = (-worth,)
     if options.order == "highest":
         sure, height = worth >= SURE_SCORE, (hands @ gripper.T_hand_tcp)[:, 2, 3]
@@ -272,7 +272,9 @@ def _reason(
         return UngraspableReason.TOO_FLAT
     if not sample.collision_free[scored].any():
         allowed = outcome != OUTCOME_CODE[Outcome.DIRECTION]
-        return UngraspableReason.BLOCKED if allowed.any() else None
+        untried = OUTCOME_CODE[Outcome.NOT_CHECKED], OUTCOME_CODE[Outcome.NOT_SCORED]
+        blocked = allowed.any() and not np.isin(outcome, untried).any()
+        return UngraspableReason.BLOCKED if blocked else None
     hands = sample.candidates.T_cloud_hand[scored]
     _, hidden = _touched_first(scene, hands, gripper)
     return UngraspableReason.HIDDEN if hidden.mean() > 0.5 else None

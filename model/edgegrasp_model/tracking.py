@@ -126,7 +126,7 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
     surface: dict[int, Float32] = {}
     found = np.unique(number[number >= 0])
     named = {int(one): int(one) for one in found} if given else {}
-    renamed = number.copy() if given or previous.search else np.full_like(number, UNDECIDED)
+    renamed = number.copy() if given else np.where(number >= 0, UNDECIDED, number)
     taken = np.zeros(len(number), dtype=bool)
     places = [np.reshape(one.surface, (-1, 3)).astype(np.float64) for one in previous.objects]
     matches = [(*register_icp(before, cloud), row) for row, before in enumerate(places)]

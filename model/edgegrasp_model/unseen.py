@@ -23,14 +23,10 @@ HAND_SLICES = 9  # of the hand, along y
 OUTSIDE_SHARE = 0.5  # share of a slice's swept space, from which a hand reaches out of the image
 PLACES = 27  # places on the closing line, from beyond one finger to beyond the other
 NO_SURFACE = np.float32(np.inf)
-MIN_AHEAD = (
-    0.2  # cosine to the middle of the map from which a reading counts for an image's outline
-)
-HAND_CELLS = (
-    50  # cells of the map beyond the points if there are several cameras: a hand opens less
-)
+MIN_AHEAD = 0.2  # cosine to the middle of the map, from which a reading counts for an outline
+HAND_CELLS = 50  # cells of the map beyond the points, for several cameras: a hand opens less
 MIN_UP_SINE = 1e-3  # sine of the angle to up below which up cannot orient the map
-HALF_MAP_CELLS = 256  # most cells from the middle of the map to its edge: some 0.5 m
+HALF_MAP_CELLS = 640  # most cells from the middle of the map to its edge: some 1.4 m
 FAR_CELL = 10 * HALF_MAP_CELLS  # stands for everything beyond
 NUM_EXTENTS = 11
 EXTENT_POINTS = 256  # most points of an object that its extents are measured with
@@ -78,10 +74,15 @@ def unseen_space(
     )
 
 
-def enters_unseen(depths: Sequence["DepthMap"], T_cloud_hand: Float32, gripper: Gripper) -> Bools:
-    """Which hands (E,) would enter unseen space with more than their finger ends."""
+def enters_unseen(
+    depths: Sequence["DepthMap"], T_cloud_hand: Float32, gripper: Gripper, length: float
+) -> Bools:
+    """Which hands (E,) enter unseen space on an approach of `length` metres.
+
+    The ends of the fingers may.
+    """
     entered = np.zeros(len(T_cloud_hand), dtype=np.bool_)
-    for places in (*_palm_ways(gripper), *_ways(gripper)) if depths else ():
+    for places in (*_palm_ways(gripper, length), *_ways(gripper, length)) if depths else ():
         left = np.flatnonzero(~entered)
         behind = _behind(depths, T_cloud_hand[left], places)
         entered[left] = unseen(behind).mean(axis=1) > UNKNOWN_SHARE
@@ -155,22 +156,22 @@ def probes(gripper: Gripper) -> list[Float32]:
 
 
 @lru_cache(maxsize=16)
-def _ways(gripper: Gripper) -> list[Float32]:
+def _ways(gripper: Gripper, length: float = APPROACH_LENGTH) -> list[Float32]:
     """Points of the space that each finger sweeps behind its final position: each (S, 3)."""
     half, inner = gripper.pad_half_width, gripper.max_opening / 2
     root = min(low[2] for low, _ in gripper.finger.boxes)
     thick = gripper.finger_thickness
-    x, z = [-0.7 * half, 0.7 * half], root - np.linspace(0.0, APPROACH_LENGTH, 5)[1:]
+    x, z = [-0.7 * half, 0.7 * half], root - np.linspace(0.0, length, 5)[1:]
     return [_grid(x, side * (inner + np.array([0.15, 0.7]) * thick), z) for side in (1.0, -1.0)]
 
 
 @lru_cache(maxsize=16)
-def _palm_ways(gripper: Gripper) -> list[Float32]:
+def _palm_ways(gripper: Gripper, length: float = APPROACH_LENGTH) -> list[Float32]:
     """Points of the space that slices of the hand sweep, from end to end: each (S, 3)."""
     slices = []
     for low, high in gripper.hand.boxes:
-        x = 0.6 * np.array([low[0], high[0]])
-        z = np.linspace(low[2] - APPROACH_LENGTH, high[2], 7)[:-1]
+        x = (low[0] + high[0]) / 2 + 0.3 * (high[0] - low[0]) * np.array([-1.0, 1.0])
+        z = np.linspace(low[2] - length, high[2], 7)[:-1]
         slices += [_grid(x, [y], z) for y in np.linspace(low[1], high[1], HAND_SLICES)]
     return slices
 

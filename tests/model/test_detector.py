@@ -17,7 +17,7 @@ from edgegrasp_model.kernels import mean_over_similar
 from edgegrasp_model.networks.checkpoint import save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import Collision, DetectOptions, parse_options
-from edgegrasp_model.ranking import densest_first
+from edgegrasp_model.ranking import densest_first, ranked
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene import network
 from edgegrasp_model.scene.cloud import CloudInput, pose_matrix
@@ -352,6 +352,15 @@ def test_a_palm_in_space_that_no_camera_saw_counts_as_colliding(cameras, edge, b
     assert collides(behind, hand, np.float32([0.04]), PANDA, Collision()).tolist() == [blocked]
 
 
+@pytest.mark.parametrize(("length", "blocked"), [(0.0, False), (0.01, False), (0.05, True)])
+def test_unseen_space_is_entered_only_on_the_approach_asked_for(length, blocked) -> None:
+    plate = grid([-0.1], np.arange(-0.2, 0.2, 0.004), np.arange(-0.3, -0.03, 0.004))
+    eye = np.float32([[-0.6, 0.0, 0.0]])
+    hand, asked = np.eye(4, dtype=np.float32)[None], Collision(approach_length=length)
+    above = scene_of(plate.astype(np.float32), viewpoints=eye)
+    assert collides(above, hand, np.float32([0.04]), PANDA, asked).tolist() == [blocked]
+
+
 def test_hands_that_reach_out_of_the_image_come_last() -> None:
     left, right, top, bottom = 80, 250, 60, 200  # through the objects' surroundings
     image = rendered.SCENE[top:bottom, left:right]
@@ -379,6 +388,7 @@ def convinced(logit: float) -> GraspDetector:
         ((0.03, 0.05, 0.008), {}, "too-flat"),
         ((0.04, 0.06, 0.08), {"collision": {"obstacles": LID}}, "blocked"),
         ((0.04, 0.06, 0.03), {"collision": {"margin": 0.05}}, "blocked"),  # by the support
+        ((0.04, 0.06, 0.08), {"collision": {"obstacles": LID}, "num_candidates": 1}, None),
         ((0.04, 0.06, 0.08), {"viewpoint": (1.0, 0.0, 0.04)}, "hidden"),
         ((0.04, 0.06, 0.08), {"viewpoint": None}, "hidden"),  # from where it is assumed
     ],
@@ -388,6 +398,16 @@ def test_an_object_without_a_good_grasp_has_a_reason(size, options, reason) -> N
     asked = parse_options(known | {"approach_direction": {"preset": "top-down"}} | options)
     (single,) = convinced(-50.0).detect(box_on_table(3000, size=size), asked).objects
     assert single.reason == reason
+
+
+def test_objects_far_apart_have_a_hidden_side() -> None:
+    two = [box_on_table(3000) + np.float32([0.0, y, 0.0]) for y in (-0.7, 0.7)]
+    floor = grid(np.linspace(-0.1, 0.1, 40), np.linspace(-0.9, 0.9, 300), [0.0])
+    known = ASKED | {"viewpoint": (0.8, 0.0, 0.1), "objects": "off"}
+    asked = parse_options(known | {"approach_direction": {"preset": "top-down"}})
+    found = convinced(50.0).detect(np.concatenate([*two, floor]).astype(np.float32), asked)
+    hidden = [grasp.far_side_hidden for grasp in found.grasps]
+    assert np.mean(hidden) > 0.5
 
 
 @pytest.mark.parametrize("second", [False, True])
@@ -459,6 +479,14 @@ def test_hands_are_averaged_with_others_on_the_same_object_that_are_near_and_tur
     found = mean_over_similar(logits, poses, number, 0.03, 0.5)
     np.testing.assert_allclose(found[:3], [-1.5, 0.5, 1.0], atol=1e-6)
     assert np.isnan(found[3:]).all()
+
+
+def test_a_colliding_hand_comes_after_the_same_hand_that_is_free() -> None:
+    outside = np.eye(4)[[3, 3, 0]] * (0, 0, 0, 1)  # no image contains it
+    scene = scene_of(np.zeros((4, 3), np.float32), P_image_cloud=outside)
+    alike = hands([1.0, 1.0], [0.0, 0.0]), np.full(2, 0.31), np.array([False, True])
+    order, _ = ranked(scene, np.zeros(2, int), *alike, PANDA, DetectOptions(), None)
+    assert order[0] == 1
 
 
 def test_a_hand_among_good_ones_comes_before_a_lone_one_that_is_hardly_better() -> None:

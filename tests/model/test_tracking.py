@@ -16,6 +16,7 @@ from edgegrasp_results import Evaluation, Grasp
 
 from .scenes import PANDA, grid, scene_of
 
+BLOCK = grid(*[np.arange(0, 0.04, 0.004)] * 3)  # (1000, 3)
 NOTHING = np.zeros((9, 3), np.float32)  # points in one place
 
 
@@ -49,6 +50,17 @@ def test_an_object_is_found_where_it_was_moved_to(millimetres: Any, degrees: flo
     assert apart.max() < 0.003
     _, share = following.register_icp(np.repeat(points[:1], 9, axis=0), surface)  # all in one place
     assert share == 1.0
+
+
+def test_the_surface_of_an_object_has_no_points_of_another() -> None:
+    points = np.concatenate([BLOCK + (x, 0.0, 0.0) for x in (0.0, 0.3, 0.6)]).astype(np.float32)
+    scene = scene_of(points, object_of_point=np.repeat([0, 1, 2], len(BLOCK)))
+    before = {"number": 0, "surface": (BLOCK[::8] + (0.6, 0.0, 0.0)).ravel().tolist()}
+    previous = parse_options({"previous": {"objects": [before]}}).previous
+    assert previous is not None
+    _, followed = following.follow(scene, previous, given=False, chosen=False)
+    assert len(followed.surface) == 3
+    assert all(np.ptp(one[:, 0]) < 0.1 for one in followed.surface.values())
 
 
 def test_a_can_does_not_turn_with_a_camera_that_goes_around_it() -> None:

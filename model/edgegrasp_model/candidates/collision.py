@@ -73,7 +73,7 @@ def collides(
         hands = in_hands(background, T_cloud_hand[free])
         between, *_ = points_in_hand_boxes(hands, *np.array([low, high], np.float32))
         hit[free] = np.bincount(between, minlength=len(free)) >= MIN_BACKGROUND_VOXELS
-        hit[free] |= enters_unseen(scene.depths, T_cloud_hand[free], gripper)
+        hit[free] |= enters_unseen(scene.depths, T_cloud_hand[free], gripper, request.behind)
     return hit
 
 
