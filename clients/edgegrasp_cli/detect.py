@@ -199,7 +199,8 @@ def decode_request(cloud: Any, asked: Mapping[str, Any]) -> tuple[CloudInput, De
         fields["depth_images"] = request.depth_images
     else:
         fields["cloud"] = File(*cloud_file(request.cloud))
-    return decode_cloud(fields, parse_options(request.options), sys.maxsize)
+    options = parse_options(request.options)
+    return decode_cloud(fields, options, sys.maxsize), options
 
 
 def _check_outputs(flags: DetectFlags, fields: Mapping[str, Any]) -> None:

@@ -28,9 +28,10 @@ from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import Collision, DetectOptions
 from edgegrasp_model.results import NoGraspReason, UnitCosts
-from edgegrasp_model.scene.cloud import assumed_viewpoint, check_cloud
+from edgegrasp_model.scene.cloud import HAND_REACH, assumed_viewpoint, check_cloud
 from edgegrasp_model.scene.scene import (
     MAX_VOXELS,
+    NO_OBJECT,
     Scene,
     SelectedPoints,
     build_scene,
@@ -134,12 +135,16 @@ class GraspDetector:
                 f"uncalibrated for {gripper.name!r}; use them for ranking only."
             )
         if options.viewpoint is None:
-            eye = assumed_viewpoint(sent, options, warnings)
+            eye = getattr(cloud, "viewpoint", None)  # of a CloudInput
+            eye = assumed_viewpoint(sent, options, warnings) if eye is None else eye
             options = options.model_copy(update={"viewpoint": eye})
         previous, followed, choice = options.previous, None, options.objects
         if previous is not None:
             options = tracking.narrowed(options, gripper.name, sent.points)
-        selected = select_points(sent, options, counts, warnings)
+        rules, counts["points"] = options.collision, len(sent.points)
+        moved = max(rules.approach_length, rules.retreat_length) + rules.margin
+        further = max(gripper.reach + moved - HAND_REACH, 0.0)
+        selected = select_points(sent, options, further, counts, warnings)
         scene = build_scene(selected, options, self.metadata.voxel_size, counts, max_voxels)
         if scene is None:
             warnings.append(
@@ -194,7 +199,8 @@ class GraspDetector:
             score: Floats = np.empty(0, dtype=np.float32)
             outcome = np.empty(0, dtype=np.int8)
             if scene is not None and not scene.approach_allowed.any():
-                prepared.warnings.append(NO_APPROACH_POINT)
+                why = NO_APPROACH_POINT if options.approach_region else NO_OBJECT
+                prepared.warnings.append(why)
             elif sample is not None and len(sample.logits) == 0:
                 prepared.warnings.append(NO_CANDIDATE)
             elif scene is not None and sample is not None:
@@ -252,14 +258,14 @@ class GraspDetector:
     ) -> Scoring:
         """Score the caller's edges or hand poses, in order (the paper's grasp evaluation function).
 
-        Regions, approach directions, and options on sampling and selection have no effect. The hand
-        of an edge that would cut into the support is retracted where that helps; given poses stay
-        as they are.
+        Approach directions, and options on sampling and selection, have no effect; regions only
+        mark an object that is not recognised. The hand of an edge that would cut into the support
+        is retracted where that helps; given poses stay as they are.
         """
         if edges is not None and hand_poses is not None:
             raise InvalidRequest("hand_poses", "poses beside edges", "Send one of the two.")
         options = options or DetectOptions()
-        unused = dict.fromkeys(("approach_region", "contact_region", "num_approach_points"))
+        unused = dict.fromkeys(("num_approach_points", "previous"))
         options = options.model_copy(update=unused)
         prepared = self.prepare(cloud, options, max_voxels, thin=edges is None)
         rows = len(prepared.selected.labels)

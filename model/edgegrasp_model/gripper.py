@@ -56,6 +56,12 @@ class Gripper:
         return transform
 
     @cached_property
+    def reach(self) -> float:
+        """Metres from a contact point to the farthest corner of the open hand."""
+        x, y, z = np.abs(self.open_boxes.reshape(-1, 3) - (0.0, 0.0, self.contact_z)).T
+        return float(np.sqrt(x**2 + (y + self.max_opening / 2) ** 2 + z**2).max())
+
+    @cached_property
     def symmetric(self) -> bool:
         """Whether the open gripper is the same after half a turn about its z."""
         boxes = self.open_boxes.reshape(-1, 6)

@@ -47,13 +47,8 @@ class File(NamedTuple):
     data: bytes
 
 
-def decode_cloud(
-    fields: Mapping[str, Any], options: DetectOptions, max_points: int
-) -> tuple[CloudInput, DetectOptions]:
-    """Decode the cloud of a request, one of SOURCES, and its per-point arrays, any of PER_POINT.
-
-    Also returns the options, in which the cameras of depth images are the viewpoints.
-    """
+def decode_cloud(fields: Mapping[str, Any], options: DetectOptions, max_points: int) -> CloudInput:
+    """Decode the cloud of a request, one of SOURCES, and its per-point arrays, any of PER_POINT."""
     sources = [name for name in SOURCES if fields.get(name) is not None]
     if not sources:
         fix = "Send points in metres, point_cloud2, depth_images or a file."
@@ -77,8 +72,6 @@ def decode_cloud(
         cloud = read_file(file.format, file.data, max_points)
     else:
         cloud = CloudInput(decode_points(fields[source], max_points))
-    if options.viewpoint is None and cloud.viewpoint is not None:
-        options = options.model_copy(update={"viewpoint": cloud.viewpoint})
     arrays: dict[str, Any] = {}
     for name in PER_POINT:
         if fields.get(name) is None:
@@ -86,7 +79,7 @@ def decode_cloud(
         if getattr(cloud, name) is not None:
             raise InvalidRequest(name, "an array beside the one in the cloud", "Send it once.")
         arrays[name] = decode_array(name, fields[name], max_points)
-    return replace(cloud, **arrays), options
+    return replace(cloud, **arrays)
 
 
 # Points and arrays beside them

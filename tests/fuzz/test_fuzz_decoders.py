@@ -70,8 +70,7 @@ def decoding(size: int) -> Iterator[None]:
 
 def decode(size: int, **fields: Any) -> None:
     with decoding(size):
-        cloud, _ = decode_cloud(fields, DetectOptions(), MAX_POINTS)
-        check_cloud(cloud, 32)
+        check_cloud(decode_cloud(fields, DetectOptions(), MAX_POINTS), 32)
 
 
 @pytest.mark.parametrize("file_format", FILES)

@@ -22,7 +22,7 @@ from edgegrasp_model.scene.cloud import (
     seen_from_origin,
     voxelise,
 )
-from edgegrasp_model.scene.scene import check_region, inside_region, labels_of_all_pixels
+from edgegrasp_model.scene.scene import check_regions, inside_region, labels_of_all_pixels
 from edgegrasp_service.errors import PayloadTooLarge
 
 from .scenes import SEED, random_hands
@@ -192,7 +192,7 @@ def test_a_large_image_of_something_near_keeps_every_second_row(distance: float,
 )
 def test_rows_that_the_cloud_does_not_have_are_refused(shape: object, field: str) -> None:
     with refusal(field, fix="Send"):
-        check_region(Region(exclude=(shape,)), rows(), "contact_region")
+        check_regions(DetectOptions(contact_region=Region(exclude=(shape,))), rows())
 
 
 MANY = 100_000
@@ -223,12 +223,9 @@ def test_points_project_back_onto_their_pixels() -> None:
     np.testing.assert_allclose(FX * x / z + CX, column, atol=1e-4)
     np.testing.assert_allclose(FY * y / z + CY, row, atol=1e-4)
     np.testing.assert_array_equal(cloud.viewpoint, T_cloud_camera[:3, 3])
-    sent = {"depth_images": [image(depth, T_cloud_camera)]}
-    _, options = wire.decode_cloud(sent, DetectOptions(), MANY)
-    assert options.viewpoint == tuple(T_cloud_camera[:3, 3].tolist())
     archive = wire.File("npz", npz(depth=depth, intrinsics=np.array([FX, FY, CX, CY])))
-    _, options = wire.decode_cloud({"cloud": archive}, DetectOptions(), MANY)
-    assert options.viewpoint == (0.0, 0.0, 0.0)
+    read = wire.decode_cloud({"cloud": archive}, DetectOptions(), MANY)
+    assert read.viewpoint == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("kind", ["<f4", "<f8", "<u2"])
@@ -268,15 +265,20 @@ def test_intrinsics_that_do_not_fit_the_image_are_refused(intrinsics, field, val
         wire.read_depth_images([image(depth_of(), pose(0)) | {"intrinsics": intrinsics}], MANY)
 
 
+def test_a_single_row_does_not_look_along_z() -> None:
+    image, x = np.full((2, 200, 3), np.nan, np.float32), np.linspace(-1.9, 1.9, 200)
+    image[0] = np.stack([x, 0 * x, 1 + 0 * x], axis=1)
+    assert not check_cloud(image).looks_along_z()
+
+
 def test_views_are_fused_and_doubtful_intrinsics_get_a_warning() -> None:
     depths = [depth_of(seed=seed) for seed in range(3)]
     poses = [pose(seed) for seed in range(3)]
     depths[0][0, 0] = np.nan
     images = [image(depth, at) for depth, at in zip(depths, poses, strict=True)]
     sent = {"depth_images": images, "segment_ids": list(range(3 * 24 * 32))}
-    cloud, options = wire.decode_cloud(sent, DetectOptions(), MANY)
-    np.testing.assert_allclose(options.viewpoint, [at[:3, 3] for at in poses])
-    assert DetectOptions.model_validate(options.model_dump()) == options
+    cloud = wire.decode_cloud(sent, DetectOptions(), MANY)
+    np.testing.assert_allclose(cloud.viewpoint, [at[:3, 3] for at in poses])
     checked = check_cloud(cloud)
     np.testing.assert_array_equal(checked.segment_ids, np.arange(1, 3 * 24 * 32))
     for view, single in enumerate(images):

@@ -13,6 +13,7 @@ from edgegrasp_camera.depth import DepthView, Intrinsics, fuse_depth_images
 from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue, choose_device
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, UnknownModel
+from edgegrasp_model.gripper import gripper_fields
 from edgegrasp_model.kernels import mean_over_similar
 from edgegrasp_model.networks.checkpoint import save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
@@ -25,7 +26,17 @@ from edgegrasp_results import Detection, Grasp
 from edgegrasp_training.recipes import build_network
 
 from . import rendered
-from .rendered import FOCAL_LENGTH, HEIGHT, WIDTH, box, boxes_on_table, camera, render, table
+from .rendered import (
+    FOCAL_LENGTH,
+    HEIGHT,
+    WIDTH,
+    box,
+    boxes_on_table,
+    camera,
+    render,
+    table,
+    to_world,
+)
 from .scenes import PANDA, TINY, box_on_table, detector, grid, scene_of
 
 CLOUD = box_on_table()
@@ -102,9 +113,19 @@ def test_several_depth_images_show_each_object_once() -> None:
     intrinsics = Intrinsics(FOCAL_LENGTH, FOCAL_LENGTH, WIDTH / 2, HEIGHT / 2)
     depths = [render(boxes, pose)[..., 2] for pose in poses]
     cloud = fuse_depth_images(depths, [DepthView(intrinsics, pose) for pose in poses])
-    found = detector().detect(cloud, DetectOptions.model_validate({"viewpoint": cloud.viewpoint}))
+    found = detector().detect(cloud)
     assert len(found.objects) == 4
     assert found.grasps
+    assert not found.warnings
+
+
+def test_objects_of_a_few_scattered_points_are_none() -> None:
+    places = np.random.default_rng(0).uniform(-0.02, 0.02, (20_000, 2))
+    plate = np.column_stack([places, np.full(20_000, 0.01)])
+    ids = (np.arange(20_000) % 100 == 0).astype(int)
+    found = detect(CloudInput(plate, segment_ids=ids))
+    assert not found.grasps
+    assert "no object" in found.warnings[-1]
 
 
 def test_normals_that_contradict_each_other_are_estimated() -> None:
@@ -142,7 +163,7 @@ def test_a_raw_cloud_is_seen_from_its_origin_and_the_answer_says_so(catalogue) -
     assert len(assumed.grasps) > 0
     assert any("the camera is assumed at the origin" in each for each in assumed.warnings)
     # Not below a table that is given.
-    above = rendered.to_world(camera(0.7, 0.0, 0.9), cloud) + np.array([0.0, 0.0, 1.0])
+    above = to_world(camera(0.7, 0.0, 0.9), cloud) + np.array([0.0, 0.0, 1.0])
     support = {"normal": (0.0, 0.0, 1.0), "offset": 1.0}
     found = network.detect(above, DetectOptions.model_validate({"support": support}))
     assert found.grasps[0].score > 0.8
@@ -220,6 +241,33 @@ def test_where_every_hand_collides_further_points_are_tried_and_hands_are_marked
     assert len(found.debug.outcome) == found.counts["candidates"]
     if mode == "avoid":
         assert Counter(found.debug.outcome)[Outcome.COLLISION] == found.counts["checked"]
+
+
+def detect_beside(wall: np.ndarray, **fields: object) -> list[Grasp]:
+    """Grasps of the box beside more points, inside a workspace that contains the box alone."""
+    cloud = np.concatenate([CLOUD, wall]).astype(np.float32)
+    sent = CloudInput(cloud, segment_ids=(np.arange(len(cloud)) < len(CLOUD)).astype(int))
+    where = {"min": (-0.3, -0.3, 0.0), "max": (0.03, 0.3, 0.2)}
+    asked = {"viewpoint": (0.1, 0.5, 0.5), "min_score": 0.0, "workspace": where}
+    return detect(sent, **asked | fields).grasps
+
+
+def test_a_lift_is_checked_to_its_end() -> None:
+    board = grid(np.arange(-0.3, 0.3, 0.004), np.arange(-0.3, 0.3, 0.004), [0.5])
+    down = {"cones": [{"direction": (0, 0, -1), "max_angle": 0.3}]}
+    for length, found in ((0.1, True), (0.4, False)):
+        lift = {"retreat_length": length, "retreat_direction": "up"}
+        assert bool(detect_beside(board, collision=lift, approach_direction=down)) == found
+
+
+def test_the_back_of_a_long_hand_is_checked_beyond_the_workspace() -> None:
+    wall = grid([0.34], np.arange(-0.3, 0.3, 0.004), np.arange(0, 0.3, 0.004))
+    long = gripper_fields("panda")
+    long["hand"]["boxes"].append([[-0.045, -0.045, -0.2], [0.045, 0.045, -0.026]])
+    side = {"cones": [{"direction": (-1, 0, 0), "max_angle": 0.2}]}
+    for moved, found in ((0.3, True), (0.0, False)):
+        beside = wall + np.array([moved, 0.0, 0.0])
+        assert bool(detect_beside(beside, approach_direction=side, gripper=long)) == found
 
 
 def test_hands_stay_above_the_support_that_is_seen_not_the_one_that_is_given() -> None:
@@ -494,6 +542,46 @@ def test_a_hand_among_good_ones_comes_before_a_lone_one_that_is_hardly_better() 
     for lone, first in ((0.92, 1), (0.99, 3)):
         worth = np.array([0.9, 0.91, 0.9, lone])
         assert densest_first(order, worth, poses)[0] == first
+
+
+def test_an_object_is_whole_at_a_side_beyond_which_the_table_is_seen() -> None:
+    T_world_camera = camera(0.7, -1.5, 0.7)
+    cloud = to_world(
+        T_world_camera, render([table(), box((0, 0, 0.05), (0.03, 0.03, 0.05))], T_world_camera)
+    ).astype(np.float32)
+    where = {"min": (-0.2, -0.2, -0.05), "max": (0.032, 0.2, 0.3)}
+    asked = parse_options({"viewpoint": T_world_camera[:3, 3].tolist(), "workspace": where})
+    for sent, cut in ((cloud, False), (cloud[cloud[..., 0] < 0.032], True)):
+        scene = detector().prepare(sent, asked).scene
+        assert scene is not None
+        assert scene.at_side.any() == cut
+
+
+def test_grasps_of_a_marked_object_are_scored_as_they_were_found() -> None:
+    bar, block = box((0, 0, 0.03), (0.26, 0.025, 0.03)), box((0.1, 0.15, 0.03), (0.02, 0.03, 0.03))
+    T_world_camera = camera(0.7, -1.5, 0.9)
+    cloud = to_world(T_world_camera, render([table(), bar, block], T_world_camera))
+    mask = (bar.distance(cloud.reshape(-1, 3)) < 0.004) & (np.abs(cloud[..., 0]).ravel() < 0.08)
+    mask &= cloud[..., 2].ravel() > 0.01
+    region = {"include": [{"kind": "mask", "mask": mask.tolist()}]}
+    known = {"viewpoint": T_world_camera[:3, 3].tolist(), "min_score": 0.0}
+    asked = parse_options(known | {"approach_region": region})
+    found = detector().detect(cloud.astype(np.float32), asked).grasps
+    poses = np.stack([grasp.T_cloud_hand for grasp in found])
+    scored = detector().score(cloud.astype(np.float32), asked, hand_poses=poses).evaluations
+    for mine, theirs in zip(scored, found, strict=True):
+        assert mine.grasp is not None
+        assert mine.grasp.collision_free
+        assert mine.grasp.object == theirs.object
+
+
+def test_a_wall_is_no_support_of_kind_ransac() -> None:
+    T_world_camera = camera(1.15, -1.5, 0.9)
+    wall = box((0, 0.42, 0.4), (0.9, 0.01, 0.45))
+    cloud = render([table(), wall, *boxes_on_table(1)], T_world_camera)
+    seen = detector().detect(cloud, DetectOptions(viewpoint=(0, 0, 0), support="ransac")).support
+    assert seen is not None
+    assert T_world_camera[2, :3] @ seen.normal > 0.99
 
 
 def test_a_long_approach_and_retreat_are_checked_to_their_ends() -> None:

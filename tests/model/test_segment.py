@@ -616,7 +616,7 @@ def built(points: np.ndarray, **support: object) -> tuple[np.ndarray, list[str]]
     workspace = {"min": (-0.15, -0.15, 0.055), "max": (0.15, 0.15, 0.3)}
     where = {"viewpoint": CAMERA.tolist(), "workspace": workspace, "objects": "off"}
     options = parse_options({"support": PLANE | support} | where)
-    selected = select_points(check_cloud(points.astype(np.float32)), options, {}, warnings)
+    selected = select_points(check_cloud(points.astype(np.float32)), options, 0.0, {}, warnings)
     found = build_scene(selected, options, 0.004, {})
     assert len(found.readings) == len(points)  # whatever the workspace
     if options.support.max_depth_error > 0:

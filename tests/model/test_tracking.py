@@ -53,9 +53,10 @@ def test_an_object_is_found_where_it_was_moved_to(millimetres: Any, degrees: flo
 
 
 def test_the_surface_of_an_object_has_no_points_of_another() -> None:
-    points = np.concatenate([BLOCK + (x, 0.0, 0.0) for x in (0.0, 0.3, 0.6)]).astype(np.float32)
+    blocks = [BLOCK + np.array([x, 0, 0]) for x in (0.0, 0.3, 0.6)]
+    points = np.concatenate(blocks).astype(np.float32)
     scene = scene_of(points, object_of_point=np.repeat([0, 1, 2], len(BLOCK)))
-    before = {"number": 0, "surface": (BLOCK[::8] + (0.6, 0.0, 0.0)).ravel().tolist()}
+    before = {"number": 0, "surface": (BLOCK[::8] + np.array([0.6, 0, 0])).ravel().tolist()}
     previous = parse_options({"previous": {"objects": [before]}}).previous
     assert previous is not None
     _, followed = following.follow(scene, previous, given=False, chosen=False)

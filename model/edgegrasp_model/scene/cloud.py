@@ -62,9 +62,9 @@ class CheckedCloud:
             return False
         down, right = np.divmod(subsample(self.row), self.image_size[1])
         x, y, z = subsample(self.points).T
-        with np.errstate(all="ignore"):  # NaN of a single column, which is false
+        with np.errstate(all="ignore"):  # NaN of a single row or column, which is false
             along = np.corrcoef(right, x / z)[0, 1], np.corrcoef(down, y / z)[0, 1]
-        return bool(min(along) > 0.9)
+        return bool(np.min(along) > 0.9)
 
     def projection(self, frame: "CanonicalFrame", eyes: Float64) -> Float64 | None:
         """The projection (3, 4) of canonical points into the image that was sent.

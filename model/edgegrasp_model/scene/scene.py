@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,7 +11,6 @@ from scipy import ndimage
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.gripper import APPROACH_LENGTH
 from edgegrasp_model.options import (
     AutoPlane,
     Box,
@@ -130,18 +130,17 @@ class SelectedPoints:
 
 
 def select_points(
-    sent: CheckedCloud, options: DetectOptions, counts: dict[str, int], warnings: list[str]
+    sent: CheckedCloud,
+    options: DetectOptions,
+    further: float,  # metres beyond HAND_REACH that a hand may reach
+    counts: dict[str, int],
+    warnings: list[str],
 ) -> SelectedPoints:
     """Correct depths, segment, remove the support, and drop what no hand at an object can reach."""
-    viewpoints = camera_positions(sent, options)
+    viewpoints, found = camera_positions(sent, options), None
     given = sent.segment_ids is not None or options.objects == "off"
-    for name in ("approach_region", "contact_region"):
-        if (region := getattr(options, name)) is not None:
-            check_region(region, sent, name)
-    counts["points"], found = len(sent.points), None
-    if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
-        sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
-    readings, further = sent, max(options.collision.behind - APPROACH_LENGTH, 0.0)
+    check_regions(options, sent)
+    readings = sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
     if options.workspace is not None:
         reach = further + (FOLLOWED_REACH if options.follows_only else HAND_REACH)
         sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
@@ -165,16 +164,16 @@ def select_points(
     sent, inside = sent.take(above), inside[above]
     counts["above_support"] = int(inside.sum())
     plan = (support.frame.points_from_cloud(sent.points) if support else sent.points)[:, :2]
-    number, confidence = number[above], dict[int, float]()
+    number, certain = number[above], np.empty(0)
     if found is not None and not given:
         if support is not None:
             is_cropped = math.isnan(support.growth)
             number, certain = objects_above(found, above, plan, height, margin, is_cropped)
-            confidence = dict(enumerate(certain.tolist()))
         elif options.viewpoint is not None and (
             (found.object_of_point >= 0).any() or np.median(seen.distance()) < NEAREST_DEPTH
         ):
-            number, confidence = found.object_of_point, dict(enumerate(found.confidence.tolist()))
+            number, certain = found.object_of_point, found.confidence
+    confidence = dict(enumerate(certain.tolist()))
     if not given:
         number = drop_long_objects(number, sent.points, options.max_object_size)
         number = add_marked(number, len(confidence), sent, options)
@@ -235,7 +234,7 @@ def build_scene(
     None if there is no object; InvalidRequest: there are too many voxels.
     """
     sent, support, viewpoints = selected.cloud, selected.support, selected.viewpoints
-    obstacles = options.collision.obstacles
+    obstacles, readings = options.collision.obstacles, selected.readings.points
     if not (selected.object_of_point >= 0).any():
         counts |= {"voxels": 0, "kept": 0}
         return None
@@ -268,12 +267,12 @@ def build_scene(
         contact_allowed=contact,
         object_of_point=number,
         support=None if support is None else plane_in(frame, support.plane_under(objects, spare)),
-        at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, sent.points),
+        at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, readings),
         viewpoints=(eyes[:0] if options.viewpoint is None else eyes).astype(np.float32),
         confidence=selected.confidence,
         P_image_cloud=projection,
         obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
-        readings=selected.readings.points,
+        readings=readings,
         readings_by_camera=_readings_by_camera(selected.readings, frame, len(eyes)),
     )
 
@@ -333,7 +332,7 @@ def near_workspace_side(
     """Which points (V, 3) lie within 6 mm of a side of the workspace beyond which nothing was seen.
 
     An object there may be cut off and wider than it looks. Floor and ceiling do not count. `seen`
-    (N, 3) are the points of the cloud, some of which may lie outside of the workspace.
+    (N, 3) are the points of the whole cloud, some of which may lie outside of the workspace.
     """
     if workspace is None:
         return np.zeros(len(points), dtype=bool)
@@ -364,11 +363,11 @@ def camera_positions(sent: CheckedCloud, options: DetectOptions) -> Float64:
 # Regions, and objects that a request names
 
 
-def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
-    """Check that the rows and segments of a region exist; InvalidRequest names its `field`."""
-    for part in ("include", "exclude"):
-        for place, shape in enumerate(getattr(region, part)):
-            here, rows = f"options.{field}.{part}.{place}", cloud.rows_sent
+def check_regions(options: DetectOptions, cloud: CheckedCloud) -> None:
+    """Check that the rows and segments of the regions exist; InvalidRequest names the field."""
+    for name, part in product(("approach_region", "contact_region"), ("include", "exclude")):
+        for place, shape in enumerate(getattr(getattr(options, name), part, ())):
+            here, rows = f"options.{name}.{part}.{place}", cloud.rows_sent
             if isinstance(shape, Indices) and max(shape.indices, default=0) >= rows:
                 value = f"row {max(shape.indices)} of a cloud of {rows} rows"
                 raise InvalidRequest(f"{here}.indices", value, f"Send rows from 0 to {rows - 1}.")

@@ -137,6 +137,7 @@ def find_support(
     if isinstance(request, SupportPlane):
         found = _given_support(seen, segmentation, request, options, warnings)
     elif isinstance(request, RansacPlane):
+        up = segmentation.up if up is None and segmentation is not None else up
         cell, count = grid_cells(seen.points, AREA_CELL)  # equal areas get equal weight
         plane = fit_plane(seen, inside / count[cell], rng, up, request.max_tilt)
         if plane is not None:
@@ -390,12 +391,14 @@ def _heights(
 
 
 def correct_depth_scale(
-    sent: CheckedCloud, plane: SupportPlane, viewpoints: Float64, warnings: list[str]
+    sent: CheckedCloud, plane: object, viewpoints: Float64, warnings: list[str]
 ) -> CheckedCloud:
-    """Scale every view about its camera so that its support lies in the given plane.
+    """Scale every view about its camera so that its support lies in the plane, if one is given.
 
     `viewpoints` (W, 3), metres, are the cameras; the cloud's `view_ids` are their rows.
     """
+    if not isinstance(plane, SupportPlane) or plane.max_depth_error == 0.0:
+        return sent
     several = len(viewpoints) > 1 and sent.view_ids is not None
     points = sent.points.copy()
     for number, viewpoint in enumerate(viewpoints):

@@ -200,7 +200,7 @@ class _RunningJob:
                 detector = self.catalogue.get(options.model)
                 given = _given(fields, options, most) if self.job.method == "ScoreGrasps" else {}
                 in_time = self._within_deadline(most, self.catalogue.unit_costs.point)
-                cloud, options = decode_cloud(fields, options, in_time)
+                cloud = decode_cloud(fields, options, in_time)
         except MemoryError:
             value, fix = f"{size} bytes that take too much memory to read", "Send packed arrays."
             raise errors.PayloadTooLarge("body", value, fix) from None
