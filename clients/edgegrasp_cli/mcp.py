@@ -284,7 +284,7 @@ def _with_sentences(function: Callable[..., Any], folder: Path) -> Callable[...,
     def run(**arguments: Any) -> Any:
         try:
             return function(**arguments)
-        except (EdgeGraspError, GraspClientError, OSError, ValueError) as error:
+        except (EdgeGraspError, GraspClientError, OSError, RuntimeError, ValueError) as error:
             raise ToolError(str(error).replace(f"{folder}/", "")) from error
 
     return run

@@ -6,6 +6,8 @@ passes them on. The server's workers decode them.
 
 import json
 import math
+import signal
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -74,6 +76,8 @@ def open_inference(
 
     It does not require a token: put a gateway in front of it that checks tokens.
     """
+    # When it has stopped, uvicorn raises the signal again; gRPC has calls to finish.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     with flags.connect(flags.server) as client:
         models = Models(client, name, flags.timeout)
         place = f"[{host}]" if ":" in host else host  # IPv6 is in brackets
@@ -239,6 +243,8 @@ def _grpc_infer(models: Models, request: Any, call: Any) -> dict[str, Any]:
         raise invalid("raw_input_contents", value, "Give each one.")
     tensors = {}
     for number, each in enumerate(request.inputs):
+        if each.name in tensors:
+            raise invalid("inputs", f"{each.name} twice", "Give each one once.")
         field = CONTENT_FIELDS.get(each.datatype, "fp32_contents")
         data = raw[number] if raw else getattr(each.contents, field)
         tensors[each.name] = tensor(each.name, each.datatype, each.shape, data)
@@ -318,8 +324,8 @@ def _http_infer(
             if data is None:
                 end = start + int(each["parameters"]["binary_data_size"])
                 data, start = binary[start:end], end
-            if not isinstance(each["name"], str):
-                raise TypeError("a name that is not text")
+            if not isinstance(each["name"], str) or each["name"] in tensors:
+                raise TypeError("a name that is not text or is there twice")
             tensors[each["name"]] = tensor(each["name"], each["datatype"], each["shape"], data)
         parameters = dict((request.get("parameters") or {}).items())
         wanted = [str(each["name"]) for each in request.get("outputs") or ()]

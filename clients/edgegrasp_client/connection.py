@@ -3,6 +3,7 @@
 import math
 import random
 import re
+import ssl
 import subprocess
 import sysconfig
 from collections.abc import Iterator, Sequence
@@ -120,9 +121,20 @@ def local_server(*flags: str, program: Sequence[str] = ()) -> Iterator[Addresses
 
 def unreachable(address: str, why: str) -> ServerUnavailableError:
     """The exception for a call whose connection was not made or broke."""
-    hint = "Check the address, whether it needs TLS or a proxy (the variables http_proxy and "
-    hint += "no_proxy), and that `edgegrasp serve` runs there."
+    hint = "Check the address, whether it needs TLS, a client certificate or a proxy (the "
+    hint += "variables http_proxy and no_proxy), and that `edgegrasp serve` runs there."
     return ServerUnavailableError(f"No connection to {address} ({why}). {hint}")
+
+
+def ssl_context(tls: Tls) -> ssl.SSLContext:
+    """A context that trusts its files; raises InvalidRequestError for files that cannot be used."""
+    try:
+        context = ssl.create_default_context(cafile=tls.ca)
+        if tls.certificate is not None:
+            context.load_cert_chain(tls.certificate, tls.key)
+    except OSError as error:  # also if a file contains no certificate
+        raise invalid("tls", f"{tls} ({error})", "Give PEM files.") from None
+    return context
 
 
 def invalid(field: str, value: str, fix: str) -> InvalidRequestError:

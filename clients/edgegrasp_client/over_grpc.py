@@ -14,7 +14,14 @@ import numpy as np
 from google.protobuf.message import DecodeError, Message
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_client.connection import Tls, invalid, is_local, token_metadata, unreachable
+from edgegrasp_client.connection import (
+    Tls,
+    invalid,
+    is_local,
+    ssl_context,
+    token_metadata,
+    unreachable,
+)
 from edgegrasp_client.errors import GraspClientError
 from edgegrasp_client.requests import Request, cloud_file
 from edgegrasp_client.results import Answer, Model, StreamAnswer, error_of_kind, field_of, read_as
@@ -48,10 +55,8 @@ class GrpcTransport:
         if tls is None:
             self._channel = grpc.aio.insecure_channel(address, options)
         else:
-            try:
-                ca, certificate, key = (file and Path(file).read_bytes() for file in astuple(tls))
-            except OSError as error:
-                raise invalid("tls", f"{tls} ({error})", "Give PEM files.") from None
+            ssl_context(tls)  # refuses files with which gRPC would fail to connect
+            ca, certificate, key = (file and Path(file).read_bytes() for file in astuple(tls))
             credentials = grpc.ssl_channel_credentials(ca, key, certificate)
             self._channel = grpc.aio.secure_channel(address, credentials, options)
         self._metadata = token_metadata(token)
@@ -150,6 +155,8 @@ def _error_of(error: Any, address: str) -> GraspClientError:
     except (DecodeError, KeyError):
         if code == grpc.StatusCode.UNAVAILABLE:
             return unreachable(address, message)
+        if "status: 413" in message:  # of a proxy
+            return error_of_kind("payload-too-large", f"A proxy before {address}: {message}")
         return error_of_kind(code.name.lower().replace("_", "-"), f"{code.name}: {message}")
     return _described(message, detail)
 

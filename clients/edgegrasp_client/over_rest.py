@@ -3,7 +3,6 @@
 import asyncio
 import base64
 import json
-import ssl
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -18,6 +17,7 @@ from edgegrasp_client.connection import (
     Tls,
     invalid,
     is_local,
+    ssl_context,
     token_metadata,
     unreachable,
 )
@@ -44,7 +44,7 @@ class RestTransport:
             raise invalid("tls", f"a Tls for {address}", "Give an https:// address.")
         if address.startswith(HTTP_OVER_UNIX):
             socket, address = address.removeprefix(HTTP_OVER_UNIX), "http://localhost"
-        context = _ssl_context(tls)
+        context = True if tls is None else ssl_context(tls)
         if is_local(address):  # with an explicit transport, httpx uses no proxy
             transport = httpx.AsyncHTTPTransport(verify=context, uds=socket)
         try:
@@ -190,16 +190,3 @@ def _foreign(response: httpx.Response) -> errors.GraspClientError:
     what = f"{response.request.url} answered {status} {response.reason_phrase}"
     what += "." if kind else ", which is not the answer of a grasp service."
     return error_of_kind(kind, what, retry_after=seconds)
-
-
-def _ssl_context(tls: Tls | None) -> ssl.SSLContext | bool:
-    """For httpx; raises InvalidRequestError for files that cannot be used."""
-    if tls is None:
-        return True
-    try:
-        context = ssl.create_default_context(cafile=tls.ca)
-        if tls.certificate is not None:
-            context.load_cert_chain(tls.certificate, tls.key)
-    except OSError as error:  # also if a file contains no certificate
-        raise invalid("tls", f"{tls} ({error})", "Give PEM files.") from None
-    return context

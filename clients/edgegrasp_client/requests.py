@@ -22,8 +22,10 @@ from edgegrasp_camera.clouds import PointCloud2, read_point_cloud2
 from edgegrasp_camera.depth import ENCODINGS, Intrinsics, to_intrinsics
 from edgegrasp_camera.files import FILE_FORMATS
 from edgegrasp_client.connection import checked_timeout, invalid
+from edgegrasp_client.errors import PayloadTooLargeError
 from edgegrasp_client.options import DetectOptions
 
+MAX_FILE_BYTES = 2**30  # no server takes more
 SCENE_VOXEL = 0.005  # metres, side of a cell: scene points in the object's cells are left out
 DEPTH_ENCODINGS = {np.dtype(kind).name: name for name, kind in ENCODINGS.items()}  # by dtype
 
@@ -213,6 +215,8 @@ def cloud_file(cloud: Cloud) -> tuple[str, bytes]:
         fix = f"Give one of: {', '.join(FILE_FORMATS)}; {depth}."
         raise invalid("cloud", repr(path.name), fix)
     try:
+        if (size := path.stat().st_size) > MAX_FILE_BYTES:
+            raise PayloadTooLargeError(f"cloud: {path} has {size:,} bytes: more than servers take.")
         return file_format, path.read_bytes()
     except OSError as error:
         raise invalid("cloud", f"{path} ({error.strerror})", "Give a readable file.") from None

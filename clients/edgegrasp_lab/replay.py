@@ -72,7 +72,8 @@ def request(
 def answer_again(file: Path, settings: Settings) -> tuple[Job, Answer, Answer]:
     """A recorded request, the recorded answer, and the answer now; raises ValueError."""
     job = recorded = None
-    wrong = LookupError, MemoryError, OverflowError, TypeError, ValueError  # for other files
+    # For other files.
+    wrong = LookupError, MemoryError, OverflowError, RecursionError, TypeError, ValueError
     with file.open("rb") as stream, suppress(*wrong):
         job, recorded = receive(stream), receive(stream)
     outcome = isinstance(job, Job) and job.method == "RecordOutcome"  # it would be recorded twice

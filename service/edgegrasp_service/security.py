@@ -3,6 +3,8 @@
 import hashlib
 import re
 import ssl
+from collections import deque
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -81,16 +83,27 @@ class ServerTls:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self.http = _RenewableContext(ssl.PROTOCOL_TLS_SERVER)
+        self._for_grpc = deque[grpc.ServerCertificateConfiguration](maxlen=1)  # not used yet
         self.use(self.read())
         self.grpc = grpc.dynamic_ssl_server_credentials(
-            self._for_grpc,
-            lambda: self._for_grpc,  # called for each connection
+            self._for_grpc.pop(),
+            self._renewed,
             require_client_authentication=settings.tls_client_ca is not None,
         )
 
     def use(self, certificates: "Certificates") -> None:
         """Use these certificates for new connections; open ones are not affected."""
-        self.http.current, self._for_grpc = certificates
+        self.http.current, for_grpc = certificates
+        self._for_grpc.append(for_grpc)
+
+    def _renewed(self) -> Any:
+        """Certificates to use from the next connection on, or None; gRPC asks at each one.
+
+        Returned once, since gRPC crashes if it often gets new ones (grpc issue 36693).
+        """
+        with suppress(IndexError):
+            return self._for_grpc.pop()
+        return None
 
     def read(self) -> "Certificates":
         """Read the files; raises InvalidSettings."""

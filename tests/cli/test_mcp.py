@@ -41,6 +41,7 @@ def folder(tmp_path: Path) -> Path:
     mask[4:12, 8:20] = 255
     image.fromarray(depth).save(folder / "depth.png")
     image.fromarray(mask).save(folder / "mask.png")
+    (folder / "loop.npy").symlink_to("loop.npy")
     os.mkfifo(folder / "pipe.npy")  # nobody writes to it: who opens it waits for ever
     np.save(folder / "cloud.npy", np.random.default_rng(1).uniform(0, 0.2, (500, 3)))
     np.save(tmp_path / "outside.npy", np.zeros((9, 3)))
@@ -138,6 +139,7 @@ MASKED_CLOUD = {"point_cloud_file": "cloud.npy", "mask_file": "mask.png"}
         (CLOUD, {"point_cloud_file": "none.npy"}, "none.npy"),
         (CLOUD, {"point_cloud_file": "../outside.npy"}, "not below"),
         (CLOUD, {"point_cloud_file": "pipe.npy"}, "not a file"),
+        (CLOUD, {"point_cloud_file": "loop.npy"}, "loop"),
         (CLOUD, {"object": "bottle"}, "object"),
         (CLOUD, {"num_grasps": -3}, "greater than or equal to 1"),
         (CLOUD, {"robot": {"name": "r2d2", "joints": [0.0]}}, "options.robot.name"),

@@ -5,10 +5,12 @@ import json
 import socket
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import grpc
 import httpx
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ pytest.importorskip("uvicorn", reason="the extra `open-inference` is not install
 
 import uvicorn
 
+from edgegrasp.oip import open_inference_pb2 as messages
 from edgegrasp_cli.open_inference import MAX_BODY_BYTES, Models, grpc_server, http_app, refusal
 from edgegrasp_client import GraspClient, GraspClientError
 
@@ -44,6 +47,12 @@ def post(gateway: dict[str, str], body: Any, model: str = "grasps") -> httpx.Res
     url = f"http://{gateway['http']}/v2/models/{model}/infer"
     content = body if isinstance(body, bytes) else json.dumps(body)
     return httpx.post(url, content=content, timeout=60)
+
+
+def infer(channel: grpc.Channel) -> Any:
+    name = "/inference.GRPCInferenceService/ModelInfer"
+    kinds = messages.ModelInferRequest.SerializeToString, messages.ModelInferResponse.FromString
+    return channel.unary_unary(name, *kinds)
 
 
 def points_of(cloud: np.ndarray, **changes: Any) -> dict[str, Any]:
@@ -98,6 +107,18 @@ def test_a_request_in_json(gateway, cloud) -> None:
     assert "outputs: got pose" in unknown.json()["error"]
 
 
+def test_a_tensor_that_is_there_twice_is_refused(gateway, cloud) -> None:
+    body = points_of(cloud)
+    body["inputs"] *= 2
+    assert "there twice" in post(gateway, body).json()["error"]
+    request = messages.ModelInferRequest(model_name="grasps")
+    for _ in range(2):
+        request.inputs.add(name="points", datatype="FP32", shape=[0, 3])
+    channel = grpc.insecure_channel(gateway["grpc"])
+    with channel, pytest.raises(grpc.RpcError, match="points twice"):
+        infer(channel)(request)
+
+
 @pytest.mark.parametrize(
     ("changes", "model", "status", "told"),
     [
@@ -150,6 +171,26 @@ def test_the_command_serves_both_transports(dummy_server, host: str) -> None:
             ready = http.get(f"http://{url}:{ports[0]}/v2/health/ready", timeout=60)
         assert ready.json() == {"ready": True}
         socket.create_connection((host, int(ports[1]))).close()
+
+
+def test_calls_are_answered_before_it_stops(start_dummy, cloud) -> None:
+    ports = [str(port) for port in free_ports(2)]
+    body = points_of(cloud)["inputs"][0]
+    request = messages.ModelInferRequest(model_name="default")
+    request.inputs.add(name="points", datatype="FP32", shape=body["shape"])
+    request.raw_input_contents.append(cloud.astype("<f4").tobytes())
+    with start_dummy(seconds=2.0) as server:
+        flags = ["--server", server.grpc_address, "--http-port", ports[0], "--grpc-port", ports[1]]
+        with started(*EDGEGRASP, "open-inference", *flags) as gateway:
+            with grpc.insecure_channel(f"127.0.0.1:{ports[1]}") as channel:
+                grpc.channel_ready_future(channel).result(60)
+                with httpx.Client(transport=httpx.HTTPTransport(retries=10)) as http:
+                    http.get(f"http://127.0.0.1:{ports[0]}/v2/health/live", timeout=60)
+                asked = infer(channel).future(request)
+                time.sleep(1.0)
+                gateway.terminate()
+                assert asked.result().raw_output_contents
+            assert gateway.wait(30) == 0
 
 
 def test_a_server_that_is_away() -> None:

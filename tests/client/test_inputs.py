@@ -10,6 +10,7 @@ from PIL import Image
 from tests.checks import refusal
 from tests.cloud_files import ros_message
 
+from edgegrasp_client import PayloadTooLargeError
 from edgegrasp_results import Detection
 
 
@@ -83,6 +84,13 @@ def test_depth_files_are_read_with_their_scale(client, tmp_path) -> None:
         image = depth_image(depth=tmp_path / name, depth_scale=scale)
         found = contacts(client.detect(depth_images=[image]))
         np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_a_file_that_no_server_takes_is_not_read(client, tmp_path) -> None:
+    with (tmp_path / "large.npy").open("wb") as file:
+        file.truncate(2**30 + 1)
+    with pytest.raises(PayloadTooLargeError, match=r"large\.npy has 1,073,741,825 bytes"):
+        client.detect(tmp_path / "large.npy")
 
 
 def test_edges_are_scored_in_their_order(client, cloud) -> None:

@@ -21,7 +21,7 @@ from edgegrasp_service.front.http import OPENAPI_DOCUMENT
 from edgegrasp_service.front.service import Admission
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import answer
-from edgegrasp_service.worker.process import Answer, Facts, Job, pack
+from edgegrasp_service.worker.process import MESSAGE_HEADER, Answer, Facts, Job, pack
 from edgegrasp_service.worker.recording import Recorder, append_line, check_outcomes
 from edgegrasp_training.evaluation import read_outcomes
 
@@ -49,7 +49,9 @@ async def test_recorded_requests_are_replayed(serve, transport, cloud, tmp_path,
     assert answer_again(harmful, settings)[1].error.kind == "harmful-request"
     tried = Job("RecordOutcome", "http", b""), Answer(b"{}", Facts())  # it would be kept twice
     outcome = b"".join(part for message in tried for part in pack(message))
-    for other in (b"", b"\xff" * 64, fine.read_bytes()[:-9000], bad.read_bytes()[12:], outcome):
+    deep = MESSAGE_HEADER.pack(200_000, 0) + b"[" * 200_000
+    short = fine.read_bytes()[:-9000], bad.read_bytes()[12:]
+    for other in (b"", deep, b"\xff" * 64, *short, outcome):
         fine.write_bytes(other)
         with pytest.raises(ValueError, match="is not a recorded request"):
             answer_again(fine, settings)

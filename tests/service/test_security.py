@@ -1,7 +1,9 @@
 """Who may ask, over both transports: TLS, client certificates, tokens, and what stays open."""
 
 import asyncio
+import socket
 import ssl
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +14,12 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_client import AsyncGraspClient, StreamRequest, Tls
-from edgegrasp_client.errors import AccessDeniedError, ServerUnavailableError
+from edgegrasp_client import AsyncGraspClient, GraspClient, StreamRequest, Tls
+from edgegrasp_client.errors import (
+    AccessDeniedError,
+    InvalidRequestError,
+    ServerUnavailableError,
+)
 from edgegrasp_service.errors import InvalidSettings, ReloadFailed
 from edgegrasp_service.probe import is_ready, read_settings
 from edgegrasp_service.security import ServerTls, Tokens
@@ -46,6 +52,23 @@ async def test_tls(serve, server_tls, pem, transport: str, cloud: np.ndarray) ->
     assert {type(by_other), type(plain)} == {ServerUnavailableError}
 
 
+def test_clients_that_connect_at_once_over_tls_do_no_harm(start_dummy, pem) -> None:
+    context = ssl.create_default_context(cafile=pem["ca"])
+    context.set_alpn_protocols(["h2"])
+    flags = "--tls-certificate", pem["server"], "--tls-key", pem["server_key"]
+    with start_dummy(*flags) as server:
+        host, port = server.grpc_address.rsplit(":", 1)
+
+        def shake_hands(_: int) -> None:
+            with socket.create_connection((host, int(port))) as connection:
+                context.wrap_socket(connection, server_hostname=host).close()
+
+        with ThreadPoolExecutor(16) as clients:
+            list(clients.map(shake_hands, range(4000)))
+        with GraspClient(server.grpc_address, tls=Tls(ca=pem["ca"])) as client:
+            assert client.models()
+
+
 async def test_certificates_are_read_anew(serve, pem, transport, cloud, tmp_path) -> None:
     """Server's and clients' alike; connections that are open stay, and bad files change nothing."""
     files = {name: tmp_path / f"{name}.pem" for name in ("server", "server_key", "ca")}
@@ -68,7 +91,9 @@ async def test_certificates_are_read_anew(serve, pem, transport, cloud, tmp_path
     for client in (running.ours(transport, tls=tls("other_", "other_")), before):
         assert len((await client.detect(cloud)).grasps) == 10
     for stranger in (tls("", ""), tls("other_", ""), Tls(ca=pem["other_ca"])):
-        assert isinstance(await refused(address, tls=stranger), ServerUnavailableError)
+        error = await refused(address, tls=stranger)
+        assert isinstance(error, ServerUnavailableError)
+        assert "a client certificate" in str(error)
     files["server_key"].write_text("half a k")
     with pytest.raises(ReloadFailed, match="cannot be read as a certificate with its key"):
         await running.server.service.reload()
@@ -90,6 +115,13 @@ def test_bad_certificates_are_named(pem, server_tls, tmp_path, changed, sentence
     given = server_tls | {name: files.get(value, value) for name, value in changed.items()}
     with pytest.raises(InvalidSettings, match=sentence):
         ServerTls(Settings(**given))
+
+
+def test_unusable_files_of_a_client_are_named(transport: str, pem) -> None:
+    address = "127.0.0.1:1" if transport == "grpc" else "https://127.0.0.1:1"
+    for wrong in (Tls(pem["server_key"]), Tls(pem["ca"], pem["client"], pem["other_client_key"])):
+        with pytest.raises(InvalidRequestError, match="Give PEM files"):
+            GraspClient(address, tls=wrong)
 
 
 async def test_tokens(serve, transport: str, cloud: np.ndarray) -> None:
