@@ -282,7 +282,7 @@ class RansacPlane(Strict):
     max_tilt: Annotated[float, Field(ge=0.0, le=1.6), numeric] = 0.35
     """greatest angle between its normal and up, radians; π/2: any plane"""
     min_share: Annotated[float, Field(gt=0.0, le=1.0), numeric] = 0.1
-    """least share of the visible surface that must lie in it"""
+    """least share of the points that must lie in it"""
 
 
 class AutoPlane(Strict):

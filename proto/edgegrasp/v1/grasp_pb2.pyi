@@ -920,7 +920,7 @@ class RansacPlane(_message.Message):
     max_tilt: _builtins.float
     """Greatest angle between its normal and up, radians; π/2: any plane."""
     min_share: _builtins.float
-    """Least share of the visible surface that must lie in it."""
+    """Least share of the points that must lie in it."""
     def __init__(
         self,
         *,
