@@ -83,7 +83,7 @@ class FoundSupport:
     normal: Float32  # (3,) unit, pointing up from the support
     offset: float  # metres
     residual: float | None  # metres, median distance of its points; None: the plane is not visible
-    share: float  # share of the visible surface that lies in it
+    share: float  # share of the points that lie in it
 
 
 @dataclass(frozen=True)

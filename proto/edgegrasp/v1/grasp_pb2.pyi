@@ -2146,7 +2146,7 @@ class FoundSupport(_message.Message):
     residual: _builtins.float
     """Median distance of its points from it, metres; absent (null in JSON): none of it is seen."""
     share: _builtins.float
-    """Share of the visible surface that lies in it."""
+    """Share of the points that lie in it."""
     @_builtins.property
     def normal(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """3 floats: unit, away from the table."""
