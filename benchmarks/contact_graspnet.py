@@ -55,7 +55,8 @@ class ContactGraspNet:
         """The grasp to execute; None if no grasp is confident enough."""
         torch.set_num_threads(1)
         options = parse_options(request_options(observation, seed, self.rules, {}))
-        prepared = self.detector.prepare(CloudInput(observation.image), options)
+        views = observation.view_ids if len(observation.camera_positions) > 1 else None
+        prepared = self.detector.prepare(CloudInput(observation.image, view_ids=views), options)
         if (scene := prepared.scene) is None:
             return None
         points = _points(scene, observation, np.random.default_rng(seed))

@@ -60,17 +60,20 @@ def main() -> None:
             own = stack.enter_context(local_server())
             servers = {"grpc": own.grpc_address, "rest": own.http_url}
         runs: dict[tuple[int, str], list[list[Sample]]] = {}
+        rates: dict[tuple[int, str], list[float]] = {}
         for turn, clients, name in itertools.product(range(given.rounds), given.clients, servers):
+            begun = time.monotonic()
             samples = run_clients(servers[name], clients, given.seconds, given.points, seed=turn)
+            answers = sum(one.code == OK for one in samples)
+            rates.setdefault((clients, name), []).append(answers / (time.monotonic() - begun))
             runs.setdefault((clients, name), []).append(samples)
     for (clients, name), found in runs.items():
-        rates = [sum(one.code == OK for one in run) / given.seconds for run in found]
         samples = list(itertools.chain(*found))
         answered = [one for one in samples if one.code == OK]
         row = {
             "server": name,
             "clients": clients,
-            "per_second": statistics.median(rates),
+            "per_second": statistics.median(rates[clients, name]),
             "codes": dict(Counter(one.code for one in samples)),
             "answered_ms": percentiles([one.seconds for one in answered]),
             "beyond_the_detector_ms": percentiles([one.beyond for one in answered]),

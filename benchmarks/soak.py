@@ -293,7 +293,7 @@ def faults(results: dict[str, Any], grows: bool) -> list[str]:
         "a poison was not refused": not all(
             one.endswith((": 400", ": 413", ": 429")) for one in poisoned
         ),
-        "nothing was held open": not all(held.values()),
+        "nothing was held open": not {"pages", "silent calls"} <= held.keys(),
         "memory grows": grows and np.median(after) > np.median(before) * (1 + MAX_GROWTH),
         f"the server ended with {results['exit_code']}": results["exit_code"],
     }

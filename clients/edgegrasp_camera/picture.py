@@ -41,12 +41,13 @@ class Camera:
     """A pinhole camera: column = fx * x / z + cx, row = fy * y / z + cy in its own frame."""
 
     shape: tuple[int, int]  # rows and columns of its image
-    fx: float  # pixels, like the next three; negative if the cloud's z points backward
+    fx: float  # pixels, like the next three; negative if x or z points the other way
     fy: float
     cx: float
     cy: float
     # (4, 4); by default the cloud is in the camera's frame
     T_cloud_camera: Floats = field(default_factory=lambda: np.eye(4))
+    ahead: float = 1.0  # -1 if z points backward
 
     @classmethod
     def facing(cls, points: ArrayLike, eye: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Self:
@@ -81,7 +82,8 @@ class Camera:
             worst = max(worst, float(np.abs(system @ (focal, middle) - pixel).max()))
             numbers += [float(focal), float(middle)]
         fx, cx, fy, cy = numbers
-        return cls((points.shape[0], points.shape[1]), fx, fy, cx, cy) if worst < 1.0 else None
+        shape, ahead = (points.shape[0], points.shape[1]), float(np.sign(np.median(z)))
+        return cls(shape, fx, fy, cx, cy, ahead=ahead) if worst < 1.0 else None
 
     def project(self, points: ArrayLike) -> tuple[Float64, Float64]:
         """Columns and rows (..., 2), and distances along the line of sight (...), metres."""
@@ -89,7 +91,7 @@ class Camera:
         x, y, z = np.moveaxis((np.asarray(points, dtype=np.float64) - position) @ turn, -1, 0)
         with np.errstate(divide="ignore", invalid="ignore"):
             pixels = np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
-        return pixels, z if self.fx > 0 else -z
+        return pixels, self.ahead * z
 
     def rows_of_pixels(self, points: ArrayLike) -> Int64:
         """(H, W) the row of the nearest point seen at each pixel; -1 where there is no point."""
@@ -152,7 +154,7 @@ class Picture:
             parts = [around[y : y + rows, x : x + columns] for y, x in np.ndindex(3, 3)]
             near = [np.where(np.abs(part - depth) < HIDDEN_DEPTH, part, depth) for part in parts]
             depth = np.mean(near, axis=0)
-        grey = 70 + 165 * shaded(depth, abs(self.view.fx), self.view.fy)
+        grey = 70 + 165 * shaded(depth, abs(self.view.fx), abs(self.view.fy))
         return np.repeat(grey[..., None], 3, axis=2)
 
     def outline(self, mask: Bools) -> None:
@@ -208,7 +210,7 @@ class Picture:
         rows, columns = self.view.shape
         seen = self._depth[np.clip(row, -1, rows), np.clip(column, -1, columns)]  # (4, 17)
         hidden = depth > seen + HIDDEN_DEPTH
-        wide = FORK_WIDTH * self.view.fy / np.median(depth) * self._point
+        wide = FORK_WIDTH * abs(self.view.fy) / np.median(depth) * self._point
         bar = float(np.clip(wide, *FORK_POINTS))
         for width, shade in ((bar + 1.6, OUTLINE_COLOUR), (bar, color)):
             for solid, alpha, cap in ((True, 1.0, "round"), (False, 0.25, "butt")):

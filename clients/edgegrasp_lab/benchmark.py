@@ -93,7 +93,9 @@ def _plan(flags: BenchmarkFlags, options: dict[str, Any]) -> tuple[BenchmarkConf
         if flags.gripper is not None:
             raise ValueError(f"gripper is {flags.gripper}; leave it out: {flags.robot} has its own")
         arm, hand, fields = benchmark_arm(flags.robot, rules.camera)
-        options = fields | options
+        asked = options.get("collision", {})  # a mode alone is allowed
+        asked = asked if isinstance(asked, dict) else {"mode": asked}
+        options = fields | options | {"collision": fields["collision"] | asked}
     config = BenchmarkConfig(
         SceneKind(flags.scene or rules.kind or SceneKind.PILE),
         rules.rounds if flags.rounds is None else flags.rounds,

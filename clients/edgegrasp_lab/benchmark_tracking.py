@@ -225,8 +225,9 @@ def follow(client: Any, scene: Scene, seconds: float, clock: Callable[[], float]
             continue
         now = max(taken + 1.0 / RATE, taken + spent)
         done.latency.append(spent)
-        done.switches += int(best is None or best.id != shown)
-        done.last, shown = best or done.last, best and best.id
+        before, shown = shown, best and best.id
+        done.switches += int(shown != before)
+        done.last = best or done.last
         if best is not None and best.id == done.first.id:
             true = scene.object_motion(now) @ done.first.T_cloud_tcp
             apart = np.linalg.norm(best.T_cloud_tcp[:3, 3] - true[:3, 3])

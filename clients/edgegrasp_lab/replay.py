@@ -45,7 +45,7 @@ def attempt(
         done, now, seen = repeat(folder, first if seed is None else seed, round, number, objects)
     before, title = done.attempts[number], attempt_title(done, number)
     if picture is not None:
-        draw_attempt(picture, done, number, seen)
+        draw_attempt(picture, folder.manifest()["run"].get("gripper"), done, number, seen)
     print(title)
     if any(getattr(now, name) != getattr(before, name) for name in ("cause", "object", "opening")):
         sys.exit(f"edgegrasp replay: the result differs: {now.cause or 'success'}")

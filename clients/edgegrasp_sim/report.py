@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from edgegrasp_camera.picture import Camera, Picture
+from edgegrasp_camera.picture import PANDA_Z, Camera, Picture
 from edgegrasp_sim.benchmark import BenchmarkConfig
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.objects import SceneKind
@@ -129,11 +129,16 @@ def attempt_title(done: Round, number: int) -> str:
     )
 
 
-def draw_attempt(path: Path, done: Round, number: int, seen: Observation) -> None:
-    """Write a picture of an attempt in the cloud that was seen before it."""
+def draw_attempt(
+    path: Path, hand: dict[str, Any] | None, done: Round, number: int, seen: Observation
+) -> None:
+    """Write a picture of an attempt in the cloud seen before it; `hand` None: the Panda's."""
+    z = PANDA_Z
+    if hand is not None:
+        z = max(high[2] for _, high in hand["hand"]["boxes"]), hand["tip_z"]
     view = Camera.facing(seen.cloud, seen.camera_position)
     picture = Picture(view, seen.cloud, title=attempt_title(done, number))
-    picture.grasps([done.attempts[number]])
+    picture.grasps([done.attempts[number]], z)
     picture.save(path)
 
 
@@ -183,8 +188,9 @@ def _failure_pictures(folder: ResultFolder, rounds: Sequence[Round]) -> Iterator
             if not attempt.success:
                 before[str(attempt.cause)] += 1
                 failed.append((before[str(attempt.cause)], done, number))
+    hand = folder.manifest()["run"].get("gripper")
     for _, done, number in sorted(failed, key=lambda each: each[0])[:PICTURES]:
         _, _, seen = repeat(folder, done.seed, done.index, number)
         with tempfile.NamedTemporaryFile(suffix=".jpg") as file:
-            draw_attempt(Path(file.name), done, number, seen)
+            draw_attempt(Path(file.name), hand, done, number, seen)
             yield image("jpeg", file.read(), attempt_title(done, number))

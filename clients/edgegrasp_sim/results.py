@@ -161,9 +161,9 @@ def count_outcomes(rounds: Iterable[Round]) -> Int64:
 
 def without_too_wide(item: Round) -> Round:
     """A round without the objects that are too wide for the hand, and without their grasps."""
-    left = Counter(item.objects) - Counter(item.too_wide)
+    left = tuple(name for name in item.objects if name not in item.too_wide)
     attempts = tuple(a for a in item.attempts if not {a.object, a.target} & {*item.too_wide})
-    return replace(item, objects=tuple(left.elements()), attempts=attempts)
+    return replace(item, objects=left, attempts=attempts)
 
 
 def counts_by_object(rounds: Sequence[Round]) -> dict[str, dict[str, int]]:

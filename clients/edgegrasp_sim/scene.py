@@ -36,6 +36,7 @@ POUR_MARGIN = 0.25  # share of its length and width, on each side, where nothing
 FULL_MARGIN = 0.12  # the same for a bin to be filled
 POUR_SECONDS = 0.5  # for each object to come to rest
 AT_ONCE = 4  # objects poured between two checks whether a bin is full
+MAX_POURS = 100  # into a full bin, in which objects that are too large never stay
 COVERED = 0.85  # share of the floor of a full bin that objects hide from above
 RAYS = 24  # rays along each side of the floor, to measure this share
 
@@ -104,7 +105,9 @@ def make_bin(layout: Layout) -> list[SceneObject]:
 def make_full_bin(layout: Layout) -> list[SceneObject]:
     """Pour objects all over a bin until they hide its floor or reach the requested number."""
     placed: list[SceneObject] = []
-    while len(placed) < layout.num_objects and _covered(layout, placed) < COVERED:
+    for _ in range(MAX_POURS):
+        if len(placed) == layout.num_objects or _covered(layout, placed) >= COVERED:
+            break
         new = _pour(layout, min(AT_ONCE, layout.num_objects - len(placed)), FULL_MARGIN)
         placed = settle(layout.world, [*placed, *new], layout.fixed_parts)
     return placed

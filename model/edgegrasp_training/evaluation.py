@@ -230,7 +230,8 @@ def score_views(paths: list[Path], weights: list[Path]) -> Scored:
             description = packed.batch.description
             with torch.inference_mode():
                 logit = network(packed.batch).double().numpy()
-            logits.append(logit / metadata.temperature)
+            scale, shift = metadata.training.get("rescaled_by_outcomes", (1.0, 0.0))
+            logits.append(scale * logit / metadata.temperature + shift)
         hidden = (description[:, UNSEEN_NUMBERS] > MAX_HIDDEN_DEPTH).any(dim=1).numpy()
         scene = f"{scene_of(path).split('_')[0]} scenes"
         sensor = f"{view.sensor or 'unknown'} camera"

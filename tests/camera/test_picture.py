@@ -1,4 +1,5 @@
 import io
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -6,6 +7,7 @@ import pytest
 from PIL import Image
 
 from edgegrasp_camera.clouds import CloudInput
+from edgegrasp_camera.depth import Intrinsics, unproject
 from edgegrasp_camera.picture import Camera, Picture, draw_detection, fork
 
 
@@ -18,6 +20,14 @@ def test_the_nearest_point_is_seen_at_a_pixel() -> None:
     view = Camera((3, 3), 1.0, 1.0, 1.0, 1.0)
     points = [(0.0, 0.0, 2.0), (0.0, 0.0, 1.0), (np.nan, 0.0, 1.0), (0.0, 0.0, -1.0)]
     assert view.rows_of_pixels(points)[1, 1] == 1
+
+
+@pytest.mark.parametrize("signs", [*itertools.product((-1, 1), repeat=3)])
+def test_an_image_is_drawn_whatever_its_axes_point_to(signs) -> None:
+    points = unproject(np.ones((20, 30), np.float32), Intrinsics(40, 40, 15, 10)) * np.array(signs)
+    view = Camera.from_image(points)
+    assert view is not None
+    assert (view.rows_of_pixels(points.reshape(-1, 3)) >= 0).all()
 
 
 def test_an_image_whose_points_lie_in_a_line_has_no_camera() -> None:

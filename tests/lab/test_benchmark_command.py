@@ -10,13 +10,15 @@ import threading
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from tests.cli.commands import refused, run
 from tests.programs import until
 
-from edgegrasp_lab.benchmark import benchmark_arm
+from edgegrasp_camera.picture import Picture
+from edgegrasp_lab.benchmark import BenchmarkFlags, _plan, benchmark_arm
 from edgegrasp_lab.flags import PlannerFlags
 from edgegrasp_lab.planners import named_planner, open_planner, request_options
 from edgegrasp_model.detector import WEIGHTS_FOLDER
@@ -73,14 +75,25 @@ def test_the_shipped_weights_are_not_below_the_gate(tmp_path) -> None:
     assert planner["options"] == {"num_approach_points": 16, "num_candidates": 400}
 
 
-def test_another_hand_is_planned_for_and_simulated(tmp_path) -> None:
+def test_another_hand_is_planned_for_and_simulated(tmp_path, monkeypatch) -> None:
     few = ("--num-approach-points", 16, "--num-candidates", 400, "--gripper", "robotiq-2f-85")
     assert benchmark(tmp_path, "in-process", *few, rounds=1)["successes"] > 0
     manifest = figures(tmp_path, "manifest.json")["run"]
     assert manifest["gripper"]["max_opening"] == 0.085
     assert manifest["planner"]["options"]["gripper"] == manifest["gripper"]
-    assert "the result is the same" in run("replay", "attempt", tmp_path, "--round", 0)
+    drawn = Mock()
+    monkeypatch.setattr(Picture, "grasps", drawn)
+    replay = "replay", "attempt", tmp_path, "--round", 0, "--picture", tmp_path / "hand.png"
+    assert "the result is the same" in run(*replay)
+    assert drawn.call_args.args[1][1] == manifest["gripper"]["tip_z"]
     assert "nothere" in refused("benchmark", "--gripper", "nothere")
+
+
+@pytest.mark.parametrize("asked", ["penalise", {"margin": 0.001}])
+def test_flags_keep_the_lift_of_an_arm(asked) -> None:
+    pytest.importorskip("roboplan", reason="the extra robot is not installed")
+    _, options = _plan(BenchmarkFlags(robot="ur5", protocol="ur5-pile"), {"collision": asked})
+    assert options["collision"]["retreat_length"] == 0.1
 
 
 def test_a_result_below_the_gate_fails(top_down: Path, in_process: Path, tmp_path) -> None:

@@ -2,7 +2,9 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace as N
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -213,6 +215,21 @@ def test_the_grasp_of_a_recorded_scene_stays_where_it_is(scene, tmp_path) -> Non
     assert figures["mm_95"] < 3.0
     assert figures["degrees_95"] < 3.0
     assert (tmp_path / "out" / "jitter.svg").read_text().startswith("<?xml")
+
+
+def test_a_grasp_that_is_lost_for_long_is_one_switch() -> None:
+    pose, ids = np.eye(4), iter([1, 1, *[None] * 8])
+
+    def detect(**_: Any) -> Any:
+        number = next(ids)
+        one = N(id=number, object=0, T_cloud_hand=pose, T_cloud_tcp=pose, score=0.9)
+        grasps = [] if number is None else [one]
+        plain = {"tracking": N(next_id=2, first="lost"), "objects": [], "support": None}
+        return N(grasps=grasps, gripper=N(name=""), up=None, **plain)
+
+    scene: Any = Mock(image_at=lambda _: {}, object_motion=lambda _: pose)
+    detect_of: Any = N(detect=detect)
+    assert follow(detect_of, scene, 0.3, clock=lambda: 0.0).switches == 1
 
 
 def test_the_grasp_of_an_object_on_a_belt_moves_with_it() -> None:

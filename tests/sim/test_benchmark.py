@@ -290,6 +290,12 @@ def test_figures_count_as_the_reference_does() -> None:
     assert objects["cube"] == {"present": 2, "removed": 1, "attempts": 0, "successes": 0}
 
 
+def test_objects_of_the_name_of_one_that_is_too_wide_are_left_out() -> None:
+    both = replace(ROUNDS[0], objects=("mug", "mug"), too_wide=("mug",))
+    others = results.summarise([both])["too_wide"]["declutter_rate_of_others"]
+    assert others["value"] is None
+
+
 def test_an_arm_s_figures_are_those_of_its_motions() -> None:
     held = replace(HELD, motion_seconds=3.75)
     missed = replace(held, object=None, cause=FailureCause.MISSED, touched_on_the_way=True)

@@ -216,3 +216,5 @@ def test_a_deep_bin_has_walls_as_high_as_a_hand_and_a_full_one_hides_its_floor(s
     assert (inside[:, 2] > TABLE_HEIGHT + 0.003).mean() > 0.75
     assert number < most  # no more than that takes
     assert simulation.reset(SceneKind.FULL_BIN, np.random.default_rng(2), 3) <= 3
+    too_large = (40.0, 40.0)
+    assert simulation.reset(SceneKind.FULL_BIN, np.random.default_rng(2), 2, too_large) == 0

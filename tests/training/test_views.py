@@ -9,7 +9,7 @@ import torch
 from scipy.special import expit
 
 from edgegrasp_model.gripper import gripper_fields, load_gripper
-from edgegrasp_model.networks.checkpoint import save_checkpoint
+from edgegrasp_model.networks.checkpoint import load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.scene.scene import Surroundings, near_workspace_side
@@ -157,6 +157,11 @@ def test_views_are_scored_by_hand_networks_alone(tmp_path: Path) -> None:
     }
     assert scored.logit.shape == (2, len(scored.held))
     np.testing.assert_array_equal(*scored.logit)
+    network, metadata = load_checkpoint(hands)
+    robot = replace(metadata, training={"rescaled_by_outcomes": (0.5, -1.0)})
+    save_checkpoint(tmp_path / "robot.safetensors", network, robot)
+    plain, rescaled = score_views(paths, [hands, tmp_path / "robot.safetensors"]).logit
+    np.testing.assert_allclose(rescaled, 0.5 * plain - 1.0, rtol=1e-6)
     assert 0 < scored.held.mean() < 1
     with pytest.raises(ValueError, match="hand networks"):
         score_views(paths, [balls])
