@@ -100,8 +100,9 @@ class Camera:
         seen = seen[np.argsort(-depth[seen], kind="stable")]  # near points cover distant points
         rows, columns = self.shape
         column, row = np.clip(np.rint(pixels[seen]), -1e6, 1e6).astype(np.int64).T
-        within = ((row >= 0) & (row < rows) & (column >= 0) & (column < columns)).sum()
-        gap = np.sqrt(rows * columns / max(within, 1))  # pixels from point to point
+        within = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        seen, column, row = seen[within], column[within], row[within]
+        gap = np.sqrt(rows * columns / max(len(seen), 1))  # pixels from point to point
         spread = int(min(1.2 * gap - 0.6, MAX_GAP_PIXELS))
         around = np.arange(-spread, spread + 1)
         column = np.add.outer(column, np.tile(around, len(around)))

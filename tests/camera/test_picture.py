@@ -1,5 +1,6 @@
 import io
 import itertools
+import tracemalloc
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,6 +29,16 @@ def test_an_image_is_drawn_whatever_its_axes_point_to(signs) -> None:
     view = Camera.from_image(points)
     assert view is not None
     assert (view.rows_of_pixels(points.reshape(-1, 3)) >= 0).all()
+
+
+def test_points_outside_of_a_picture_take_no_memory() -> None:
+    near = np.random.default_rng(0).uniform((-0.1, -0.1, 0.9), (0.1, 0.1, 1.1), (2000, 3))
+    cloud = np.concatenate([near, np.tile([50.0, 0.0, 1.0], (100_000, 1))])
+    tracemalloc.start()
+    Camera((960, 1280), 500, 500, 640, 480).rows_of_pixels(cloud)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 2e8
 
 
 def test_an_image_whose_points_lie_in_a_line_has_no_camera() -> None:

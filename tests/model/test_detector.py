@@ -11,17 +11,20 @@ from tests.checks import refusal
 
 from edgegrasp_camera.depth import DepthView, Intrinsics, fuse_depth_images
 from edgegrasp_model.candidates.collision import collides
+from edgegrasp_model.candidates.edge_grasps import centred_grasps, crop_balls, edge_grasps
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue, choose_device
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, UnknownModel
-from edgegrasp_model.gripper import gripper_fields
+from edgegrasp_model.gripper import gripper_fields, load_gripper
 from edgegrasp_model.kernels import mean_over_similar
 from edgegrasp_model.networks.checkpoint import save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
-from edgegrasp_model.options import Collision, DetectOptions, parse_options
+from edgegrasp_model.options import Box, Collision, DetectOptions, parse_options
 from edgegrasp_model.ranking import densest_first, ranked
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene import network
-from edgegrasp_model.scene.cloud import CloudInput, pose_matrix
+from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud, CloudInput, pose_matrix
+from edgegrasp_model.scene.obstacles import SolidBoxes
+from edgegrasp_model.scene.segment import BACKGROUND
 from edgegrasp_results import Detection, Grasp
 from edgegrasp_training.recipes import build_network
 
@@ -117,6 +120,27 @@ def test_several_depth_images_show_each_object_once() -> None:
     assert len(found.objects) == 4
     assert found.grasps
     assert not found.warnings
+
+
+def test_each_camera_has_its_own_noise() -> None:
+    boxes, above = [table(), *boxes_on_table(0)], []
+    views = [(camera(0.5, -1.5, 0.5), 1), (camera(0.5, 1.5, 2.0), 3)]
+    depths = [render(boxes, pose, zoom=zoom)[..., 2] for pose, zoom in views]
+    middle = WIDTH / 2, HEIGHT / 2
+    poses = [DepthView(Intrinsics(*(zoom * FOCAL_LENGTH,) * 2, *middle), at) for at, zoom in views]
+    for part in (slice(0, 1), slice(1, 2), slice(0, 2)):
+        found = detector().detect(fuse_depth_images(depths[part], poses[part]))
+        above.append(found.counts["above_support"])
+    assert above[2] < 1.1 * (above[0] + above[1])
+
+
+def test_objects_at_the_side_of_a_wide_image_are_found() -> None:
+    T_world_camera = np.diag([1.0, -1.0, -1.0, 1.0])
+    T_world_camera[2, 3] = 0.45
+    seen = [table(1.0, 0.8), box((0.62, 0, 0.03), (0.02, 0.025, 0.03))]
+    cloud = render(seen, T_world_camera, zoom=0.35)
+    (one,) = detector().detect(cloud, DetectOptions(viewpoint=(0, 0, 0), up=(0, 0, -1))).objects
+    assert one.center[0] == pytest.approx(0.62, abs=0.01)
 
 
 def test_objects_of_a_few_scattered_points_are_none() -> None:
@@ -409,6 +433,40 @@ def test_unseen_space_is_entered_only_on_the_approach_asked_for(length, blocked)
     assert collides(above, hand, np.float32([0.04]), PANDA, asked).tolist() == [blocked]
 
 
+def test_fingers_that_swing_forward_hit_what_is_ahead_of_them() -> None:
+    swinging, hand = load_gripper("robotiq-2f-140"), np.eye(4, dtype=np.float32)[None]
+    tips = swinging.tip_z + swinging.furthest_advance(0.03)
+    ahead = Box(min=(-0.5, -0.5, tips - 0.01), max=(0.5, 0.5, tips + 0.1))
+    solid = SolidBoxes.from_shapes([ahead], CanonicalFrame(np.eye(4)))
+    plate = grid(np.linspace(-0.01, 0.01, 5), np.linspace(-0.02, 0.02, 9), [tips - 0.005])
+    beside = np.full(len(plate), BACKGROUND)
+    for scene in (
+        scene_of(np.ones((1, 3), np.float32), obstacles=solid),
+        scene_of(plate.astype(np.float32), object_of_point=beside),
+    ):
+        for opening, hit in ((0.04, True), (0.14, False)):
+            found = collides(scene, hand, np.float32([opening]), swinging, Collision())
+            assert found.tolist() == [hit]
+
+
+def test_centred_hands_hold_objects_at_the_same_depth() -> None:
+    gripper, x = load_gripper("robotiq-2f-85"), np.arange(-0.03, 0.03, 0.004)
+    sides = [grid(x, [y], np.arange(-0.03, 0.0, 0.004)) for y in (-0.037, 0.037)]
+    count, top = len(sides[0]), grid(x, np.arange(-0.034, 0.035, 0.004), [0.0])
+    points = np.concatenate([*sides, top]).astype(np.float32)
+    normals = np.tile(np.float32([0, 0, 1]), (len(points), 1))
+    normals[:count], normals[count : 2 * count] = (0, -1, 0), (0, 1, 0)
+    rows = np.arange(2 * count, len(points))
+    crop = crop_balls(points, rows, 0.05)
+    of_ball = rows[crop.ball_of_point], crop.ball_rows
+    found, _ = edge_grasps(Cloud(points, normals), *of_ball, gripper)
+    moved = centred_grasps(points, crop, found, gripper)
+    hands = moved.T_cloud_hand
+    outward = points[moved.contact_index] - hands[:, :3, 3]
+    depth = np.einsum("ed,ed->e", outward, hands[:, :3, 2])
+    np.testing.assert_allclose(depth, gripper.contact_z_at(moved.opening), atol=1e-4)
+
+
 def test_hands_that_reach_out_of_the_image_come_last() -> None:
     left, right, top, bottom = 80, 250, 60, 200  # through the objects' surroundings
     image = rendered.SCENE[top:bottom, left:right]
@@ -579,9 +637,11 @@ def test_a_wall_is_no_support_of_kind_ransac() -> None:
     T_world_camera = camera(1.15, -1.5, 0.9)
     wall = box((0, 0.42, 0.4), (0.9, 0.01, 0.45))
     cloud = render([table(), wall, *boxes_on_table(1)], T_world_camera)
-    seen = detector().detect(cloud, DetectOptions(viewpoint=(0, 0, 0), support="ransac")).support
-    assert seen is not None
-    assert T_world_camera[2, :3] @ seen.normal > 0.99
+    for objects in ("auto", "off"):
+        asked = parse_options({"viewpoint": (0, 0, 0), "support": "ransac", "objects": objects})
+        seen = detector().detect(cloud, asked).support
+        assert seen is not None
+        assert T_world_camera[2, :3] @ seen.normal > 0.99
 
 
 def test_a_long_approach_and_retreat_are_checked_to_their_ends() -> None:

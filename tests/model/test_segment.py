@@ -33,6 +33,11 @@ FURNISHINGS = {
 }
 
 
+def seen_from(points: np.ndarray, eye: np.ndarray) -> ViewedPoints:
+    """Points (N, 3) that one camera saw."""
+    return ViewedPoints(points, eye, np.linalg.norm(points - eye, axis=1).astype(np.float32))
+
+
 def bin_walls(length: float, width: float, height: float, wall: float = 0.005) -> list[SolidBox]:
     """An open box on z = 0 around the origin."""
     x, y, z = length / 2, width / 2, height / 2
@@ -404,7 +409,7 @@ def test_small_objects_are_found_beside_a_large_one() -> None:
 
 def test_hands_have_a_plane_to_stay_above_where_all_objects_are_outliers() -> None:
     points = seen_in_world([table()], ABOVE)
-    request, seen = parse_options({"support": "ransac"}), ViewedPoints(points, ABOVE[:3, 3])
+    request, seen = parse_options({"support": "ransac"}), seen_from(points, ABOVE[:3, 3])
     support = find_support(seen, np.ones(len(points), bool), None, request, [])
     plane = support.plane_under(np.empty((0, 3)), 0.001)
     assert plane.offset == pytest.approx(support.plane.offset + 0.001)
@@ -575,7 +580,7 @@ def chosen_support(background: np.ndarray, objects: np.ndarray, camera: object) 
     number = np.repeat([BACKGROUND, 0], [len(background), len(objects)])
     up, of_object = np.array([0.0, 0.0, 1.0]), (number == 0).astype(np.float32)
     shown = Segmentation(number, of_object, 1 - of_object, np.ones(1), up)
-    seen = ViewedPoints(points.astype(np.float32), np.array(camera))
+    seen = seen_from(points.astype(np.float32), np.array(camera))
     inside = np.ones(len(points), bool)
     warnings: list[str] = []
     return find_support(seen, inside, shown, parse_options({}), warnings), warnings

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edgegrasp_camera.arrays import Bools, Float32, Int64
-from edgegrasp_model.candidates.edge_grasps import support_clearance
+from edgegrasp_model.candidates.edge_grasps import CLOSING_ALLOWANCE, support_clearance
 from edgegrasp_model.gripper import APPROACH_LENGTH, Gripper
 from edgegrasp_model.kernels import (
     SLACK,
@@ -60,19 +60,24 @@ def collides(
         hit |= np.asarray(lowest < request.margin - SLACK)
     side, inner = gripper.pad_half_width, gripper.max_opening / 2
     low, high = (-side, -inner, gripper.palm_z), (side, inner, gripper.tip_z)
+    ahead = gripper.furthest_advance(opening - CLOSING_ALLOWANCE)  # of fingers that swing
+    closing = T_cloud_hand.copy()
+    closing[:, :3, 3] += ahead[:, None] * T_cloud_hand[:, :3, 2]
     if scene.obstacles is not None:
-        closing = np.concatenate([swept, [[low, high]]])  # and the space between the fingers
-        for shapes, way in [(closing, 0.0), (boxes, lift)][: 1 + (lift > 0.0)]:
-            solid = SolidBoxes.from_hands(T_cloud_hand, shapes)
+        between = np.array([[low, high]])  # the fingers
+        whole = np.concatenate([swept, between])
+        ways = [(T_cloud_hand, whole, 0.0), (closing, between, 0.0), (T_cloud_hand, boxes, lift)]
+        for hands_at, shapes, way in ways[: 2 + (lift > 0.0)]:
+            solid = SolidBoxes.from_hands(hands_at, shapes)
             for near, theirs in near_pairs(solid, scene.obstacles, way):
                 overlap = separation(solid.take(near), theirs, way * UP.astype(np.float64)) < 0
                 hit[near[overlap] // len(shapes)] = True
     if request.margin >= 0.0:
         free = np.flatnonzero(~hit)
         background = scene.cloud.points[scene.object_of_point == BACKGROUND]
-        hands = in_hands(background, T_cloud_hand[free])
-        between, *_ = points_in_hand_boxes(hands, *np.array([low, high], np.float32))
-        hit[free] = np.bincount(between, minlength=len(free)) >= MIN_BACKGROUND_VOXELS
+        hands = in_hands(background, closing[free])
+        held, *_ = points_in_hand_boxes(hands, *np.array([low, high], np.float32))
+        hit[free] = np.bincount(held, minlength=len(free)) >= MIN_BACKGROUND_VOXELS
         hit[free] |= enters_unseen(scene.depths, T_cloud_hand[free], gripper, request.behind)
     return hit
 

@@ -222,8 +222,12 @@ def centred_grasps(
     middle, width = (low + high) / 2, high - low
     moved = (width > WIDE_SHARE * gripper.max_opening) & (width < gripper.max_opening)
     moved &= np.abs(middle) < MAX_SHIFT
-    further = replace(candidates.take(wide[moved]), opening=width[moved])
+    found = candidates.take(wide[moved])
+    further = replace(found, opening=width[moved])
     further.T_cloud_hand[:, :3, 3] += middle[moved, None] * further.T_cloud_hand[:, :3, 1]
+    # Fingers that swing are elsewhere along z at the new opening.
+    now, before = gripper.contact_z_at(np.stack([further.opening, found.opening]))[..., None]
+    further.T_cloud_hand[:, :3, 3] += (before - now) * further.T_cloud_hand[:, :3, 2]
     return further
 
 

@@ -150,11 +150,11 @@ def select_points(
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
     number = callers_objects(sent)
-    needed = isinstance(options.support, AutoPlane) or (options.support is not None and not given)
-    if needed and len(sent.points) > 0:
+    needed = isinstance(options.support, AutoPlane) or not given or options.known_up is None
+    if needed and options.support is not None and len(sent.points) > 0:
         found = segment_cloud(sent, viewpoints, options.known_up, rows)
         found = found if sent.segment_ids is None else found._replace(object_of_point=number)
-    seen = ViewedPoints(sent.points, viewpoints.sum(axis=0) / max(len(viewpoints), 1))
+    seen = ViewedPoints.by_cameras(sent, viewpoints)
     support = find_support(seen, inside, found, options, warnings)
     above_all = np.ones(len(inside), np.float32), np.zeros(len(inside), np.float32)
     height, margin = above_all if support is None else support.heights(seen)
@@ -170,7 +170,7 @@ def select_points(
             is_cropped = math.isnan(support.growth)
             number, certain = objects_above(found, above, plan, height, margin, is_cropped)
         elif options.viewpoint is not None and (
-            (found.object_of_point >= 0).any() or np.median(seen.distance()) < NEAREST_DEPTH
+            (found.object_of_point >= 0).any() or np.median(seen.away) < NEAREST_DEPTH
         ):
             number, certain = found.object_of_point, found.confidence
     confidence = dict(enumerate(certain.tolist()))

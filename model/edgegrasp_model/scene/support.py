@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import SUPPORT_STREAM, DetectOptions, RansacPlane, SupportPlane
 from edgegrasp_model.scene.cloud import (
@@ -87,12 +87,11 @@ class Support:
 
         The noise of depth cameras grows with the square of the distance.
         """
-        T_plane_cloud, eye = self.frame.T_canonical_cloud, seen.viewpoint
-        height, squared = _heights(seen.points, T_plane_cloud, self.bow, eye)
+        height = _heights(seen.points, self.frame.T_canonical_cloud, self.bow)
         if math.isnan(self.growth):
             return height, np.full_like(height, self.margin)
-        squared *= np.float32(MARGIN_DEVIATIONS * self.growth)
-        return height, np.clip(squared, self.margin, max(MAX_MARGIN, self.margin), out=squared)
+        noise = np.float32(MARGIN_DEVIATIONS * self.growth) * np.square(seen.away)
+        return height, np.clip(noise, self.margin, max(MAX_MARGIN, self.margin), out=noise)
 
 
 class ViewedPoints(NamedTuple):
@@ -100,11 +99,19 @@ class ViewedPoints(NamedTuple):
 
     points: Float32  # (N, 3) metres
     viewpoint: Float64  # (3,) the camera, or the mean of several
+    away: Float32  # (N,) metres from each point to the camera that saw it
 
-    def distance(self) -> Float64:
-        """Metres (N,) from the camera."""
-        apart = self.points - self.viewpoint
-        return np.asarray(np.sqrt(np.einsum("nd,nd->n", apart, apart)))
+    @classmethod
+    def by_cameras(cls, sent: CheckedCloud, viewpoints: Float64) -> "ViewedPoints":
+        """The points of a cloud, which cameras at (W, 3) saw."""
+        eyes = viewpoints if len(viewpoints) < 2 else viewpoints[sent.view_ids]
+        apart = sent.points - eyes.astype(np.float32)
+        away = np.sqrt(np.einsum("nd,nd->n", apart, apart))
+        return cls(sent.points, viewpoints.sum(axis=0) / max(len(viewpoints), 1), away)
+
+    def take(self, rows: Int64) -> "ViewedPoints":
+        """The points of the given rows."""
+        return ViewedPoints(self.points[rows], self.viewpoint, self.away[rows])
 
 
 def heights_over(plane: SupportPlane, points: Floats) -> Floats:
@@ -170,7 +177,7 @@ def _given_support(
     # The table around a bin must not count as its floor; a followed object's workspace is no bin.
     around = np.inf if options.follows_only else HAND_REACH * np.abs(plane.normal)
     over = np.flatnonzero(inside_workspace(seen.points, options.workspace, around))
-    sample = ViewedPoints(seen.points[subsample(over)], seen.viewpoint)
+    sample = seen.take(subsample(over))
     below = float(heights_over(plane, sample.points).min(initial=np.inf))
     if options.max_object_size < below < np.inf:
         warnings.append(
@@ -190,7 +197,7 @@ def _fit_support(
     """The plane of the points classified as support, weighted toward those near objects."""
     on = np.flatnonzero(segmentation.support_probability > 0.5)
     held = np.flatnonzero(segmentation.object_of_point >= 0)
-    part = ViewedPoints(seen.points[subsample(on)], seen.viewpoint)
+    part = seen.take(subsample(on))
     around = seen.points[subsample(held, 500)]
     # Metres to the nearest object; infinity beyond NEAR_DISTANCE, or where there is no object.
     apart = np.asarray(cKDTree(around).query(part.points, distance_upper_bound=NEAR_DISTANCE)[0])
@@ -314,9 +321,9 @@ def fit_plane(
     chosen = rng.choice(
         held, min(1200, len(held)), replace=False, p=weight[held] / weight[held].sum()
     )
-    sample = ViewedPoints(seen.points[chosen], seen.viewpoint)
+    sample = seen.take(chosen)
     points = sample.points.astype(np.float64)
-    thick = PLANE_NOISE + NOISE_GROWTH * sample.distance() ** 2
+    thick = PLANE_NOISE + NOISE_GROWTH * np.square(sample.away)
     corners = points[rng.integers(len(points), size=(150, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
@@ -347,11 +354,11 @@ def measure_support(seen: ViewedPoints, plane: SupportPlane, least: float, whole
 
     `whole`: the cloud was not cropped above the plane.
     """
-    sample = ViewedPoints(subsample(seen.points), seen.viewpoint)
+    sample = seen.take(subsample(np.arange(len(seen.points))))
     frame = CanonicalFrame.from_scene(sample.points, plane.normal, seen.viewpoint)
     frame.T_canonical_cloud[2, 3] = -plane.offset / np.linalg.norm(plane.normal)
     x, y, height = frame.points_from_cloud(sample.points).T
-    distance = sample.distance()
+    distance = sample.away
     thick = PLANE_NOISE + NOISE_GROWTH * np.square(distance)
     near = np.abs(height) < thick
     # If the cloud was cropped above the plane, only objects on it are near.
@@ -374,11 +381,9 @@ def _bow_terms(x: Floats, y: Floats) -> Floats:
 
 
 @compiled("contract")
-def _heights(
-    points: Float32, T_plane_cloud: Float64, bow: Float64, eye: Float64
-) -> tuple[Float32, Float32]:
-    """Heights (N,) over a bowed plane, and squared distances (N,) from the camera."""
-    T, (height, squared) = T_plane_cloud, np.empty((2, len(points)), np.float32)
+def _heights(points: Float32, T_plane_cloud: Float64, bow: Float64) -> Float32:
+    """Heights (N,) over a bowed plane."""
+    T, height = T_plane_cloud, np.empty(len(points), np.float32)
     for i in range(len(points)):
         a, b, c = points[i, 0], points[i, 1], points[i, 2]
         x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
@@ -386,8 +391,7 @@ def _heights(
         rise = bow[0] + bow[1] * x + bow[2] * y + bow[3] * x * x + bow[4] * x * y + bow[5] * y * y
         rise = min(max(rise, -MAX_BOW), MAX_BOW)
         height[i] = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3] - rise
-        squared[i] = (a - eye[0]) ** 2 + (b - eye[1]) ** 2 + (c - eye[2]) ** 2
-    return height, squared
+    return height
 
 
 def correct_depth_scale(
