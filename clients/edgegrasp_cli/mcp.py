@@ -120,7 +120,7 @@ class _Tools:
         `viewpoint` is the camera's position: give it if you know it.
         """
         asked = self._request(options, num_grasps, robot, viewpoint, point_cloud_file)
-        return _short(self._client.detect(**asked))
+        return _short(self._client.detect(**asked), asked.get("collision"))
 
     def generate_grasps_from_depth(
         self,
@@ -142,7 +142,7 @@ class _Tools:
         """
         image = (depth_file, intrinsics, mask_file, depth_scale, T_base_camera)
         asked = self._request(options, num_grasps, robot, image=image)
-        return _short(self._client.detect(**asked))
+        return _short(self._client.detect(**asked), asked.get("collision"))
 
     def visualize_grasps(
         self,
@@ -290,10 +290,11 @@ def _with_sentences(function: Callable[..., Any], folder: Path) -> Callable[...,
     return run
 
 
-def _short(found: "Detection") -> str:
+def _short(found: "Detection", collision: Any) -> str:
     """The part of a detection that an agent needs, as JSON with few digits."""
     from edgegrasp_client.conversions import quaternion_from_matrix
 
+    back = collision.get("approach_length", 0.05) if isinstance(collision, dict) else 0.05
     grasps = [
         {
             "score": round(grasp.score, 3),
@@ -301,7 +302,7 @@ def _short(found: "Detection") -> str:
             "hand_quaternion_xyzw": _digits(quaternion_from_matrix(grasp.T_cloud_hand[:3, :3]), 4),
             "tcp_position": _digits(grasp.T_cloud_tcp[:3, 3], 4),
             "approach_direction": _digits(grasp.approach_direction, 3),
-            "pregrasp_hand_position": _digits(grasp.pregrasp()[:3, 3], 4),
+            "pregrasp_hand_position": _digits(grasp.pregrasp(back)[:3, 3], 4),
             "width": round(grasp.width, 4),
             "object": grasp.object,
             **({} if grasp.arm is None else {"arm": _short_plan(grasp.arm)}),

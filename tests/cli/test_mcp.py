@@ -93,6 +93,10 @@ async def test_an_agent_gets_grasps_and_sees_them(dummy_server, folder: Path) ->
         assert tcp @ grasp["approach_direction"] == pytest.approx(0.1, abs=1e-3)
         way = np.subtract(grasp["hand_position"], grasp["pregrasp_hand_position"])
         np.testing.assert_allclose(way, 0.05 * np.array(grasp["approach_direction"]), atol=2e-4)
+        short = {**asked, "options": {"collision": {"approach_length": 0.02}}}
+        grasp = answer(await client.call_tool(CLOUD, short))["grasps"][0]
+        way = np.subtract(grasp["hand_position"], grasp["pregrasp_hand_position"])
+        assert np.linalg.norm(way) == pytest.approx(0.02, abs=2e-4)
 
         shown = await client.call_tool("visualize_grasps", asked)
         assert shown.content[0].text.startswith("3 grasps, the best ")

@@ -666,3 +666,23 @@ def test_the_flat_top_of_an_object_is_no_table_by_which_depths_are_scaled() -> N
     np.testing.assert_allclose(left[:, 2], 0.07, atol=0.001)
     with refusal("options.viewpoint"):  # which scaling needs
         detector().detect(top, parse_options({"support": PLANE}))
+
+
+def test_walls_of_a_cropped_bin_are_no_objects() -> None:
+    pose, floor = camera(0.7, -1.5, 0.8), box((0, 0, -0.03), (1, 1, 0.03))
+    boxes = [box((-0.05, 0, 0.04), (0.03,) * 3), box((0.07, 0.03, 0.03), (0.03,) * 3)]
+    points = seen_in_world([*bin_walls(0.3, 0.22, 0.12), *boxes, floor], pose)
+    found = detect(points[points[:, 2] > 0.012], pose, up=[0, 0, 1])
+    assert max(2 * one.half_extents.max() for one in found.objects) < 0.15
+
+
+def test_a_known_up_keeps_the_support_level() -> None:
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(-0.3, 0.3, 0.004), np.arange(0, 0.03, 0.004)))
+    strips = [np.stack([x, y + back, 0 * x + z], 1) for back, z in ((0.0, 0.0), (0.3, 0.1))]
+    points = np.concatenate(strips).astype(np.float32)
+    ones, up = np.ones(len(points), np.float32), np.array([0.0, 0.0, 1.0])
+    shown = Segmentation(np.full(len(points), -2), 0 * ones, ones, np.empty(0), up)
+    seen = seen_from(points, np.array([0.0, -0.8, 0.25]))
+    found = find_support(seen, ones > 0, shown, parse_options({"up": (0, 0, 1)}), [])
+    assert found is not None
+    assert np.degrees(np.arccos(found.frame.T_canonical_cloud[2, 2])) < 5

@@ -207,7 +207,7 @@ def assumed_viewpoint(
 ) -> tuple[float, float, float] | None:
     """The assumed position of the camera that saw a cloud, if a request does not give it.
 
-    None: several cameras saw the cloud.
+    None: no single position sees all of it.
 
     InvalidRequest: an option needs the position to the millimetre.
     """
@@ -229,8 +229,8 @@ def assumed_viewpoint(
     eye = likely_viewpoint(points[inside] if inside.any() else points, up)
     if eye is None:
         warnings.append(
-            "viewpoint is not given, and several cameras saw the cloud, as no single position sees "
-            "all of it: send their positions, and view_ids."
+            "viewpoint is not given, and no position sees all of the cloud: send the camera's "
+            "position; if there are several cameras, their positions and view_ids."
         )
         return None
     x, y, z = eye.tolist()

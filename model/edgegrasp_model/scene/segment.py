@@ -307,8 +307,8 @@ def objects_above(
     first = len(found.confidence)
     # If there are objects, background stays background: only parts that were too small are left.
     alone = not (number >= 0).any()
-    among = likely & ((number == UNDECIDED) | alone)
-    number = add_clusters(number, plan, among | is_cropped, first)
+    among = (likely | is_cropped) & ((number == UNDECIDED) | alone)
+    number = add_clusters(number, plan, among, first)
     new = np.flatnonzero(number >= first)
     which = number[new] - first
     mean = np.bincount(which, found.object_probability[above[new]]) / np.bincount(which)

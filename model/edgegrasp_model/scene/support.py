@@ -202,9 +202,9 @@ def _fit_support(
     # Metres to the nearest object; infinity beyond NEAR_DISTANCE, or where there is no object.
     apart = np.asarray(cKDTree(around).query(part.points, distance_upper_bound=NEAR_DISTANCE)[0])
     weight = np.where(np.isfinite(apart), 1.0, FAR_WEIGHT)
-    up = segmentation.up if up is None else up
+    tilt, up = (30, segmentation.up) if up is None else (12, up)  # degrees; estimates are rough
     for _ in range(2):
-        plane = fit_plane(part, weight, rng, up)
+        plane = fit_plane(part, weight, rng, up, math.radians(tilt))
         if plane is None:
             return None
         below = heights_over(plane, around) < -MAX_MARGIN
@@ -251,8 +251,8 @@ def _assume_support(
         normal=tuple(up.tolist()), offset=lowest - ASSUMED_PLANE_GAP
     )
     warnings.append(
-        "no support plane is seen: one is assumed under the lowest points. Send support (null if "
-        "there is none)."
+        "no support plane is seen: one is assumed under the lowest points. Send support (null, "
+        "with objects: off, if there is none)."
     )
     return measure_support(seen, plane, 0.0, False)
 
