@@ -95,8 +95,8 @@ class GraspTracker:
                 asked = options.get("support", "auto")
                 kind = asked.get("kind") if isinstance(asked, Mapping) else asked
                 options |= {"support": plane if kind in SEARCHED_SUPPORTS else asked, "up": last.up}
-            if options.keys() & {"at", "near"} and object_ in self._objects:
-                options |= {"at": None, "near": self._objects[object_].center}
+            if options.keys() & {"at", "near"}:
+                options |= {"at": None, "near": last.grasps[0].contact_point}
         return cast("DetectOptions", options | {"previous": cast("Previous", previous)})
 
     def take(self, detection: Detection) -> None:

@@ -286,11 +286,12 @@ def _upright_box(scene: Scene, held: Bools) -> tuple[Float32, Float32, float]:
     The last value is the points' least width as seen from above, metres.
     """
     points = scene.cloud.points[held].astype(np.float64)
-    corners = plan = points[:, :2]
+    plan = points[:, :2]
+    corners = plan[np.lexsort(plan.T)[[0, -1]]]  # the ends if all lie on a line
     with suppress(QhullError, ValueError):  # too few points, or all on a line
         corners = plan[ConvexHull(plan).vertices]
     edges = np.roll(corners, -1, axis=0) - corners
-    edges = edges[np.linalg.norm(edges, axis=1) > 0] if len(corners) > 1 else edges[:0]
+    edges = edges[np.linalg.norm(edges, axis=1) > 0]
     edges = np.concatenate([edges, [[1.0, 0.0]]])
     edges /= np.linalg.norm(edges, axis=1, keepdims=True)
     # The smallest rectangle around points has a side along an edge of their convex hull.

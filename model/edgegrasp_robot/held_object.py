@@ -122,8 +122,8 @@ def places_for(
     in_box = transform(np.linalg.inv(load.T_base_box), load.points)
     for pose in _places(place, load):
         foot = _lowest(scene, transform(T_cloud_base @ pose, in_box)) - load.below
-        if foot < -RELEASE_HEIGHT:
-            if place.region is None or foot < -FOOT_HEIGHT:
+        if foot < (-RELEASE_HEIGHT if place.region is None else 0.0):
+            if place.region is None or foot < RELEASE_HEIGHT - FOOT_HEIGHT:
                 continue
             pose[2, 3] -= foot  # the region's bottom is slightly too low
         off, half = load.above_its_foot

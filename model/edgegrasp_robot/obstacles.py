@@ -21,6 +21,7 @@ from edgegrasp_model.scene.support import heights_over, plane_in
 from edgegrasp_robot.robot import HAND, Robot, touching
 
 VOXEL_SIZE = 0.01  # metres, side of a voxel
+SHELL = 0.1  # metres of distance from a camera, in which the voxel nearest in angle hides
 MARGIN = 0.4  # voxels around a point: noise and the arm's controller are off by millimetres
 MAX_RANGE = 2.0  # metres from the arm's base; farther points are left out
 SELF_DISTANCE = 0.02  # metres; points this near to the arm are the arm itself
@@ -69,7 +70,8 @@ class ArmObstacles(NamedTuple):
 
     def without(self, load: Load) -> "ArmObstacles":
         """The obstacles without a load that is taken away."""
-        inside = np.abs(transform(np.linalg.inv(load.T_base_box), self.voxels)) < load.half
+        around = np.abs(transform(np.linalg.inv(load.T_base_box), self.voxels))
+        inside = around < load.half + VOXEL_SIZE  # and unseen space right behind it
         near = cKDTree(load.points).query(self.voxels, distance_upper_bound=NEAR_HELD)[0]
         own = inside.all(axis=1) | (near <= NEAR_HELD)
         return self._replace(voxels=self.voxels[~own])
@@ -227,18 +229,32 @@ def _voxels(support: SupportPlane | None, points: Floats, T_base_cloud: Float64)
 
 def _hidden(support: SupportPlane | None, voxels: Float64, viewpoints: Float64) -> Float64:
     """Centers (U, 3) of voxels that `voxels` hide from every camera (W, 3), above the support."""
-    steps = np.arange(VOXEL_SIZE, 2 * MAX_RANGE, VOXEL_SIZE)[:, None, None]
     first, *others = viewpoints
-    places = (voxels + steps * unit(voxels - first)).reshape(-1, 3)
-    kept = np.einsum("ij,ij->i", places, places) < MAX_RANGE**2
-    if support is not None:
-        kept &= heights_over(support, places) > VOXEL_SIZE / 2
-    hidden = _centers(places[kept] / VOXEL_SIZE)
-    for eye in others:  # what lies behind a voxel from there too
-        away = np.linalg.norm(voxels - eye, axis=1)
-        aside, row = cKDTree(unit(voxels - eye)).query(unit(hidden - eye))
-        behind = np.linalg.norm(hidden - eye, axis=1) - away[row]
-        hidden = hidden[(aside * away[row] < VOXEL_SIZE) & (behind > VOXEL_SIZE / 2)]
+    places, step, cells = voxels, VOXEL_SIZE * unit(voxels - first), [np.empty((0, 3), np.int16)]
+    while len(places):  # until the last ray leaves the range
+        places = places + step
+        near = np.einsum("ij,ij->i", places, places) < MAX_RANGE**2
+        places, step = places[near], step[near]
+        above = support is None or heights_over(support, places) > VOXEL_SIZE / 2
+        cells.append(np.floor(places[above] / VOXEL_SIZE).astype(np.int16).reshape(-1, 3))
+    hidden = _centers(np.concatenate(cells))
+    for eye in others:
+        hidden = hidden[_behind(voxels - eye, hidden - eye)]
+    return hidden
+
+
+def _behind(seen: Float64, places: Float64) -> Bools:
+    """Which places (N, 3) are behind a voxel (V, 3); both relative to a camera."""
+    away, hidden = np.linalg.norm(seen, axis=1), np.zeros(len(places), dtype=bool)
+    # By shells, since a voxel farther away may be nearer in angle.
+    for shell in np.unique(away // SHELL):
+        own, left = seen[away // SHELL == shell], np.flatnonzero(~hidden)
+        widest = VOXEL_SIZE / max(shell * SHELL, VOXEL_SIZE)  # radians
+        tree, ways = cKDTree(unit(own)), unit(places[left])
+        aside, row = tree.query(ways, distance_upper_bound=widest)
+        there = np.append(np.linalg.norm(own, axis=1), np.inf)[row]
+        behind = np.linalg.norm(places[left], axis=1) - there > VOXEL_SIZE / 2
+        hidden[left] = behind & (aside * there < VOXEL_SIZE)
     return hidden
 
 

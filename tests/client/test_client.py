@@ -301,6 +301,19 @@ def test_after_a_bad_answer_it_looks_for_others_too(bad: Detection) -> None:
     assert sent["grasps"][0]["id"] == 0  # the one to keep if it is there after all
 
 
+def test_a_hollow_object_is_looked_for_where_it_was_grasped() -> None:
+    wall, pose = np.float32([0.1, 0.0, 0.0]), np.eye(4)
+    ring = SimpleNamespace(number=1, surface=wall, confidence=None, center=np.zeros(3))
+    grasp = SimpleNamespace(id=0, object=1, score=0.9, T_cloud_hand=pose, contact_point=wall)
+    plain = {"support": None, "up": None, "gripper": SimpleNamespace(name="panda")}
+    tracking = SimpleNamespace(next_id=1, first="started")
+    found: Any = SimpleNamespace(grasps=[grasp], objects=[ring], tracking=tracking, **plain)
+    tracker = GraspTracker(near=(0.1, 0.0, 0.0))
+    tracker.options()
+    tracker.take(found)
+    np.testing.assert_array_equal(tracker.options()["near"], wall)
+
+
 def test_images_that_come_while_one_is_at_work_are_dropped_but_for_the_latest() -> None:
     """And an error of the camera is raised."""
     read, seen = threading.Event(), []

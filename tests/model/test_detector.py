@@ -1,5 +1,6 @@
 """A cloud in, ranked grasps out; and the catalogue of models."""
 
+import time
 from collections import Counter
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from edgegrasp_model.kernels import mean_over_similar
 from edgegrasp_model.networks.checkpoint import save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import Box, Collision, DetectOptions, parse_options
-from edgegrasp_model.ranking import densest_first, ranked
+from edgegrasp_model.ranking import densest_first, detected_objects, ranked
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene import network
 from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud, CloudInput, pose_matrix
@@ -570,6 +571,33 @@ def test_labels_name_the_followed_objects_without_a_search() -> None:
     named, count = np.unique(found.debug.labels[found.debug.labels >= 0], return_counts=True)
     assert {one.number for one in found.objects} == {*named.tolist()} == {0, 1, 2, 3}
     assert count.min() > 100
+
+
+def test_an_object_of_many_points_in_an_upright_line_has_a_box() -> None:
+    side = np.arange(-0.5, 0.5, 0.005)
+    scene = scene_of(grid([0.5], side, side).astype(np.float32))
+    start = time.process_time()
+    (one,) = detected_objects(scene, [], None, np.empty(0), PANDA)
+    np.testing.assert_allclose(sorted(one.half_extents), [0.0, 0.4975, 0.4975], atol=1e-6)
+    assert time.process_time() - start < 5.0  # 30 s if all points are corners
+
+
+def test_an_object_that_is_left_out_stays_left_out_while_another_is_followed() -> None:
+    boxes = [box_on_table(), box_on_table() + np.float32([0.3, 0, 0])]
+    floor = grid(np.arange(-0.3, 0.6, 0.004), np.arange(-0.3, 0.3, 0.004), [0.0])
+    cloud = np.concatenate([*boxes, floor]).astype(np.float32)
+    plain = {"viewpoint": (0.6, 0.5, 0.8), "min_score": 0.0, "previous": {}}
+    answer, exclude = detect(cloud, **plain), {"exclude": [0]}
+    for _ in range(2):
+        assert answer.tracking is not None
+        seen = [
+            {"number": one.number, "surface": one.surface.ravel().tolist()}
+            for one in answer.objects
+            if one.surface is not None
+        ]
+        previous = {"next_id": answer.tracking.next_id, "objects": seen}
+        answer = detect(cloud, **plain | {"previous": previous, "objects": exclude})
+        assert {grasp.object for grasp in answer.grasps} == {1}
 
 
 def hands(places: list[float], turns: list[float]) -> np.ndarray:

@@ -13,6 +13,7 @@ pytest.importorskip("roboplan", reason="the extra robot is not installed")
 
 from tests.checks import refusal
 from tests.model.scenes import grid
+from tests.robot import arms
 from tests.robot.arms import BOXES, HALF, TURNED, hand_over, picks_of, scene_of, surface
 
 from edgegrasp_model.gripper import HALF_TURN
@@ -224,6 +225,27 @@ def test_what_several_cameras_side_by_side_did_not_see_is_avoided(fr3):
     assert found.counts["reachable"] == 0
 
 
+def test_a_wall_behind_a_sign_shows_nothing_of_what_the_sign_hides(fr3):
+    signs = [
+        grid(np.arange(0.45, 0.55, 0.008), [-0.4], np.arange(0.25, 0.5, 0.008)),
+        grid([0.9], np.arange(-0.12, 0.12, 0.008), np.arange(0.25, 0.6, 0.008)),
+    ]
+    wall = grid([-0.5], np.arange(-0.9, 0.9, 0.008), np.arange(0.0, 1.6, 0.008))
+    eyes = [(0.5, -0.8, 0.1), (1.3, 0.0, 0.1)]
+    asked = {"boxes": BOXES[:1], "eyes": eyes, "avoid_unseen": True}
+    assert picks_of(fr3, more=[*signs, wall], **asked).counts["reachable"] == 0
+
+
+def test_an_object_is_carried_out_of_its_own_shadow(fr3, monkeypatch):
+    def front(x, y, half):  # a camera over the base sees the top, and the side toward it
+        points = surface(x, y, half)
+        return points[(points[:, 2] > 2 * half - 1e-6) | (points[:, 0] < x - HALF + 0.001)]
+
+    monkeypatch.setattr(arms, "surface", front)
+    asked = {"eyes": [(-0.1, 0.0, 0.7)], "avoid_unseen": True, "place": {"region": TRAY}}
+    assert picks_of(fr3, boxes=BOXES[:1], **asked).counts["with_trajectory"] == 1
+
+
 TOUCHING = [{"kind": "box", "min": (x, 0.5, -0.1), "max": (x + 0.2, 0.9, 0.3)} for x in (0.4, 0.5)]
 
 
@@ -383,12 +405,12 @@ def test_an_object_is_put_in_a_pose(fr3):
     assert plan.trajectory is None
 
 
-@pytest.mark.parametrize(("below", "lowest"), [(0.01, 0.0), (0.1, None)])
+@pytest.mark.parametrize(("below", "lowest"), [(0.0095, 0.0), (0.1, None)])
 def test_an_object_is_not_pressed_into_the_support(fr3, below, lowest):
     region = TRAY | {"min": [*TRAY["min"][:2], -below]}
     found = picks_of(fr3, boxes=BOXES[:1], place={"region": region}, plan="reach")
     points = [placed(grasp, plan)[:, 2].min() for grasp, plan in plans_of(found)]
-    assert points == ([] if lowest is None else [pytest.approx(lowest, abs=0.004)])
+    assert points == ([] if lowest is None else [pytest.approx(lowest, abs=0.002)])
     there = put_at(BOXES[0][2] - below)  # given to the millimetre: it stays there
     assert picks_of(fr3, boxes=BOXES[:1], place=there, plan="reach").counts["no_place"] == 1
 
