@@ -226,8 +226,6 @@ class GraspDetector:
             with prepared.timed("ranking"):
                 objects = ranking.detected_objects(scene, grasps, sample, score, gripper)
             if prepared.followed is not None:
-                if (others := prepared.followed.left_out) is not None:
-                    objects += ranking.detected_objects(others, [], None, score, gripper)
                 surface = prepared.followed.surface
                 objects = [replace(one, surface=surface.get(one.number)) for one in objects]
         counts["returned"], plane = len(grasps), None

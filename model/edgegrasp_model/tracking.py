@@ -68,7 +68,6 @@ class Followed:
     surface: dict[int, Float32]  # (K, 3) points, by numbers in the answer; new ones if few fit
     named: dict[int, int]  # numbers in the scene: numbers in the answer
     next_id: int
-    left_out: Scene | None = None  # with the objects that the request does not choose
 
 
 def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOptions:
@@ -177,22 +176,18 @@ def follow(scene: Scene, previous: Previous, given: bool, chosen: bool) -> tuple
 def only_chosen(
     scene: Scene, followed: Followed, choice: ObjectChoice | str, warnings: list[str]
 ) -> tuple[Scene, Followed]:
-    """Leave out the objects that a choice does not name, by their numbers in the answer.
-
-    The answer still lists them, so that they keep their numbers.
-    """
+    """Leave out the objects that a choice does not name, by their numbers in the answer."""
     number = scene.object_of_point
     wanted = resolve_object_choice(np.unique(number[number >= 0]), choice, warnings)
     held = np.isin(number, wanted)
     moved = {was: now for was, now in followed.moved.items() if now[1] is None or now[1] in wanted}
-    left_out = replace(scene, object_of_point=np.where(held, BACKGROUND, number))
     scene = replace(
         scene,
         object_of_point=np.where((number >= 0) & ~held, BACKGROUND, number),
         approach_allowed=scene.approach_allowed & held,
         contact_allowed=scene.contact_allowed & held,
     )
-    return scene, replace(followed, moved=moved, left_out=left_out)
+    return scene, replace(followed, moved=moved)
 
 
 def merged(

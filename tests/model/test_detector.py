@@ -135,15 +135,6 @@ def test_each_camera_has_its_own_noise() -> None:
     assert above[2] < 1.1 * (above[0] + above[1])
 
 
-def test_objects_at_the_side_of_a_wide_image_are_found() -> None:
-    T_world_camera = np.diag([1.0, -1.0, -1.0, 1.0])
-    T_world_camera[2, 3] = 0.45
-    seen = [table(1.0, 0.8), box((0.62, 0, 0.03), (0.02, 0.025, 0.03))]
-    cloud = render(seen, T_world_camera, zoom=0.35)
-    (one,) = detector().detect(cloud, DetectOptions(viewpoint=(0, 0, 0), up=(0, 0, -1))).objects
-    assert one.center[0] == pytest.approx(0.62, abs=0.01)
-
-
 def test_objects_of_a_few_scattered_points_are_none() -> None:
     places = np.random.default_rng(0).uniform(-0.02, 0.02, (20_000, 2))
     plate = np.column_stack([places, np.full(20_000, 0.01)])
@@ -580,24 +571,6 @@ def test_an_object_of_many_points_in_an_upright_line_has_a_box() -> None:
     (one,) = detected_objects(scene, [], None, np.empty(0), PANDA)
     np.testing.assert_allclose(sorted(one.half_extents), [0.0, 0.4975, 0.4975], atol=1e-6)
     assert time.process_time() - start < 5.0  # 30 s if all points are corners
-
-
-def test_an_object_that_is_left_out_stays_left_out_while_another_is_followed() -> None:
-    boxes = [box_on_table(), box_on_table() + np.float32([0.3, 0, 0])]
-    floor = grid(np.arange(-0.3, 0.6, 0.004), np.arange(-0.3, 0.3, 0.004), [0.0])
-    cloud = np.concatenate([*boxes, floor]).astype(np.float32)
-    plain = {"viewpoint": (0.6, 0.5, 0.8), "min_score": 0.0, "previous": {}}
-    answer, exclude = detect(cloud, **plain), {"exclude": [0]}
-    for _ in range(2):
-        assert answer.tracking is not None
-        seen = [
-            {"number": one.number, "surface": one.surface.ravel().tolist()}
-            for one in answer.objects
-            if one.surface is not None
-        ]
-        previous = {"next_id": answer.tracking.next_id, "objects": seen}
-        answer = detect(cloud, **plain | {"previous": previous, "objects": exclude})
-        assert {grasp.object for grasp in answer.grasps} == {1}
 
 
 def hands(places: list[float], turns: list[float]) -> np.ndarray:

@@ -20,7 +20,7 @@ from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.scene.cloud import (
     LARGE_IMAGE,
-    MAX_WIDE_TANGENT,
+    MAX_VIEW_TANGENT,
     OUTLIER_PERCENT,
     SUBSAMPLE_SIZE,
     subsample,
@@ -203,7 +203,7 @@ def _view(points: Float64) -> tuple[Float64, Float64]:
     ends = OUTLIER_PERCENT, 100 - OUTLIER_PERCENT
     low, high = np.percentile(ahead[:, :2] / ahead[:, 2:], ends, axis=0)
     edge = 0.02 * (high - low) + 1e-3
-    low, high = np.maximum(low - edge, -MAX_WIDE_TANGENT), np.minimum(high + edge, MAX_WIDE_TANGENT)
+    low, high = np.maximum(low - edge, -MAX_VIEW_TANGENT), np.minimum(high + edge, MAX_VIEW_TANGENT)
     return low.round(9), high.round(9)
 
 
